@@ -8,7 +8,7 @@
 import os
 import sys
 
-from sfms_robot.child_process import ONE_THREAD
+from sfms_robot.processes import ONE_THREAD
 
 os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in the workers that pytest starts
 

@@ -19,12 +19,11 @@ BASE = {
     "data",
     "config",
     "ranges",
-    "child_process",
     "endpoint",
     "origin",
     "network",
     "plugins",
-    "realtime",
+    "processes",
 }
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
@@ -45,6 +44,7 @@ SHARED_NAMES = {
     "features": "what SFMS is trained on, and what ARIG is trained on",
     "losses": "what SFMS learns by, and what ARIG learns by",
     "registry": "the kinds of listeners, and those of sources",
+    "idle": "what a listener adds to a face at rest, and what a head does without one",
 }
 
 MODULES = sorted(PACKAGE.rglob("*.py"))

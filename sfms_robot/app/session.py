@@ -29,12 +29,12 @@ from sfms_robot.config import Calmness, Head
 from sfms_robot.errors import ConfigError, RobotError, TorqueError
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.open_feed import NamedFeed, open_feed
 from sfms_robot.listeners.process import ListenerProcess
+from sfms_robot.listeners.remote import NamedFeed, open_feed
 from sfms_robot.network import Router, session_config
 from sfms_robot.plugins import REMOTE, listener_folder
 from sfms_robot.ports import Observer, PlanFeed, Retargeter, Source, Timeline
-from sfms_robot.realtime import realtime_priority
+from sfms_robot.processes import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed
 from sfms_robot.runtime.halt import HaltLatch, halt_signals, halt_switch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -39,15 +40,22 @@ def serve(
 ) -> None:
     """Listen for robots elsewhere: `sfms-robot run --listener zenoh/NAME`. Until Ctrl-C."""
     from sfms_robot.app.listen.preflight import engine_named
-    from sfms_robot.app.serve.service import ServeOptions
+    from sfms_robot.app.serve.batch_process import Served
     from sfms_robot.app.serve.service import serve as serve_until
 
     runs_on = engine_named(engine)
     over = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
-    options = ServeOptions(listener, name, zenoh, metrics, hop, processes, everybody, runs_on, insecure)
-    figures = serve_until(options, over, _say)
+    served = Served(
+        listener=listener,
+        name=name or Path(listener).name,
+        server=os.uname().nodename,
+        engine=runs_on,
+        hop=hop,
+        all_heads=everybody,
+    )
+    figures = serve_until(served, over, _say, router=zenoh, insecure=insecure, metrics=metrics, processes=processes)
     if json:
         print_json(figures)
 

@@ -166,7 +166,7 @@ class Listener(Model):
         flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
         events: the model is given nods, smiles and blinks decided elsewhere (`signals.control`). It then draws
             everything but gaze: neither the direction of the eyes nor the head's part of it, which are kinematics.
-        sway: slow motion of the head is a separate process (`listeners.sway`), not drawn by the model. Needs events.
+        sway: slow motion of the head is a separate process (`listeners.idle`), not drawn by the model. Needs events.
     """
 
     kind: str

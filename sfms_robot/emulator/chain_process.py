@@ -1,20 +1,20 @@
-"""The process of an emulated chain: a pseudo terminal for the host, a control socket beside it.
+"""The process of an emulated chain: a pseudo terminal for the host, and a control socket.
 
-Started by `launch`, which writes one JSON line on stdin and reads one line back, `ready {"device": ..., ...}`. It ends
-on SIGTERM, or when stdin closes because its parent is gone.
+Started by `launch`, which sends a description and receives where the chain is, or the ConfigError that refuses it. The
+process ends on SIGTERM, or when the pipe to its parent does.
 
 In real time bytes are answered when the wire says. In virtual time they wait in the terminal until a client of the
 control socket says how many there are and what time it is. Control requests and answers are one line each:
 
     sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
                                                  due by UNTIL; what came by SECONDS for bytes before FROM is lost
-    time SECONDS                     ok          only that; what happens by itself by then happens
+    time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
     fault ID BITS                    ok          latch hardware errors
-    turn ID TICKS                    ok          somebody turns the shaft by hand to where its position reads TICKS
-    heat ID DEGREES                  ok          its temperature is this from now on, and goes where its load takes it
-    state ID                         json {...}  what an onlooker sees: position, goal, torque, ...
+    turn ID TICKS                    ok          turn the shaft by hand to where its position reads TICKS
+    heat ID DEGREES                  ok          set its temperature, which follows its load from then on
+    state ID                         json {...}  its true state: position, goal, torque, ...
     inject SPEC                      ok          a fault (see `faults`), from now on unless it says
     clear                            ok          no more faults
     supply VOLTS                     ok          of all servos
@@ -45,7 +45,7 @@ from sfms_robot.emulator.device import EmulatedServo, plugged
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import ConfigError
-from sfms_robot.realtime import realtime_priority
+from sfms_robot.processes import ParentPipe, realtime_priority
 from sfms_robot.servo.registers import Table
 
 _CHUNK: Final = 4096
@@ -76,7 +76,7 @@ class PseudoTerminal:
         os.replace(beside, link)
 
     def baud(self) -> int:
-        """What the host has set."""
+        """Return the baud rate that the host has set."""
         raw = fcntl.ioctl(self.fd, _TCGETS2, bytes(_TERMIOS2.size))
         return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
 
@@ -87,7 +87,7 @@ class PseudoTerminal:
             view = view[os.write(self.fd, view) :]
 
     def close(self) -> None:
-        """Hosts see the device vanish. The link goes too, unless somebody else has taken its name."""
+        """Close the device, and remove the link unless it points to another one by now."""
         if os.path.islink(self.link) and os.readlink(self.link) == self.path:
             os.unlink(self.link)
         os.close(self.fd)
@@ -121,11 +121,11 @@ class Server:
         self._now_s = 0.0
         self._idled_s = 0.0
 
-    def run(self) -> None:
-        """Serve until stdin closes."""
-        stdin, listener = sys.stdin.fileno(), self._listener.fileno()
+    def run(self, parent: int) -> None:
+        """Serve until the pipe `parent` (a file descriptor) ends."""
+        listener = self._listener.fileno()
         while True:
-            watched = [stdin, listener, *self._clients]
+            watched = [parent, listener, *self._clients]
             if self._terminal is not None and not self._virtual:
                 watched.append(self._terminal.fd)
             ready = select.select(watched, [], [], self._patience_s())[0]
@@ -135,8 +135,8 @@ class Server:
                 elif fd == listener:
                     connection, _ = self._listener.accept()
                     self._clients[connection.fileno()] = _Client(connection)
-                elif fd == stdin:
-                    if not os.read(stdin, _CHUNK):
+                elif fd == parent:
+                    if not os.read(parent, _CHUNK):
                         return
                 elif fd in self._clients:
                     self._serve(self._clients[fd])
@@ -292,7 +292,7 @@ class Server:
 
 
 def _wire(description: Mapping[str, Any]) -> EmulatedWire:
-    """What is plugged in, with its faults."""
+    """Return the wire with its servos and faults."""
     tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
     servos = [EmulatedServo(**row) for row in description["servos"]]
     devices = plugged(servos, tables, description["behind_silent"] != "skip")
@@ -301,20 +301,14 @@ def _wire(description: Mapping[str, Any]) -> EmulatedWire:
 
 
 def main() -> None:
-    """Read the description from stdin, say `ready`, serve."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the host, which still has to stop its servos
+    """Read the description, report where the chain is, serve."""
+    parent = ParentPipe()  # ignores Ctrl-C, which is for the host: it still has to stop its servos
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    line = b""
-    while not line.endswith(b"\n"):  # unbuffered: run() watches the same descriptor
-        part = os.read(sys.stdin.fileno(), 1 << 16)
-        if not part:
-            return
-        line += part
-    description = json.loads(line)
+    description = parent.receive()
     try:
         wire = _wire(description)
     except ConfigError as error:
-        sys.stdout.write(f"refused {error}\n")
+        parent.send(error)
         return
     folder = tempfile.mkdtemp(prefix="sfms-robot-")
     link = description["link"] or os.path.join(folder, "device")
@@ -322,13 +316,7 @@ def main() -> None:
         server = Server(wire, description["virtual"], folder, link)
         # A servo has a processor of its own: it answers in time whatever else this computer does.
         with closing(server), realtime_priority(wanted=not description["virtual"]) as priority:
-            ready = {"device": link, "control": server.control, "folder": folder, "priority": priority}
-            sys.stdout.write(f"ready {json.dumps(ready)}\n")
-            sys.stdout.flush()
-            server.run()
+            parent.send({"device": link, "control": server.control, "folder": folder, "priority": priority})
+            server.run(parent.incoming.fileno())
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-if __name__ == "__main__":
-    main()

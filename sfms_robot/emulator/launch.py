@@ -1,31 +1,31 @@
-"""Start an emulated servo chain in a process of its own, and stop it again.
+"""Start an emulated servo chain in a child process, and stop it again.
 
     with launch([EmulatedServo(1), EmulatedServo(2, start_ticks=1500)]) as chain:
         SerialPort(chain.device, 1_000_000, clock)
 
 Servos of several protocols, and boards, may share one wire.
 
-The process ends with the `with` block, and by itself when this one dies.
+The process ends with the `with` block, and when this one dies.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import select
+import queue
 import shutil
 import socket
-import subprocess
-import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import IO, Any, Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.processes import Child
 
 __all__ = ["Chain", "EmulatedServo", "launch", "wait"]
 
@@ -33,6 +33,7 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_CLOSE_S = 5.0
 _refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
@@ -46,11 +47,11 @@ class Chain:
         control: path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
-        priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
-        process, folder: what ends with it.
+        priority: "fifo" where it answers as promptly as hardware; else why not (`processes.realtime_priority`).
+        child, folder: its process, and the folder of its socket; both end with it.
     """
 
-    process: subprocess.Popen[bytes]
+    child: Child
     servos: Sequence[EmulatedServo]
     virtual: bool
     device: str
@@ -60,18 +61,20 @@ class Chain:
 
     @property
     def pid(self) -> int:
-        return self.process.pid
+        """Return the id of its process."""
+        return self.child.process.pid
 
     @property
     def read_deadline_s(self) -> float:
-        """Silence after which one of its servos is rightly called silent."""
+        """Return the silence after which one of its servos counts as silent [s]."""
         return PROMPT_DEADLINE_S if self.priority == "fifo" else READ_DEADLINE_S
 
     def kill(self, servo_id: int) -> None:
-        """The servo falls silent, as with its cable out; its motor keeps doing what it was told."""
+        """Silence a servo, as with its cable out; its motor follows its last goal."""
         self.ask(f"kill {servo_id}")
 
     def revive(self, servo_id: int) -> None:
+        """Let a servo answer again."""
         self.ask(f"revive {servo_id}")
 
     def fault(self, servo_id: int, bits: int) -> None:
@@ -83,30 +86,31 @@ class Chain:
         self.ask(f"turn {servo_id} {ticks}")
 
     def heat(self, servo_id: int, temperature_C: float) -> None:
-        """A servo has this temperature from now on, and goes where its load takes it."""
+        """Set the temperature of a servo, which follows its load from then on."""
         self.ask(f"heat {servo_id} {temperature_C}")
 
     def state(self, servo_id: int) -> dict[str, Any]:
-        """What an onlooker sees: position [ticks], goal, torque, faults, temperature_C."""
+        """Return the true state of a servo: position [ticks], goal, torque, faults, temperature_C."""
         return cast("dict[str, Any]", self._json(f"state {servo_id}"))
 
     def inject(self, spec: str) -> None:
-        """A fault from now on, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
+        """Begin a fault, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
         self.ask(f"inject {spec}")
 
     def clear_faults(self) -> None:
+        """End all faults."""
         self.ask("clear")
 
     def faults(self) -> list[str]:
-        """Specs of the faults that go on or are to come."""
+        """Return the specs of faults that last or are to come."""
         return cast("list[str]", self._json("faults"))
 
     def supply(self, volts: float) -> None:
-        """Another supply voltage for all servos."""
+        """Set the supply voltage of all servos."""
         self.ask(f"supply {volts!r}")
 
     def hang_up(self) -> None:
-        """Unplug the adapter: hosts see the device vanish."""
+        """Unplug the adapter: the device vanishes for hosts."""
         self.ask("hangup")
 
     def come_back(self) -> None:
@@ -114,32 +118,25 @@ class Chain:
         self.ask("return")
 
     def time_is(self, now_s: float) -> None:
-        """In virtual time: let happen what happens by itself by `now_s`, though no host says a word."""
+        """Advance virtual time to `now_s` without a host."""
         self.ask(f"time {now_s!r}")
 
     def statistics(self) -> dict[str, Any]:
-        """bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
+        """Return bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
         return cast("dict[str, Any]", self._json("stats"))
 
     def stamps(self) -> list[dict[str, Any]]:
-        """The last replies: ids, due_s, sent_s."""
+        """Return the last replies: ids, due_s, sent_s."""
         return cast("list[dict[str, Any]]", self._json("stamps"))
 
-    @property
-    def stdout(self) -> IO[bytes]:
-        """Says nothing any more, and ends with the process."""
-        return cast("IO[bytes]", self.process.stdout)
-
     def digest(self) -> tuple[str, int]:
-        """SHA-256 and number of all bytes that hosts have sent."""
+        """Return SHA-256 and number of all bytes that hosts have sent."""
         _, sha, count = self.ask("digest").split()
         return sha, int(count)
 
     def close(self) -> None:
         """End the process and remove its folder. Idempotent."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        _reap(self.process)
+        self.child.close(_CLOSE_S)
         shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
             os.unlink(self.device)  # it was killed, and left its link behind
@@ -154,7 +151,7 @@ class Chain:
         return json.loads(self.ask(request).removeprefix("json "))
 
     def ask(self, request: str) -> str:
-        """One line to the control socket, and its answer. Raises BusError when it is refused."""
+        """Send one line to the control socket and return the answer. Raises BusError when it is refused."""
         try:
             with socket.socket(socket.AF_UNIX) as control:
                 control.connect(self.control)
@@ -180,10 +177,10 @@ def launch(
     """Start a chain and wait until it can be opened.
 
     Args:
-        virtual: time is what the host says it is (see `servo.port.VirtualTimePort`).
+        virtual: the host sets the time (see `servo.port.VirtualTimePort`).
         timing: replies at once, or in the time that bytes and return delays take.
-        behind_silent: whether the ids behind a silent one in a sync read are silent too.
-        faults: specs (see `emulator.faults`); `seed` throws their dice.
+        behind_silent: "chain_break" silences the ids behind a silent one in a sync read.
+        faults: specs (see `emulator.faults`); `seed` of their random numbers.
         link: a symbolic link to the device, removed at the end.
 
     Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
@@ -205,42 +202,37 @@ def launch(
         "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
         "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
     }
-    process, ready = _started(description)
-    return Chain(process=process, servos=tuple(servos), virtual=virtual, **ready)
+    child, ready = _started(description)
+    return Chain(child=child, servos=tuple(servos), virtual=virtual, **ready)
 
 
-def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
-    """The process, and what it says when it is ready. Raises ConfigError for what it refuses, BusError."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,  # signals of the terminal are for the host
-    )
-    stdin, stdout = cast("IO[bytes]", process.stdin), cast("IO[bytes]", process.stdout)
-    try:
-        stdin.write(json.dumps(description).encode() + b"\n")
-        stdin.flush()
-        ready = stdout.readline() if select.select([stdout], [], [], _START_S)[0] else b""
-    except OSError:
-        ready = b""
-    if not ready.startswith(b"ready "):
-        process.kill()
-        _reap(process)
-        if ready.startswith(b"refused "):
-            raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
-        raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
-    return process, json.loads(ready.removeprefix(b"ready "))
+def _started(description: Mapping[str, Any]) -> tuple[Child, dict[str, str]]:
+    """Return the process, and its message when it is ready. Raises ConfigError for what it refuses, BusError."""
+    child = Child("sfms_robot.emulator.chain_process:main", description, name="emulator")
+    answer = child.receive(_START_S)
+    if isinstance(answer, dict):
+        return child, answer
+    child.close(_CLOSE_S)
+    if isinstance(answer, ConfigError):
+        raise answer
+    raise BusError(f"the emulated chain did not start (exit code {child.process.returncode})")
 
 
 def wait(chains: Sequence[Chain]) -> Chain:
-    """Block until a chain ends by itself, and say which."""
-    pipes = {chain.stdout: chain for chain in chains}
-    return pipes[select.select(list(pipes), [], [])[0][0]]
+    """Block until the process of a chain ends, and return that chain."""
+    ended: queue.SimpleQueue[Chain] = queue.SimpleQueue()
+
+    def join(chain: Chain) -> None:
+        chain.child.reader.join()
+        ended.put(chain)
+
+    for chain in chains:
+        threading.Thread(target=join, args=(chain,), daemon=True).start()
+    return ended.get()
 
 
 def _map(servo: EmulatedServo) -> FirmwareMap:
-    """The layout that holds for its firmware; for families without such layouts, the only one."""
+    """Return the registers of a servo's firmware; for families without firmware maps, the only ones."""
     named = load_firmware_map(servo.model)
     return variant(servo.model, servo.firmware) if named.protocol == 2 else named
 
@@ -258,7 +250,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
             raise _refusal("id", servo.id, "is not a servo id", [f"0..{highest}"])
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
-            raise _refusal("baud", servo.baud, f"is no rate of {servo.model}", bauds)
+            raise _refusal("baud", servo.baud, f"is not a rate of {servo.model}", bauds)
         if table.channels is not None:
             if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
                 problem = "is a board of hobby servos: it has no registers, and does not know its supply"
@@ -267,7 +259,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:
-                raise _refusal("register", name, f"is none of {servo.model}", table.registers)
+                raise _refusal("register", name, f"is not a register of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
                 raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
@@ -278,15 +270,3 @@ def _check_link(link: str) -> None:
         raise _refusal("link", link, "is already there")
     if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
         raise _refusal("link", link, "lies in a folder that does not exist")
-
-
-def _reap(process: subprocess.Popen[bytes]) -> None:
-    """Wait for the end, with force if it takes too long, and close the pipes."""
-    try:
-        process.wait(timeout=5.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None and not pipe.closed:
-            pipe.close()

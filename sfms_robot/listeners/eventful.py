@@ -1,21 +1,30 @@
 """A listener in four parts: events say when, a model of motion says how, kinematics move the eyes, a face never rests.
 
-Of every frame, in this order:
+For each frame, in this order:
 
-    events      hazards look at the person and at what was done before, and decide (`events.model`)
+    events      hazards judge the person and what was done before, and decide (`events.model`)
     control     what has been decided becomes rows of numbers, of the past and of the frames to be planned
-    motion      the model draws head and face, told those rows; the direction of the eyes it leaves alone
-    gaze        the eyes go to where the last gaze shift said, the head follows, and while it nods the eyes stay
-    idle        the small motion of a resting face, where the listener has learned any (`idle_motion`)
+    motion      the model draws head and face from those rows; the direction of the eyes it leaves alone
+    gaze        the eyes go to the target of the last gaze shift, the head follows, and while it nods the eyes stay
+    idle        the small motion of a resting face, where the listener has learned any (`idle`)
 
-An event is decided `LEAD_FRAMES` before it begins, whatever the hop: a plan that is made in between shows it from its
-beginning. What has been decided is never taken back. Between plans frames are kept and nothing is decided: only with
-the next plan could it be told.
+Frame t ends at (t + 1) T. When it has been heard, with P past and A ahead of `MotionModel.control_frames`, horizon H:
 
-The model of motion learned from people who sat before a camera. A face further from that than any camera follows
-(upside down, far off) is not one that it is shown; events judge it against its own last second (`events.sensing`).
+    frame             t-P+1 .. t-1   t | t+1  t+2  t+3  t+4 .. t+H
+    control rows          0 .. P-2 P-1 |   P  P+1  P+2  ..   P+A-1
+    plan frames                        |   0    1    2    3 ..  H-1      times_s[0] = (t + 2) T
+    memory.gaze                      0 |   1    2    3    4 ..   H       state of the eyes after that frame
+    events decided                   d | begin behind frame t+3 = t + LEAD_FRAMES, at (t + 4) T
 
-Laws: `step_many` of several streams is each one's `step`; a plan tells each event once; with nothing decided the eyes
+The hazards of frame t are drawn when frame t brings a plan. With hop h the frames t+1 .. t+h-1 wait, and their hazards
+are drawn, in order, with frame t+h: only its plan could show an event. So an event begins no sooner than the plan that
+brings it, for any hop up to LEAD_FRAMES + 1, and is never taken back. By then h frames of the plan in force have
+passed, so the eyes are where `memory.gaze[h]` says, which becomes `memory.gaze[0]`.
+
+The model of motion learned from people who sat before a camera. A face further from that than a camera follows (upside
+down, far off) is not passed to it; events judge it against its own last second (`events.evidence`).
+
+Laws: `step_many` of several streams is each one's `step`; a plan brings each event once; with nothing decided the eyes
 look at the person; memory holds what is still under way, no more.
 """
 
@@ -32,7 +41,7 @@ import numpy as np
 from sfms_robot.config import Calmness
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.events.model import Decision, EventMemory, EventModel
-from sfms_robot.listeners.idle_motion import IdleMotion, IdleStream
+from sfms_robot.listeners.idle import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.control import control_track
 from sfms_robot.signals.gaze_kinematics import GazeState
@@ -44,10 +53,10 @@ MOVED_M: Final = 1.0
 
 
 class MotionModel(Protocol):
-    """How: a listener that is told what has been decided.
+    """A listener that draws the motion of events decided elsewhere.
 
     Attributes:
-        control_frames: rows it is told of (past, ahead); the past ends with the newest frame heard.
+        control_frames: rows of control that it takes (past, ahead); the past ends with the newest frame heard.
     """
 
     @property
@@ -64,17 +73,21 @@ class MotionModel(Protocol):
     def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]: ...
 
 
-@dataclass(frozen=True)
+Moved = Sequence[tuple[Plan | None, Any]]
+Move = Callable[[Sequence[SpeakerFrame], Sequence[Any], Sequence[Floats | None]], Moved]
+
+
+@dataclass(frozen=True, kw_only=True)
 class EventfulMemory:
-    """What one stream remembers.
+    """The memory of one stream.
 
     Attributes:
         when, how: of the events, and of the motion.
-        events: decided, and not over since longer than the model looks back; the last gaze shift always.
-        news: those of them that no plan has told yet.
-        gaze: state of the eyes after the newest frame decided upon, then after every row of the plan in force.
+        events: decided, and not over for longer than the model looks back; the last gaze shift always.
+        news: those of them that no plan has brought yet.
+        gaze: state of the eyes after the newest frame decided upon, then after every frame of the plan in force.
         idle: the stream's own idle motion; None: it has none.
-        waiting: frames since then, which events are told of with the next plan.
+        waiting: frames since then, whose hazards are drawn with the next plan.
     """
 
     when: EventMemory
@@ -87,7 +100,7 @@ class EventfulMemory:
 
 
 class EventfulListener:
-    """`ports.Listener`: `when` decides, `how` moves, `idle` is what it does meanwhile. Holds weights only."""
+    """`ports.Listener`: `when` decides, `how` moves, `idle` moves a face at rest. Holds weights only."""
 
     def __init__(
         self, how: MotionModel, when: EventModel, calmness: Calmness | None = None, idle: IdleMotion | None = None
@@ -96,57 +109,71 @@ class EventfulListener:
 
     @property
     def hop(self) -> int:
+        """Return the frames from one plan to the next."""
         return self.how.hop
 
     @property
     def horizon(self) -> int:
+        """Return the frames of a plan."""
         return self.how.horizon
 
     @property
     def hops(self) -> Sequence[int]:
-        """Those that `at_hop` may be asked for."""
+        """Return the hops that `at_hop` takes."""
         return tuple(getattr(self.how, "hops", (self.hop,)))
 
     def at_hop(self, hop: int) -> Self:
-        """The same, planning every `hop` frames."""
+        """Return the same listener, planning every `hop` frames."""
         other = copy.copy(self)
         other.how = self.how if hop == self.hop else cast(Any, self.how).at_hop(hop)
         return other
 
     def build_graphs(self) -> Self:
-        """The weights stay as they are from now on. Itself."""
+        """Compile the networks; their weights must not change any more. Return the listener."""
         build: Callable[[], object] | None = getattr(self.how, "build_graphs", None)
         if build is not None:
             build()
         return self
 
     def start(self, seed: int) -> EventfulMemory:
-        """Memory of a stream that has heard nothing and decided nothing."""
+        """Return the memory of a stream that has heard nothing and decided nothing."""
         when = self.when.start(seed, self.calmness)
         idle = None if self.idle is None else self.idle.start(seed)
-        return EventfulMemory(when, self.how.start(seed), (), (), (gaze_kinematics.start(seed),), idle)
+        gaze = (gaze_kinematics.start(seed),)
+        return EventfulMemory(when=when, how=self.how.start(seed), events=(), news=(), gaze=gaze, idle=idle)
 
     def calmed(self, memory: EventfulMemory, calmness: Calmness) -> EventfulMemory:
-        """The same stream, from now on with other rates."""
+        """Return the memory with other rates from now on."""
         if memory.waiting:
             ((_, memory),) = self._decided([memory.waiting], [memory])
         return changed(memory, when=self.when.calmed(memory.when, calmness))
 
     def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
-        """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place."""
+        """Take one frame; return a plan on every `hop`-th, None between, and the memory after it."""
         return self.step_each([speaker], [memory])[0]
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Plan | None, EventfulMemory]]:
-        """See `ports.BatchListener`; a motion model that steps one stream at a time is asked for each."""
+        """Step several streams, as `ports.BatchListener`."""
+        return self._step(speakers, memories, self._move_each)
+
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
+    ) -> tuple[list[Plan], list[EventfulMemory]]:
+        """Step streams that began together and have had the same speaker ever since; no plans between hops."""
+        found = self._step([speaker] * len(memories), memories, self._move_many)
+        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
+
+    def _step(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory], move: Move
+    ) -> list[tuple[Plan | None, EventfulMemory]]:
         decided = self._heard(speakers, memories)
-        told = [memory for _, memory in decided]
         controls = [
             None if decision is None else self._control(speaker, memory)
             for speaker, (decision, memory) in zip(speakers, decided, strict=True)
         ]
-        moved = self._move_each([*map(_believed, speakers)], [memory.how for memory in told], controls)
+        moved = move([*map(_believed, speakers)], [memory.how for _, memory in decided], controls)
         return [
             self._looking(plan, decision, changed(memory, how=how))
             for (plan, how), (decision, memory) in zip(moved, decided, strict=True)
@@ -154,42 +181,27 @@ class EventfulListener:
 
     def _move_each(
         self, speakers: Sequence[SpeakerFrame], hows: Sequence[Any], controls: Sequence[Floats | None]
-    ) -> Sequence[tuple[Plan | None, Any]]:
-        together = getattr(self.how, "step_each", None)
-        if together is None:
-            return [self.how.step(*each) for each in zip(speakers, hows, controls, strict=True)]
-        moved: Sequence[tuple[Plan | None, Any]] = together(speakers, hows, controls)
-        return moved
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[EventfulMemory]
-    ) -> tuple[list[Plan], list[EventfulMemory]]:
-        """`step` of streams that began together and heard the same speaker ever since; no plans between hops."""
-        decided = self._heard([speaker] * len(memories), memories)
-        told = [memory for _, memory in decided]
-        controls = [None if decision is None else self._control(speaker, memory) for decision, memory in decided]
-        plans, hows = self._move_many(_believed(speaker), [memory.how for memory in told], controls)
-        found = [
-            self._looking(plan, decision, changed(memory, how=how))
-            for plan, (decision, memory), how in zip(plans, decided, hows, strict=True)
-        ]
-        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
+    ) -> Moved:
+        together: Move | None = getattr(self.how, "step_each", None)
+        if together is not None:
+            return together(speakers, hows, controls)
+        return [self.how.step(*each) for each in zip(speakers, hows, controls, strict=True)]
 
     def _move_many(
-        self, speaker: SpeakerFrame, hows: Sequence[Any], controls: Sequence[Floats | None]
-    ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
+        self, speakers: Sequence[SpeakerFrame], hows: Sequence[Any], controls: Sequence[Floats | None]
+    ) -> Moved:
         together = getattr(self.how, "step_many", None)
         if together is None:
-            each = [self.how.step(speaker, how, control) for how, control in zip(hows, controls, strict=True)]
-            return [plan for plan, _ in each], [how for _, how in each]
-        plans, after = together(speaker, hows, controls)
-        return plans or [None] * len(hows), after
+            return self._move_each(speakers, hows, controls)
+        plans, after = together(speakers[0], hows, controls)
+        return [*zip(plans or [None] * len(hows), after, strict=True)]
 
     def _heard(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Decision | None, EventfulMemory]]:
-        """What is decided up to a frame that brings a plan, of each stream, and the memory that knows of it; with any
-        other frame nothing is, and it waits.
+        """Return the decision of each stream up to a frame that brings a plan, and the memory after it.
+
+        With any other frame the decision is None, and the frame waits.
         """
         is_due: Callable[[Any], bool] = getattr(self.how, "is_due", lambda _: True)
         found: list[tuple[Decision | None, EventfulMemory]] = [
@@ -205,30 +217,30 @@ class EventfulListener:
     def _decided(
         self, speakers: Sequence[Sequence[SpeakerFrame]], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Decision, EventfulMemory]]:
-        """What the frames of each stream decide, as the last one leaves it, and the memory that knows of it."""
+        """Draw the hazards of the frames of each stream; return the last decision, and the memory with all events."""
         past_s = self.how.control_frames[0] * FRAME_S
-        told = [(Decision((), {}), memory.when, memory.news) for memory in memories]
+        drawn = [(Decision((), {}), memory.when, memory.news) for memory in memories]
         for at in range(max(map(len, speakers), default=0)):
             rows = [row for row, own in enumerate(speakers) if at < len(own)]
-            decided = self.when.step_each([speakers[row][at] for row in rows], [told[row][1] for row in rows])
+            decided = self.when.step_each([speakers[row][at] for row in rows], [drawn[row][1] for row in rows])
             for row, (decision, when) in zip(rows, decided, strict=True):
-                told[row] = decision, when, told[row][2] + decision.events
+                drawn[row] = decision, when, drawn[row][2] + decision.events
         found = []
-        for own, memory, (decision, when, news) in zip(speakers, memories, told, strict=True):
+        for own, memory, (decision, when, news) in zip(speakers, memories, drawn, strict=True):
             events = _remembered((*memory.events, *news[len(memory.news) :]), own[-1].time_s - past_s)
             gaze = memory.gaze[min(len(own), len(memory.gaze) - 1) :]  # so many frames have passed
             found.append((decision, changed(memory, when=when, events=events, news=news, gaze=gaze, waiting=())))
         return found
 
     def _control(self, speaker: SpeakerFrame, memory: EventfulMemory) -> Floats:
-        """What the motion model is told with a frame that brings a plan."""
+        """Return the control rows of frames t - P + 1 to t + A, when frame t brings a plan."""
         past, ahead = self.how.control_frames
         return control_track(memory.events, frame_of(speaker) + 1 - past, past + ahead)
 
     def _looking(
         self, plan: Plan | None, decision: Decision | None, memory: EventfulMemory
     ) -> tuple[Plan | None, EventfulMemory]:
-        """The plan with eyes, what was decided since the one before, and the memory after it."""
+        """Return the plan with eyes, idle motion and the new events, and the memory after it."""
         if plan is None or decision is None:
             return None, memory
         newest = memory.gaze
@@ -241,12 +253,12 @@ class EventfulListener:
         if memory.idle is not None:
             silent_s = memory.when.sensed.hearing.own_voice_s + plan.times_s - plan.times_s[0]
             frames = memory.idle.added(frames, plan.times_s, silent_s)
-        told = changed(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
-        return told, changed(memory, news=(), gaze=(newest[0], *states))
+        drawn = changed(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
+        return drawn, changed(memory, news=(), gaze=(newest[0], *states))
 
 
 def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
-    """The frame without its face where that is turned or moved further than a person before a camera is."""
+    """Return the frame without its face where that is turned or moved further than a person before a camera is."""
     if speaker.face is None:
         return speaker
     pose = [abs(value) for value in speaker.face.pose.tolist()]
@@ -255,7 +267,7 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
 
 
 def _kept(speaker: SpeakerFrame) -> SpeakerFrame:
-    """The frame with arrays of its own: whoever gave it may use them again."""
+    """Return the frame with copies of its arrays: the caller may use them again."""
     face, own = speaker.face, speaker.agent_audio
     return changed(
         speaker,
@@ -266,12 +278,12 @@ def _kept(speaker: SpeakerFrame) -> SpeakerFrame:
 
 
 def frame_of(speaker: SpeakerFrame) -> int:
-    """The index of a frame in loop time: frame 0 ends at 0.04 s."""
+    """Return the index of a frame in loop time: frame 0 ends at 0.04 s."""
     return round(speaker.time_s * FRAME_HZ) - 1
 
 
 def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, float]:
-    """(yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; at the person before the first."""
+    """Return (yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; at the person before the first."""
     for event in reversed(events):
         if event.target_rad is not None and event.start_s <= time_s + 1e-9:
             return event.target_rad
@@ -279,7 +291,7 @@ def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, fl
 
 
 def _remembered(events: tuple[ListenerEvent, ...], keep_s: float) -> tuple[ListenerEvent, ...]:
-    """Events that are not over by `keep_s`, in the order of their decision, and the last gaze shift begun by then."""
+    """Return events that are not over by `keep_s`, in order of decision, and the last gaze shift begun by then."""
     if not events:
         return events
     shifts = [event for event in events if event.target_rad is not None and event.start_s <= keep_s]

@@ -176,7 +176,7 @@ def whole_integers() -> bool:
 # --- Choice of an engine ----------------------------------------------------------------------------------------------
 #
 # `auto` is onnx where onnxruntime is installed and the folder has graphs that fit, torch elsewhere. The loading
-# process (`process_child`) measures whether one thread or all free cores are faster. No probe imports torch only to
+# process (`process`) measures whether one thread or all free cores are faster. No probe imports torch only to
 # find that it is slower: that costs two seconds and 200 MB.
 
 

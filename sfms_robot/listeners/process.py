@@ -1,51 +1,40 @@
-"""A listener in a process of its own: the same `step`, frames one way, plans the other, over two pipes.
+"""A listener in a child process: the same `step`, frames one way, plans the other. Both ends are in this file.
 
 In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
-model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it. It ends
-when its pipe does, so it never outlives its parent, whatever killed that.
+model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.
 
-The child says of every frame that it is done. Until it listens, its main thread's processor time is the sign of life:
-loading from a slow disk uses some all the time, a child that is stopped or waits for a lock uses none. A child without
-a sign for `HUNG_S` is named as hung, and restarted after the limit of its phase; the head continues without it. After
-`RESTARTS` in a minute it stays down.
+A listener that is loaded is not yet fast: it builds its graphs while the head eases in, tries whether more than one
+thread is faster, and measures what a plan takes on this machine. From that, and from how late the source has been for
+half a second, the parent chooses its hop. Every ten seconds the choice is compared with what has been measured since: a
+hop that does not fit any more is replaced by a shorter one, never by a longer one, so that it settles.
 
-    phase      no sign of life           restarted after it lasts    or after, in all
-    starting   no processor time         `LOAD_RESTART_S`            `PHASE_LIMIT_S`
-    building   no processor time         `RESTART_S`                 `PHASE_LIMIT_S`
-    listening  an answer is due          `RESTART_S`                 -
+`processes.LIMITS["listener"]` says when a child counts as hung and when it is started again. Signs of life:
 
-Where the system does not report processor time (`_Child.worked_ns`), only `PHASE_LIMIT_S` limits the first two.
+    starting, loading   processor time of its main thread: loading from a slow disk uses some all the time, a child that
+                        is stopped or waits for a lock uses none. Where the system does not report it, always.
+    running             an answer to each frame
 
-What a slow machine did not hear (`inbox`) is counted, and said once.
-
-By what a plan takes on this machine, which the child measures (`process_child`), and by how late the source has been
-for half a second, its hop is chosen. Every ten seconds the choice is held against what has been measured since: a hop
-that does not fit any more gives way to a shorter one, and never to a longer one, so that it settles.
-
-    parent -> child    pickle: (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
-                       int: the hop, which it waits for and which may change; at any time another Calmness
-    child -> parent    pickle: (kind, value, number)
-        loaded         nothing is wrong with it; value names its engine
-        probed         value is a `Probe`; it waits for its hop
-        ready          it listens
-        done, plan     a frame was taken; for a plan, value is the answer and number the ms that it took
-        skipped        number frames were left out
-        error          it cannot listen, and value says why
+    parent -> child     (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
+                        int: the hop, which it waits for and which may change; at any time another Calmness
+    child -> parent     (kind, value, number)
+        loaded          it can be loaded; value names its engine
+        probed          value is a `Probe`; it waits for its hop
+        ready           it listens
+        done, plan      a frame was taken; for a plan, value is the answer and number the ms that it took
+        skipped         number frames were left out
+        error           it cannot listen, and value says why
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
-import pickle
 import queue
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.child_process import end_child, messages, start_child
@@ -53,23 +42,31 @@ from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
+import numpy as np
+
+from sfms_robot.config.calmness import Calmness
+from sfms_robot.errors import ModelError, RobotError
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.inbox import MOST_WAITING
+from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, calmed
+from sfms_robot.ports import Listener
+from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, cores, give_way
 from sfms_robot.signals.quantiles import Quantiles
 
-START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
-CLOSE_LIMIT_S: Final = 0.2
-HUNG_S: Final = 1.0
-RESTART_S: Final = 3.0
-LOAD_RESTART_S: Final = 10.0  # starting: a listener of another package may wait for a network or a device
-PHASE_LIMIT_S: Final = START_LIMIT_S  # a child that computes and gets nowhere
-RESTARTS: Final = 5  # in a minute; more than that is no accident
 REVIEW_S: Final = 10.0
-_LOOK_S: Final = 0.1  # at a child that loads, while nothing else runs
 SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
-_MINUTE_S: Final = 60.0
+_LOOK_S: Final = 0.1  # between two checks of a child that loads, while nothing else runs
+# Names of phases in statistics.
+_STATES: Final = {"backing off": "starting", "loading": "building", "running": "listening"}
+
+NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
+AWAKE_S: Final = 0.25
+PROBE_S: Final = 0.5
+PROBE_PLANS: Final = 12
 
 log = logging.getLogger(__name__)
+
+Say = Callable[[tuple[str, Any, float]], object]
 
 
 class ListenerProcess:
@@ -78,7 +75,7 @@ class ListenerProcess:
     Args:
         name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
         seed: of the stream.
-        calmness: how often a listener that decides events does what.
+        calmness: rates of the events of a listener that decides them.
         engine: what its networks are computed by.
         clock: seconds, for `wait_loaded`; `push` and `poll` are given theirs.
     """
@@ -91,32 +88,24 @@ class ListenerProcess:
         engine: EngineName = "auto",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._name, self._seed, self._calmness, self._wanted = name, seed, calmness, engine
+        self._name, self._calmness, self._wanted, self._clock = name, calmness, engine, clock
+        self._seeds = itertools.count(seed)  # a child that is started again gets another one
         self._engine: str | None = None
         self._step_ms = Quantiles()
-        self._lateness = Lateness()
-        self._skipped = 0
-        self._restarted_s: list[float] = []
-        self._restarts = 0
-        self._state = "starting"
-        self._hung = False
-        self._waits_since_s: float | None = None  # for a sign of life, or the answer to the oldest frame without one
-        self._phase_since_s: float | None = None  # starting or building, other than for us
+        self._skipped = self._pushed = 0
         self._worked_ns = 0
-        self._clock = clock
-        self._unanswered = 0
+        self._answered = False  # since the last check
+        self._failure: str | None = None
         self._latencies: Callable[[Probe], Latencies] | None = None
-        self._probe: Probe | None = None  # that is to be answered with a hop
         self._choice: HopChoice | None = None
         self._probed: Probe | None = None  # what the choice in force was made by
         self._review_s = math.inf
-        self._pushed = 0
-        self._child = _Child(name, seed, calmness, engine)
+        self._supervised = Supervised("listener", LIMITS["listener"], self._start)
 
     def calm(self, calmness: Calmness) -> None:
-        """From the next frames on. Never blocks; a listener that decides nothing takes no notice."""
+        """Use other rates from the next frames on. Never blocks; a listener that decides nothing ignores them."""
         self._calmness = calmness
-        self._child.tell(calmness)
+        self._supervised.child.send(calmness)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded, and restart a child that hangs.
@@ -124,64 +113,66 @@ class ListenerProcess:
         Raises ModelError with the child's own message where it cannot be loaded.
         """
         began_s = self._clock()
-        while self._state == "starting" and self._clock() - began_s <= limit_s:
-            message = self._child.message(_LOOK_S)
-            if message is None:
-                if not self._child.ended:  # one that ended has left a message why
-                    self._supervise(self._clock())
-            elif message[0] == "error":
+        while self._supervised.phase in ("starting", "backing off") and self._clock() - began_s <= limit_s:
+            message = self._supervised.child.receive(_LOOK_S)
+            if message is not None:
+                self._take(message, began_s)
+            if self._failure is not None:
                 self.close()
-                raise ModelError(message[1])
-            else:
-                self._take(*message, began_s)
-        if self._state in ("starting", "given up"):
+                raise ModelError(self._failure)
+            self._check(self._clock())
+        if self._supervised.phase not in ("loading", "running"):
             self.close()
             raise ModelError(f"the listener process was not loaded after {limit_s:g} s")
-        self._restarted_s.clear()  # times of another clock than those of `poll`
 
     def choose_hop_by(self, source_latency_s: Callable[[], float], lead_s: float, tick_s: float) -> None:
-        """Choose the hop when it is known what a plan takes here, for a source that is so late, a loop of `tick_s` and
-        leads up to `lead_s`. Without this call the listener keeps its own.
+        """Choose the hop once it is known what a plan takes here. Without this call the listener keeps its own.
+
+        Args:
+            source_latency_s: returns how late the source is by now.
+            lead_s: longest lead of a joint.
+            tick_s: of the loop.
         """
         self._latencies = lambda probe: Latencies(
             probe.horizon, source_latency_s(), probe.step_p50_s, probe.step_p99_s, lead_s, tick_s
         )
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
-        """Never blocks; what a child that does not listen leaves behind is dropped, oldest first, and counted."""
-        if self._state in ("starting", "given up"):
+        """Send a frame. Never blocks; of frames that a child does not take, the oldest are dropped and counted."""
+        if self._supervised.phase not in ("loading", "running"):
             return
         self._pushed += 1
-        self._tell_hop()
-        self._skipped += self._child.send(frame)
-        self._unanswered += 1
-        self._waits_since_s = now_s if self._waits_since_s is None else self._waits_since_s
+        self._send_hop()
+        dropped = self._supervised.child.offer(frame)
+        self._skipped += dropped
+        self._unanswered += 1 - dropped
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Return plans that came. Never blocks, never raises: a child that died or hangs is restarted."""
         plans = []
-        while (message := self._child.message()) is not None:
-            plan = self._take(*message, now_s)
+        while (message := self._supervised.child.receive()) is not None:
+            plan = self._take(message, now_s)
             if plan is not None:
                 plans.append(plan)
-        self._supervise(now_s)
+        self._check(now_s)
         self._review(now_s)
         return plans
 
     @property
     def lost(self) -> bool:
         """Return whether it hangs, restarts, is given up, or always comes too late."""
-        away = self._state == "given up" or (self._restarts > 0 and self._state != "listening")
-        return self._hung or away or self._lateness.lasting
+        return self._supervised.away or self._lateness.lasting
 
     def statistics(self) -> Mapping[str, Any]:
         """Return `state` (starting, building, listening, late, hung, given up), `engine` in words, `restarts`,
         `skipped_frames`, `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """
+        phase = self._supervised.phase
+        state = "hung" if self._supervised.hung else self._lateness.named(_STATES.get(phase, phase))
         return {
-            "state": "hung" if self._hung else self._lateness.named(self._state),
+            "state": state,
             "engine": self._engine,
-            "restarts": self._restarts,
+            "restarts": self._supervised.restarts,
             "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
             "hop": None if self._choice is None else self._choice.hop,
@@ -189,54 +180,79 @@ class ListenerProcess:
         }
 
     def close(self) -> None:
-        """End the child; blocks for `CLOSE_LIMIT_S` at most. Idempotent."""
-        self._child.close()
+        """End the child; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""
+        self._supervised.child.close(CLOSE_LIMIT_S)
 
-    def _take(self, kind: str, value: Any, number: float, now_s: float) -> Plan | None:
+    def _start(self) -> Child:
+        self._unanswered = 0
+        self._probe: Probe | None = None  # that is to be answered with a hop
+        self._lateness = Lateness()
+        order = (self._name, next(self._seeds), self._calmness, self._wanted)
+        return Child(f"{__name__}:main", order, name="listener", kept=MOST_WAITING)
+
+    def _take(self, message: Any, now_s: float) -> Plan | None:
+        if isinstance(message, Ended):
+            self._failure = f"the listener process died (exit code {message.code})"
+            return None
+        kind, value, number = message
         if kind == "error":
-            log.error("the listener cannot go on: %s", value)
+            self._failure = value
+        elif kind == "loaded":
+            self._engine = value
+            self._supervised.enter("loading")
+        elif kind == "probed":
+            self._probe = value
+            self._send_hop()
+        elif kind == "ready":
+            self._supervised.enter("running")
+            self._review_s = now_s + REVIEW_S
         elif kind == "skipped":
             if not self._skipped:
                 log.warning("the listener is slower than the person: it leaves frames out to keep up")
             self._skipped += int(number)
-            self._answered(int(number), now_s)
-        elif kind == "loaded":
-            self._state, self._engine = "building", value
-            self._waits_since_s = self._phase_since_s = None
-        elif kind == "probed":
-            self._probe = value
-            self._tell_hop()
-        elif kind == "ready":
-            if self._restarts:
-                log.warning("the listener is back")
-            self._state, self._waits_since_s = "listening", now_s if self._unanswered else None
-            self._review_s = now_s + REVIEW_S
+            self._count_answers(int(number))
         else:
-            self._answered(1, now_s)
+            self._count_answers(1)
             if kind == "plan":
+                plan: Plan = value
                 self._step_ms.add(number)
-                self._lateness.came(value, now_s)
-                return value  # type: ignore[no-any-return]
+                self._lateness.came(plan, now_s)
+                return plan
         return None
 
-    def _tell_hop(self) -> None:
-        """Answer a probe, as soon as that can be."""
+    def _count_answers(self, frames: int) -> None:
+        self._unanswered = max(0, self._unanswered - frames)
+        self._answered = True
+
+    def _check(self, now_s: float) -> None:
+        if self._probe is not None:
+            self._supervised.phase_s = 0.0  # it waits for its hop
+        if self._supervised.phase == "running":
+            alive = self._answered or not self._unanswered
+        else:
+            before_ns, self._worked_ns = self._worked_ns, self._supervised.child.worked_ns()
+            alive = not self._worked_ns or self._worked_ns != before_ns
+        self._answered, failure, self._failure = False, self._failure, None
+        self._supervised.check(now_s, alive, failure)
+
+    def _send_hop(self) -> None:
+        """Answer a probe, as soon as the source has settled."""
         probe = self._probe
         if probe is None or (self._latencies is not None and self._pushed < SETTLED_FRAMES):
             return
         self._probe = None
         if self._latencies is None:
-            self._child.tell(probe.hop)
+            self._supervised.child.send(probe.hop)
             return
         before, self._choice = self._choice, choose_hop(probe.hops, self._latencies(probe))
         self._probed = probe
-        self._child.tell(self._choice.hop)
+        self._supervised.child.send(self._choice.hop)
         if self._choice.given_up and (before is None or before.given_up is None):
             log.warning("a plan every %d frames: %s", self._choice.hop, self._choice.given_up)
 
     def _review(self, now_s: float) -> None:
-        """A shorter hop, where the one in force does not fit what is measured by now."""
-        if now_s < self._review_s or self._state != "listening":
+        """Choose a shorter hop where the one in force does not fit what is measured by now."""
+        if now_s < self._review_s or self._supervised.phase != "running":
             return
         self._review_s = now_s + REVIEW_S
         if self._choice is None or self._probed is None or self._latencies is None or not len(self._step_ms):
@@ -248,178 +264,110 @@ class ListenerProcess:
             if choice.hop != hop:
                 log.info("a plan every %d frames, %d before, by what is measured", choice.hop, hop)
                 self._choice = choice
-                self._child.tell(choice.hop)
-
-    def _answered(self, frames: int, now_s: float) -> None:
-        self._unanswered = max(0, self._unanswered - frames)
-        self._waits_since_s = now_s if self._unanswered else None
-
-    def _supervise(self, now_s: float) -> None:
-        """Name a child without a sign of life, and restart it after the limit of its phase."""
-        if self._state == "given up":
-            return
-        if self._child.ended:
-            self._restart("died", now_s)
-            return
-        if self._state != "listening" and self._loads_too_long(now_s):
-            self._restart(f"is {self._state} for {PHASE_LIMIT_S:g} s", now_s)
-            return
-        silent_s = 0.0 if self._waits_since_s is None else now_s - self._waits_since_s
-        if silent_s > (LOAD_RESTART_S if self._state == "starting" else RESTART_S):
-            self._restart(f"has not answered for {silent_s:.1f} s", now_s)
-        elif (silent_s > HUNG_S) != self._hung:
-            self._hung = not self._hung
-            if self._hung:
-                log.warning("the listener (%s) has not answered for %.1f s", self._state, silent_s)
-            else:
-                log.info("the listener answers again")
-
-    def _loads_too_long(self, now_s: float) -> bool:
-        """Look for a sign of life of a child that starts or builds; whether that has lasted too long in all."""
-        worked_ns = self._child.worked_ns()
-        if self._waits_since_s is None or not worked_ns or worked_ns != self._worked_ns:
-            self._waits_since_s, self._worked_ns = now_s, worked_ns
-        if self._phase_since_s is None or self._probe is not None:  # a child with a probe waits for us
-            self._phase_since_s = now_s
-        return now_s - self._phase_since_s > PHASE_LIMIT_S
-
-    def _restart(self, why: str, now_s: float) -> None:
-        self._child.kill()
-        self._restarted_s = [at_s for at_s in self._restarted_s if now_s - at_s < _MINUTE_S]
-        self._hung = False
-        if len(self._restarted_s) >= RESTARTS:
-            log.error("the listener %s again, %d times in a minute: the head continues without it", why, RESTARTS)
-            self._state = "given up"
-            return
-        log.warning("the listener %s: restarted", why)
-        self._restarted_s.append(now_s)
-        self._restarts += 1
-        self._state, self._waits_since_s, self._phase_since_s, self._unanswered = "starting", None, None, 0
-        self._probe = None
-        self._lateness = Lateness()
-        self._child = _Child(self._name, self._seed + self._restarts, self._calmness, self._wanted)
+                self._supervised.child.send(choice.hop)
 
 
-class _Child:
-    """One interpreter and its two threads; nothing here blocks except `close`, and `message` with a limit."""
-
-    def __init__(self, name: str, seed: int, calmness: Calmness | None, engine: EngineName) -> None:
-        self._process = start_child("sfms_robot.listeners.process_child:main")
-        self._frames: deque[Any] = deque([(name, seed, calmness, engine)])
-        self._urgent: deque[int | Calmness] = deque()
-        self._changed = threading.Condition()
-        self._messages: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
-        self.ended = False
-        self._closing = False
-        self._named = False  # what to load was sent: it goes before all
-        self._threads = [
-            threading.Thread(target=work, name=f"listener {work.__name__}", daemon=True)
-            for work in (self._write, self._read)
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def send(self, frame: SpeakerFrame) -> int:
-        """Queue a frame; the number of older ones dropped for it."""
-        with self._changed:
-            self._frames.append(frame)
-            dropped = max(0, len(self._frames) - MOST_WAITING)
-            for _ in range(dropped):
-                self._frames.popleft()
-            self._changed.notify()
-        return dropped
-
-    def tell(self, value: int | Calmness) -> None:
-        """It goes before all frames that wait, and is never dropped."""
-        with self._changed:
-            self._urgent.append(value)
-            self._changed.notify()
-
-    def message(self, limit_s: float = 0.0) -> tuple[str, Any, float] | None:
-        """Return the next message, or None when none comes within `limit_s`."""
-        try:
-            return self._messages.get(timeout=limit_s)
-        except queue.Empty:
-            return None
-
-    def worked_ns(self) -> int:
-        """Return the processor time of its main thread so far; 0 where the system (Linux) does not report it."""
-        try:
-            return int(Path(f"/proc/{self._process.pid}/schedstat").read_text().split()[0])
-        except (OSError, ValueError):
-            return 0
-
-    def kill(self) -> None:
-        """Returns at once, also where the child is stopped; the reader sees to the rest."""
-        self._process.kill()
-        self._hang_up()
-
-    def close(self) -> None:
-        self._hang_up()
-        end_child(self._process, CLOSE_LIMIT_S)
-
-    def _hang_up(self) -> None:
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
-
-    def _write(self) -> None:
-        pipe = self._process.stdin
-        assert pipe is not None
-        # It may have died, which the reader sees too, and says so. What could not be sent is dropped with the pipe:
-        # `close` fails over it once more, and has closed the file all the same.
-        with suppress(BrokenPipeError, OSError, ValueError), closing(pipe):
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._closing or self._frames or (self._urgent and self._named))
-                    if self._closing:
-                        break
-                    item = (self._urgent if self._urgent and self._named else self._frames).popleft()
-                    self._named = True
-                pickle.dump(item, pipe, protocol=5)
-                pipe.flush()
-
-    def _read(self) -> None:
-        pipe = self._process.stdout
-        assert pipe is not None
-        with pipe:
-            for message in messages(pipe):
-                self._messages.put(message)
-            code = self._process.wait()
-        self._messages.put(("error", f"the listener process died (exit code {code})", 0.0))
-        self.ended = True
+# --- Child ------------------------------------------------------------------------------------------------------------
 
 
-# --- Lateness ---------------------------------------------------------------------------------------------------------
-#
-# A listener on a computer that is too slow answers, and always too late to be shown.
+def main() -> None:
+    """Load the listener of the first message, then listen until the pipe ends."""
+    parent, inbox, hops = ParentPipe(), Inbox(), queue.SimpleQueue[int]()
+    name, seed, calmness, engine = parent.receive()
 
-LATE_S: Final = 1.0
+    def sort(message: int | Calmness | SpeakerFrame) -> None:
+        if isinstance(message, int):
+            hops.put(message)
+        elif isinstance(message, Calmness):
+            inbox.calmness = message
+        else:
+            inbox.put(message)
+
+    parent.forward(sort)
+    give_way(NICE)
+    try:
+        from sfms_robot.listeners.registry import at_hop, build_graphs, engine_name, hops_of, load_listener
+
+        listener = load_listener(name, graphs=False, calmness=calmness, engine=engine, threads=1)
+        parent.send(("loaded", engine_name(listener), 0.0))
+        build_graphs(listener)
+        choices = hops_of(listener)
+        if use_threads(at_hop(listener, min(choices)), threads()):
+            parent.send(("loaded", engine_name(listener), 0.0))
+        p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
+        parent.send(("probed", Probe(listener.horizon, listener.hop, tuple(choices), p50_s, p99_s), 0.0))
+    except RobotError as error:
+        parent.send(("error", str(error), 0.0))
+        return
+    listen(at_hop(listener, _hop(hops)), seed, inbox, parent.send, hops)
 
 
-class Lateness:
-    """A judge of plans: in time to be shown, or not.
+def threads() -> int:
+    """Return the number of threads that the child may use: one core is the servo loop's."""
+    return max(1, cores() - 1)
 
-    Attributes:
-        lasting: for `LATE_S` every plan has come after the last of its own frames. The first one in time ends it.
+
+def _hop(hops: queue.SimpleQueue[int]) -> int:
+    """Wait for the hop, awake a few times a second: for the parent, a child that uses no processor time hangs."""
+    while True:
+        with suppress(queue.Empty):
+            return hops.get(timeout=AWAKE_S)
+
+
+def use_threads(listener: Listener, most: int) -> bool:
+    """Let a listener's networks use one thread or `most`, whichever makes plans faster here; return whether `most`.
+
+    Blocks for half of `PROBE_S` each where there is a choice.
     """
+    from sfms_robot.listeners.registry import engine_name, set_threads
 
-    def __init__(self) -> None:
-        self.lasting = False
-        self._since_s: float | None = None  # of the first late one in a row
+    if most == 1 or engine_name(listener) is None:
+        return False
+    planned_s = {}
+    for count in (1, most):
+        set_threads(listener, count)
+        planned_s[count], _ = plan_times_s(listener, PROBE_S / 2)
+    if planned_s[1] <= planned_s[most]:
+        set_threads(listener, 1)
+    return planned_s[most] < planned_s[1]
 
-    def named(self, state: str) -> str:
-        """Return "late" for a listening state whose plans are never in time, else `state`."""
-        return "late" if self.lasting and state == "listening" else state
 
-    def came(self, plan: Plan, now_s: float) -> None:
-        """Take a plan that arrived at `now_s`, by the clock of its frames."""
-        if now_s <= plan.times_s[-1]:
-            if self.lasting:
-                log.warning("the listener's plans are in time again")
-            self.lasting, self._since_s = False, None
-            return
-        self._since_s = now_s if self._since_s is None else self._since_s
-        if not self.lasting and now_s - self._since_s >= LATE_S:
-            log.warning("the listener's plans come too late to be shown: the head goes on without them")
-            self.lasting = True
+def plan_times_s(
+    listener: Listener, limit_s: float = PROBE_S, wait: Callable[[float], object] = time.sleep
+) -> tuple[float, float]:
+    """Return median and 99th percentile of what a plan takes, on silence; of all steps where no plan was made.
+
+    At the pace of a run: between two frames caches cool, and a plan takes half as long again. Blocks for `limit_s`, or
+    `PROBE_PLANS` plans, and one step more.
+    """
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    memory = listener.start(0)
+    planned_s: list[float] = []
+    other_s: list[float] = []
+    began_s = time.perf_counter()
+    while len(planned_s) < PROBE_PLANS and (not other_s + planned_s or time.perf_counter() - began_s < limit_s):
+        step_s = time.perf_counter()
+        plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, silence), memory)
+        taken_s = time.perf_counter() - step_s
+        (other_s if plan is None else planned_s).append(taken_s)
+        wait(max(0.0, FRAME_S - taken_s))
+    p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
+    return float(p50_s), float(p99_s)
+
+
+def listen(listener: Listener, seed: int, inbox: Inbox, say: Say, hops: queue.SimpleQueue[int] | None = None) -> None:
+    """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
+    from sfms_robot.listeners.registry import at_hop
+
+    memory = listener.start(seed)
+    say(("ready", None, 0.0))
+    while (frame := inbox.next()) is not None:
+        if inbox.skipped:
+            say(("skipped", None, inbox.skipped))
+        memory = calmed(listener, memory, inbox)
+        while hops is not None and not hops.empty():
+            listener = at_hop(listener, hops.get())
+        began_s = time.perf_counter()
+        plan, memory = listener.step(frame, memory)
+        taken_ms = (time.perf_counter() - began_s) * 1e3
+        say(("done" if plan is None else "plan", plan, taken_ms))

@@ -1,4 +1,4 @@
-"""Which predictor a folder holds: the kinds of `config.listener_kinds`, imported only when chosen."""
+"""Listeners by name: the kinds of `config.listener_kinds`, imported only when chosen."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.engine import Engine, EngineName
 from sfms_robot.listeners.eventful import EventfulListener, MotionModel
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.idle_motion import FILE as IDLE_FILE
-from sfms_robot.listeners.idle_motion import IdleMotion
+from sfms_robot.listeners.idle import FILE as IDLE_FILE
+from sfms_robot.listeners.idle import IdleMotion
 from sfms_robot.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
@@ -24,15 +24,15 @@ def load_listener(
     engine: EngineName = "auto",
     threads: int | None = None,
 ) -> Listener:
-    """A listener by shipped name, of a folder with config.yaml and weights, or of another package.
+    """Return a listener: by its shipped name, from a folder with config.yaml and weights, or from another package.
 
-    Those that ship are `ports.BatchListener`s.
+    Shipped ones are `ports.BatchListener`s.
 
     Args:
-        graphs: ready to run at full speed, which takes torch another second; else `build_graphs` is still to be called.
-        calmness: how often a listener that decides events does what.
-        engine: what its networks are computed by (`onnx_engine`); auto: onnx where it can be, else torch.
-        threads: that its networks may use; None: one, and with torch as many as it is set to.
+        graphs: make it ready to run at full speed, which takes torch another second; else call `build_graphs` later.
+        calmness: rates of the events of a listener that decides them.
+        engine: what computes its networks (`onnx_engine`); auto: onnx where it can be, else torch.
+        threads: for its networks; None: one, and with torch as many as it is set to.
 
     Raises ConfigError or ModelError.
     """
@@ -51,13 +51,13 @@ def load_listener(
 
 
 def engine_name(listener: Listener) -> str | None:
-    """What computes its networks, in words; None for a listener of somebody else's."""
+    """Return what computes its networks, in words; None for a listener of another package."""
     engine = _engine(listener)
     return None if engine is None else engine.name
 
 
 def set_threads(listener: Listener, threads: int) -> None:
-    """Use so many from now on; a listener of somebody else's is left alone."""
+    """Use so many threads from now on; a listener of another package stays unchanged."""
     engine = _engine(listener)
     if engine is not None:
         engine.set_threads(threads)
@@ -69,24 +69,24 @@ def _engine(listener: Listener) -> Engine | None:
 
 
 def build_graphs(listener: Listener) -> None:
-    """The weights stay as they are from now on; a listener of somebody else's may know nothing of graphs."""
+    """Compile its networks, where it can; their weights must not change any more."""
     build = getattr(listener, "build_graphs", None)
     if build is not None:
         build()
 
 
 def hops_of(listener: Listener) -> Sequence[int]:
-    """The hops that it can be run with; its own alone, for one that names none."""
+    """Return the hops that it can be run with; its own alone, for one that names none."""
     return tuple(getattr(listener, "hops", (listener.hop,)))
 
 
 def at_hop(listener: Listener, hop: int) -> Listener:
-    """The listener, planning every `hop` frames, one of `hops_of`."""
+    """Return the listener, planning every `hop` frames, one of `hops_of`."""
     return listener if hop == listener.hop else cast(Listener, cast(Any, listener).at_hop(hop))
 
 
 def one_thread() -> None:
-    """Make torch repeat itself exactly: one thread, so that sums are added in one order."""
+    """Use one thread in torch, so that sums are added in one order and results repeat exactly."""
     import torch
 
     torch.set_num_threads(1)

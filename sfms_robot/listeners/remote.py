@@ -1,13 +1,21 @@
-"""A listener on another machine, as the loop sees it: frames go out, plans come back (`ports.PlanFeed`). Opens nothing.
+"""A listener on another machine, as the loop sees it: frames go out, plans come back (`ports.PlanFeed`).
 
-    joining     it asks to be listened for, again and again, for as long as nobody answers
-    listening   frames go to the stream that it was given; plans come through a jitter buffer
-    hung        frames went out, and nothing has come back for `HUNG_S`; frames go on, and so does the asking
-    refused     the server has said why not; asked again after `REFUSED_S`, since another one may stand there by then
+    joining     it requests a stream, again and again, until a server answers
+    listening   frames go to its stream; plans come through a jitter buffer
+    hung        frames went out, and nothing has come back for `HUNG_S`; frames and requests continue
+    refused     the server has refused, and said why; requested again after `REFUSED_S`: another one may be there then
 
-A server that was started anew knows no streams of before, says so, and is joined again. Memory of a stream is the
-server's: after a new beginning the listener has heard nothing yet. Meanwhile plans run out, the face eases to neutral,
-and the head lives on by itself, as with any listener that is lost (docs/safety.md).
+A server that was started again knows no streams of before, reports that, and is joined again. The memory of a stream is
+the server's: after joining again the listener has heard nothing yet. Meanwhile plans run out, the face eases to
+neutral, and the head lives on, as with any listener that is lost (docs/safety.md).
+
+Keys of zenoh:
+
+    sfms/listen/NAME/join           a query with Join, answered with Welcome or Refusal
+    sfms/listen/NAME/STREAM/up      frames, and notices, from the robot
+    sfms/listen/NAME/STREAM/down    plans, and notices, to it
+
+Frames and plans are never waited for: what the network does not take at once is dropped, since a newer one follows.
 """
 
 from __future__ import annotations
@@ -15,124 +23,47 @@ from __future__ import annotations
 import logging
 import math
 import secrets
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, Protocol
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import FRAME_HZ, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.jitter_buffer import JitterBuffer
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote_messages import (
-    Interface,
+    OURS,
     Join,
     Notice,
     Refusal,
     SentFrame,
     Welcome,
+    Words,
     frame_message,
     parse_plan,
     parse_words,
     words_message,
 )
+from sfms_robot.listeners.remote_timing import ClockOffset, JitterBuffer
+from sfms_robot.network import LOCAL, Connection, Router, check_name, session_config
 from sfms_robot.plugins import REMOTE as PREFIX
 from sfms_robot.signals.quantiles import Quantiles
 
+if TYPE_CHECKING:
+    import zenoh
+
 HUNG_S: Final = 1.0
-JOIN_S: Final = 0.25  # from one asking to the next
+JOIN_S: Final = 0.25  # from one request to the next
 REFUSED_S: Final = 5.0
-AWAY_S: Final = 5.0  # of waiting for the first answer; after that the head begins without
-_TOLD: Final = 64  # events that are remembered as told
+AWAY_S: Final = 5.0  # for the first answer; after that the head begins without
+_SHOWN: Final = 64  # events that are remembered
 _WAIT_S: Final = 0.01
 
 log = logging.getLogger(__name__)
-
-
-class Link(Protocol):
-    """What carries messages to one server and back. Nothing here blocks."""
-
-    @property
-    def where(self) -> str:
-        """For people."""
-
-    @property
-    def problem(self) -> str | None:
-        """Why nothing will ever be carried; None as long as it may."""
-
-    def ask(self, message: bytes) -> None:
-        """To whoever serves; every answer is among `received`."""
-
-    def follow(self, stream: str) -> None:
-        """From now on messages to this stream are received, and `send` means it."""
-
-    def send(self, message: bytes) -> None:
-        """To the stream; may be lost."""
-
-    def received(self) -> Sequence[tuple[float, bytes]]:
-        """What came since the last call, each with its age [s], in the order of coming."""
-
-    def close(self) -> None: ...
-
-
-# --- Clock offset -----------------------------------------------------------------------------------------------------
-#
-# The clock of a server relative to ours, and the delay of a round trip (as in NTP: RFC 5905, section 8). A message
-# leaves at t1 of our clock and arrives at t2 of the server's; its answer leaves at t3 of the server's and arrives at
-# t4 of ours:
-#
-#     offset = ((t2 - t1) + (t3 - t4)) / 2        delay = (t4 - t1) - (t3 - t2)
-#
-# The offset is wrong by half the difference between the two ways, at most by delay / 2, so the sample with the least
-# delay of the last seconds is used. Clocks drift apart, so an old sample is dropped.
-
-WINDOW_S: Final = 10.0
-SET_S: Final = 1.0  # an offset so far from the one believed: a clock was set, or the server is another one
-
-
-@dataclass(frozen=True)
-class ClockSample:
-    """One exchange, complete at `at_s` of our clock; seconds."""
-
-    at_s: float
-    offset_s: float
-    delay_s: float
-
-
-class ClockOffset:
-    """Remembers the samples of `WINDOW_S` that could still become the best one."""
-
-    def __init__(self) -> None:
-        self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
-
-    def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
-        """An exchange: the four times of the section's text, in their order."""
-        sample = ClockSample(
-            came_s,
-            ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,
-            max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s)),
-        )
-        if self._samples and abs(sample.offset_s - self._samples[0].offset_s) > SET_S + sample.delay_s:
-            self._samples.clear()
-        while self._samples and self._samples[-1].delay_s >= sample.delay_s:
-            self._samples.pop()
-        self._samples.append(sample)
-        while came_s - self._samples[0].at_s > WINDOW_S:
-            self._samples.popleft()
-
-    def forget(self) -> None:
-        """Another server."""
-        self._samples.clear()
-
-    @property
-    def best(self) -> ClockSample | None:
-        """The sample that is believed; None before the first."""
-        return self._samples[0] if self._samples else None
-
-    def theirs(self, our_s: float) -> float | None:
-        """A time of our clock by theirs; None while nothing is known of it."""
-        return None if self.best is None else our_s + self.best.offset_s
 
 
 class RemoteListener:
@@ -140,10 +71,11 @@ class RemoteListener:
 
     Args:
         name: of the served listener.
+        link: carries messages; tests have another one.
         seed, calmness: as of `process.ListenerProcess`.
     """
 
-    def __init__(self, name: str, link: Link, seed: int, calmness: Calmness | None = None) -> None:
+    def __init__(self, name: str, link: ZenohLink, seed: int, calmness: Calmness | None = None) -> None:
         self._name, self._link, self._seed, self._calmness = name, link, seed, calmness
         self._client = secrets.token_hex(8)
         self._state = "joining"
@@ -152,7 +84,7 @@ class RemoteListener:
         self._buffer = JitterBuffer(1, 1)
         self._clock = ClockOffset()
         self._step_ms, self._rtt_ms, self._delay_ms = Quantiles(), Quantiles(), Quantiles()
-        self._told: deque[tuple[str, float]] = deque(maxlen=_TOLD)
+        self._shown: deque[tuple[str, float]] = deque(maxlen=_SHOWN)
         self._asked_s = -math.inf
         self._heard_s: float | None = None  # when anything came from the stream, or it began
         self._waiting_since_s: float | None = None  # for an answer to a frame
@@ -163,9 +95,9 @@ class RemoteListener:
     # --- before the loop ---------------------------------------------------------------------------------------------
 
     def wait_loaded(self, limit_s: float = AWAY_S) -> None:
-        """Block until the server has answered, `limit_s` at most: then the head begins without, and one line says so.
+        """Block until the server has answered, `limit_s` at most; after that the head begins without, with a warning.
 
-        Raises ConfigError where the server refuses for good, or the link can never be.
+        Raises ConfigError where the server refuses for good, or the link can never be opened.
         """
         end_s = time.monotonic() + limit_s
         while self._welcome is None and time.monotonic() < end_s:
@@ -195,26 +127,27 @@ class RemoteListener:
             self._waiting_since_s = now_s
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Plans whose turn it is. Never blocks, never raises."""
+        """Return plans whose turn it is. Never blocks, never raises."""
         self._begin_loop(now_s)
         self._attend(now_s)
         self._supervise(now_s)
-        return [self._once_told(plan) for plan in self._buffer.take(now_s)]
+        return [self._with_new_events(plan) for plan in self._buffer.take(now_s)]
 
     @property
     def lost(self) -> bool:
-        """Whether it does not answer: not joined (yet), hung, refused."""
+        """Return whether it does not answer: not joined (yet), hung, refused."""
         return self._state != "listening"
 
     def calm(self, calmness: Calmness) -> None:
-        """From the next frames on."""
+        """Use other rates from the next frames on."""
         self._calmness = calmness
         if self._welcome is not None:
             self._link.send(words_message(Notice("calm", calmness=calmness.model_dump())))
 
     def statistics(self) -> Mapping[str, Any]:
-        """As `ports.PlanFeed`: `state` is joining, listening, hung or refused; `restarts` counts streams begun after
-        the first. `link` says what the way there and back takes [ms], and what was lost on it.
+        """Return the figures of `ports.PlanFeed`, and of the link: delays [ms], and counts of what was lost.
+
+        `state` is joining, listening, hung or refused; `restarts` counts streams begun after the first.
         """
         welcome, best = self._welcome, self._clock.best
         return {
@@ -242,21 +175,21 @@ class RemoteListener:
         }
 
     def close(self) -> None:
-        """Say goodbye. Idempotent."""
+        """Leave the stream and close the link. Idempotent."""
         if self._welcome is not None:
             self._link.send(words_message(Notice("leave")))
             self._welcome = None
         self._link.close()
 
-    # --- what comes --------------------------------------------------------------------------------------------------
+    # --- messages --------------------------------------------------------------------------------------------------
 
     def _begin_loop(self, now_s: float) -> None:
-        """Times of before the loop were of another clock."""
+        """Forget times of before the loop: they are of another clock."""
         if not self._looped:
             self._looped, self._asked_s, self._heard_s = True, -math.inf, now_s
 
     def _attend(self, now_s: float) -> None:
-        """Take what came, and ask to be let in where that is due."""
+        """Handle what came, and request a stream where that is due."""
         for age_s, message in self._link.received():
             try:
                 if message[:1] == b"{":
@@ -273,7 +206,7 @@ class RemoteListener:
             calmness = None if self._calmness is None else self._calmness.model_dump()
             self._link.ask(words_message(Join(self._client, self._seed, calmness)))
 
-    def _listen_to(self, said: Join | Welcome | Refusal | Notice, now_s: float) -> None:
+    def _listen_to(self, said: Words, now_s: float) -> None:
         if isinstance(said, Welcome):
             self._join(said, now_s)
         elif isinstance(said, Refusal) and self._state != "listening":
@@ -283,14 +216,14 @@ class RemoteListener:
         elif isinstance(said, Notice) and said.kind == "skipped":
             self._skipped += said.frames
         elif isinstance(said, Notice) and said.kind == "unknown" and self._state != "joining":
-            log.warning("%s%s has been started anew: joined again", PREFIX, self._name)
+            log.warning("%s%s was started again: joining again", PREFIX, self._name)
             self._lose("joining")
 
     def _join(self, welcome: Welcome, now_s: float) -> None:
         if self._welcome is not None and welcome.stream == self._welcome.stream:
             return  # the answer to an asking during an outage: the stream is still there
-        if not Interface().fits(welcome.interface):
-            reason = f"this robot is {Interface()}; server {welcome.server} is {welcome.interface}"
+        if not OURS.fits(welcome.interface):
+            reason = f"this robot is {OURS}; server {welcome.server} is {welcome.interface}"
             self._listen_to(Refusal(reason, final=True), now_s)
             return
         if self._welcome is None or (self._welcome.horizon, self._welcome.hop) != (welcome.horizon, welcome.hop):
@@ -322,7 +255,7 @@ class RemoteListener:
         self._buffer.put(sent.number, sent.plan, came_s)
 
     def _supervise(self, now_s: float) -> None:
-        """Nothing has come for long, though frames went out."""
+        """Report a hang when nothing has come for long, though frames went out."""
         if self._state != "listening" or self._waiting_since_s is None:
             return
         silent_s = now_s - max(self._waiting_since_s, self._heard_s or 0.0)
@@ -336,14 +269,132 @@ class RemoteListener:
         if state == "joining":
             self._welcome = None
 
-    def _once_told(self, plan: Plan) -> Plan:
-        """The plan without the events that one before has told: each is sent with several plans."""
+    def _with_new_events(self, plan: Plan) -> Plan:
+        """Return the plan without events that one before has brought: each is sent with several plans."""
         fresh: list[ListenerEvent] = []
         for event in plan.events:
             key = event.kind, round(event.start_s - self._buffer.shift_s, 3)
-            if key not in self._told:
-                self._told.append(key)
+            if key not in self._shown:
+                self._shown.append(key)
                 fresh.append(event)
         if len(fresh) == len(plan.events):
             return plan
         return replace(plan, events=tuple(fresh))
+
+
+# --- Link -------------------------------------------------------------------------------------------------------------
+
+ROOT: Final = "sfms/listen"
+ANSWER_S: Final = 2.0  # that the answer to a request may take
+MOST_RECEIVED: Final = 1000  # messages that wait for `received`; the oldest are dropped
+
+
+def join_key(name: str) -> str:
+    """Return the key on which streams are requested."""
+    return f"{ROOT}/{name}/join"
+
+
+def up_key(name: str, stream: str) -> str:
+    """Return the key of messages from the robot."""
+    return f"{ROOT}/{name}/{stream}/up"
+
+
+def down_key(name: str, stream: str) -> str:
+    """Return the key of messages to the robot."""
+    return f"{ROOT}/{name}/{stream}/down"
+
+
+class ZenohLink:
+    """The way to the listener that is served as `name`. Nothing here blocks.
+
+    Attributes:
+        where: the router, for people.
+    """
+
+    def __init__(self, name: str, router: Router = LOCAL) -> None:
+        self._name = name
+        self.where = str(router)
+        self._connection = Connection(session_config("call", router))
+        self._received: deque[tuple[float, bytes]] = deque(maxlen=MOST_RECEIVED)
+        self._lock = threading.Lock()
+        self._publisher: zenoh.Publisher | None = None
+        self._subscriber: Any = None
+
+    @property
+    def problem(self) -> str | None:
+        """Return why no message will ever be carried; None as long as one may."""
+        return self._connection.problem
+
+    def ask(self, message: bytes) -> None:
+        """Send a request to the servers of this name; every answer is among `received`."""
+        session = self._connection.session
+        if session is not None:
+            session.get(join_key(self._name), self._on_reply, payload=message, timeout=ANSWER_S)
+
+    def follow(self, stream: str) -> None:
+        """Receive messages of this stream from now on, and `send` to it."""
+        import zenoh
+
+        session = self._connection.session
+        if session is None:
+            return
+        self._unfollow()
+        self._subscriber = session.declare_subscriber(down_key(self._name, stream), self._on_sample)
+        self._publisher = session.declare_publisher(
+            up_key(self._name, stream),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,  # not gathered into larger packets: that would take time
+        )
+
+    def send(self, message: bytes) -> None:
+        """Send a message to the stream; it may be lost."""
+        if self._publisher is not None:
+            self._publisher.put(message)
+
+    def received(self) -> Sequence[tuple[float, bytes]]:
+        """Return what came since the last call, each message with its age [s], in the order of arrival."""
+        now_s = time.monotonic()
+        with self._lock:
+            taken = [(now_s - came_s, message) for came_s, message in self._received]
+            self._received.clear()
+        return taken
+
+    def close(self) -> None:
+        """Close the connection. Idempotent."""
+        self._unfollow()
+        self._connection.close()
+
+    def _unfollow(self) -> None:
+        for declared in (self._publisher, self._subscriber):
+            if declared is not None:
+                declared.undeclare()
+        self._publisher = self._subscriber = None
+
+    def _on_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._on_sample(reply.ok)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self._received.append((time.monotonic(), sample.payload.to_bytes()))
+
+
+# --- A listener by its name -------------------------------------------------------------------------------------------
+
+NamedFeed = ListenerProcess | RemoteListener
+
+
+def open_feed(
+    name: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL, engine: EngineName = "auto"
+) -> NamedFeed:
+    """Return a feed that loads in a child process, or connects, from now on; `wait_loaded` waits.
+
+    `router`: to a listener on another machine, which chooses its engine itself.
+
+    Raises ConfigError, MissingExtra.
+    """
+    if not name.startswith(PREFIX):
+        return ListenerProcess(name, seed, calmness, engine)
+    served = check_name(name.removeprefix(PREFIX), "listener")
+    return RemoteListener(served, ZenohLink(served, router), seed, calmness)

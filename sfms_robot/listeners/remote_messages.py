@@ -1,4 +1,4 @@
-"""What a robot and a server of listeners say to one another: values in, bytes out, and back. Opens no socket.
+"""Messages between a robot and a server of listeners: values in, bytes out, and back. Opens no socket.
 
 A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian; docs/remote.md says which goes
 where.
@@ -20,29 +20,29 @@ where.
                uint32   number of the frame that it answers
                float64  that frame's `sent`, by the robot's clock
                float64  when that frame came, and float64 when this was sent, by the server's clock
-               float32  what the step took [ms]
+               float32  duration of the step [ms]
                uint16   frames H of the plan, uint16 bytes of JSON
                float64  made at; H float64 times, loop time; H x 58 float32, H x 3 float32 jaw where its flag says so
                JSON     {"events": [...], "hazards_hz": {...}}: also the events of the two plans before, since a plan
                         may be lost
 
-Sound is told as a sound card would: in 65,536 steps, at most 1.0. Everything else survives bit for bit.
+Sound has the resolution of a sound card: 65,536 steps, at most 1.0. Everything else arrives bit for bit.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import struct
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Final
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as validated
 
 from sfms_robot import __version__
-from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import (
     AUDIO_HZ,
@@ -70,6 +70,9 @@ _PLAN: Final = struct.Struct("<BBHIdddfHH")
 _PCM: Final = 32_768.0
 
 
+# --- Frames -----------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class SentFrame:
     """A frame on its way. `sent_s` by the robot's clock, `server_sent_s` by the server's, NaN where that is unknown."""
@@ -80,85 +83,8 @@ class SentFrame:
     server_sent_s: float = math.nan
 
 
-@dataclass(frozen=True)
-class SentPlan:
-    """A plan on its way back; `echo_s` is the `sent_s` of the frame it answers, the others by the server's clock."""
-
-    number: int
-    plan: Plan
-    echo_s: float
-    came_s: float
-    sent_s: float
-    step_ms: float
-
-
-@dataclass(frozen=True)
-class Interface:
-    """What both sides must agree on. The text names them to a person."""
-
-    protocol: int = PROTOCOL
-    version: str = __version__
-    frame_hz: int = FRAME_HZ
-    audio_hz: int = AUDIO_HZ
-    motion: str = "arkit58"
-    channels: tuple[str, ...] = CHANNELS
-
-    def __str__(self) -> str:
-        space = f"{self.motion} ({len(self.channels)} channels)"
-        return (
-            f"sfms-robot {self.version}, protocol {self.protocol}, {self.frame_hz} frames a second, "
-            f"{self.audio_hz} Hz, {space}"
-        )
-
-    def fits(self, other: Interface) -> bool:
-        """Whether they understand one another: all but the version of the program must be the same."""
-        return replace(self, version="") == replace(other, version="")
-
-
-@dataclass(frozen=True)
-class Join:
-    """A robot asks to be listened for. `client` tells robots apart, `calmness` is `config.Calmness` as a mapping."""
-
-    client: str
-    seed: int
-    calmness: Mapping[str, Any] | None = None
-    interface: Interface = field(default_factory=Interface)
-
-
-@dataclass(frozen=True)
-class Welcome:
-    """A stream was begun: its frames go under `stream`. `server` changes when the server is started anew."""
-
-    stream: str
-    server: str
-    listener: str
-    horizon: int
-    hop: int
-    interface: Interface = field(default_factory=Interface)
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """No stream was begun, and why; `final`: asking again cannot help."""
-
-    reason: str
-    final: bool
-
-
-@dataclass(frozen=True)
-class Notice:
-    """`kind` "unknown": there is no such stream (any more); "skipped": `frames` were left out; "leave", "calm"."""
-
-    kind: str
-    frames: int = 0
-    calmness: Mapping[str, Any] | None = None
-
-
-# --- frames ---------------------------------------------------------------------------------------------------------
-
-
 def frame_message(sent: SentFrame) -> bytes:
-    """Raises nothing: what a frame holds was judged where it was made."""
+    """Return a frame as bytes. Raises nothing: the values of a frame were checked where it was made."""
     frame = sent.frame
     audio, own = _pcm(frame.audio), _pcm(frame.agent_audio)
     flags, parts = 0, [audio, own]
@@ -176,192 +102,223 @@ def frame_message(sent: SentFrame) -> bytes:
     if frame.place_m is not None:
         flags |= PLACE
         parts.append(_floats(frame.place_m))
-    header = _FRAME.pack(
-        FRAME, PROTOCOL, flags, sent.number, frame.time_s, sent.sent_s, sent.server_sent_s, len(audio) // 2,
-        len(own) // 2,
-    )  # fmt: skip
+    times_s = frame.time_s, sent.sent_s, sent.server_sent_s
+    header = _FRAME.pack(FRAME, PROTOCOL, flags, sent.number, *times_s, len(audio) // 2, len(own) // 2)
     return b"".join([header, *parts])
 
 
 def parse_frame(data: bytes) -> SentFrame:
-    """Raises PacketError, in one line, for everything else than a whole frame whose values are finite."""
-    rest = _checked(data, FRAME, _FRAME, "a frame")
+    """Return the frame of a message. Raises PacketError, in one line, unless it is whole and its values are finite."""
+    rest = _Reader(data, FRAME, _FRAME, "a frame")
     _, _, flags, number, time_s, sent_s, server_sent_s, samples, own_samples = rest.header
     if samples not in (0, FRAME_SAMPLES) or own_samples not in (0, FRAME_SAMPLES):
-        raise PacketError(f"a frame of {samples} and {own_samples} samples (0 or {FRAME_SAMPLES})")
+        raise PacketError(f"a frame: expected 0 or {FRAME_SAMPLES} samples, got {samples} and {own_samples}")
     if not (math.isfinite(time_s) and math.isfinite(sent_s)) or number >= 1 << 31:
-        raise PacketError("a frame whose time is not finite")
-    audio, own = rest.pcm(samples), rest.pcm(own_samples)
+        raise PacketError("a frame: its time is not finite")
+    audio, own = (np.asarray(rest.array("<i2", count) / _PCM, np.float32) for count in (samples, own_samples))
     face = attention = place_m = None
     if flags & FACE:
-        face_s, motion = rest.number("<d"), rest.floats(MOTION_DIM)
-        face = FaceFrame(face_s, motion[:6], motion[6:], rest.floats(3) if flags & JAW else None)
+        face_s, motion = rest.number(), rest.array("<f4", MOTION_DIM)
+        face = FaceFrame(face_s, motion[:6], motion[6:], rest.array("<f4", 3) if flags & JAW else None)
     if flags & ATTENTION:
-        attention = rest.number("<d", finite=False)  # NaN: nobody wrote it down
+        attention = rest.number(finite=False)  # NaN: unknown
     if flags & PLACE:
-        place_m = rest.floats(3)
+        place_m = rest.array("<f4", 3)
     rest.end()
     frame = SpeakerFrame(time_s, audio, face, own if flags & OWN_VOICE else None, attention, place_m)
     return SentFrame(number, frame, sent_s, server_sent_s)
 
 
-# --- plans ----------------------------------------------------------------------------------------------------------
+# --- Plans ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SentPlan:
+    """A plan on its way back; `echo_s` is the `sent_s` of the frame it answers, the others by the server's clock."""
+
+    number: int
+    plan: Plan
+    echo_s: float
+    came_s: float
+    sent_s: float
+    step_ms: float
+
+
+@validated(frozen=True, config=ConfigDict(allow_inf_nan=False, extra="forbid"))
+class Decided:
+    """The JSON of a plan: its events and those of plans before, and the hazards [1/s] by kind."""
+
+    events: tuple[ListenerEvent, ...]
+    hazards_hz: dict[str, float]
+
+
+_DECIDED: Final = TypeAdapter(Decided)
 
 
 def plan_message(sent: SentPlan, earlier: tuple[ListenerEvent, ...] = ()) -> bytes:
-    """`earlier`: events that plans before have told."""
+    """Return a plan as bytes. `earlier`: events that plans before have brought."""
     plan = sent.plan
-    told = {"events": [asdict(event) for event in (*earlier, *plan.events)], "hazards_hz": dict(plan.hazards_hz)}
-    words = orjson.dumps(told, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS)
-    flags = 0 if plan.jaw_rad is None else JAW
-    header = _PLAN.pack(
-        PLAN, PROTOCOL, flags, sent.number, sent.echo_s, sent.came_s, sent.sent_s, sent.step_ms, len(plan.times_s),
-        len(words),
-    )  # fmt: skip
+    decided = {"events": [asdict(event) for event in (*earlier, *plan.events)], "hazards_hz": dict(plan.hazards_hz)}
+    words = orjson.dumps(decided, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS)
+    flags, times_s = (0 if plan.jaw_rad is None else JAW), (sent.echo_s, sent.came_s, sent.sent_s)
+    header = _PLAN.pack(PLAN, PROTOCOL, flags, sent.number, *times_s, sent.step_ms, len(plan.times_s), len(words))
     times = struct.pack("<d", plan.made_at_s) + np.asarray(plan.times_s, dtype="<f8").tobytes()
     jaw = b"" if plan.jaw_rad is None else _floats(plan.jaw_rad)
     return b"".join([header, times, _floats(plan.frames), jaw, words])
 
 
 def parse_plan(data: bytes) -> SentPlan:
-    """Raises PacketError as `parse_frame`; motion that is not finite is the loop's to refuse."""
-    rest = _checked(data, PLAN, _PLAN, "a plan")
+    """Return the plan of a message. Raises PacketError as `parse_frame`; the loop refuses motion that is not finite."""
+    rest = _Reader(data, PLAN, _PLAN, "a plan")
     _, _, flags, number, echo_s, came_s, sent_s, step_ms, frames, words = rest.header
     if not 1 <= frames <= MOST_PLANNED:
-        raise PacketError(f"a plan of {frames} frames (1 to {MOST_PLANNED})")
-    made_at_s = rest.number("<d")
-    times_s = rest.doubles(frames)
-    motion = rest.floats(frames * MOTION_DIM, finite=False).reshape(frames, MOTION_DIM)
-    jaw_rad = rest.floats(frames * 3, finite=False).reshape(frames, 3) if flags & JAW else None
-    events, hazards_hz = _told(rest.bytes(words))
-    rest.end()
-    return SentPlan(
-        number, Plan(made_at_s, times_s, motion, jaw_rad, events, hazards_hz), echo_s, came_s, sent_s, step_ms
-    )
-
-
-def _told(words: bytes) -> tuple[tuple[ListenerEvent, ...], dict[str, float]]:
+        raise PacketError(f"a plan: expected 1 to {MOST_PLANNED} frames, got {frames}")
+    made_at_s, times_s = rest.number(), rest.array("<f8", frames)
+    motion = rest.array("<f4", frames * MOTION_DIM, finite=False).reshape(frames, MOTION_DIM)
+    jaw_rad = rest.array("<f4", frames * 3, finite=False).reshape(frames, 3) if flags & JAW else None
     try:
-        told = orjson.loads(words)
-        events = tuple(_event(each) for each in told["events"])
-        return events, {str(kind): float(hz) for kind, hz in told["hazards_hz"].items()}
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise PacketError("a plan whose events cannot be read") from error
+        decided = _DECIDED.validate_json(rest.bytes(words))
+    except ValidationError as error:
+        raise PacketError("a plan: its events cannot be read") from error
+    rest.end()
+    for event in decided.events:
+        if event.kind not in EVENT_KINDS:
+            raise PacketError(f"a plan: unknown event {event.kind[:20]!r} (valid: {', '.join(EVENT_KINDS)})")
+    plan = Plan(made_at_s, times_s, motion, jaw_rad, decided.events, decided.hazards_hz)
+    return SentPlan(number=number, plan=plan, echo_s=echo_s, came_s=came_s, sent_s=sent_s, step_ms=step_ms)
 
 
-def _event(told: Mapping[str, Any]) -> ListenerEvent:
-    target = told["target_rad"]
-    event = ListenerEvent(**{**told, "target_rad": None if target is None else (float(target[0]), float(target[1]))})
-    if event.kind not in EVENT_KINDS or not all(map(math.isfinite, (event.start_s, event.duration_s, event.size))):
-        raise PacketError(
-            f"an event {str(event.kind)[:20]!r} that a listener does not decide ({', '.join(EVENT_KINDS)})"
+# --- Words ------------------------------------------------------------------------------------------------------------
+
+
+@validated(frozen=True, kw_only=True, config=ConfigDict(extra="ignore"))  # keys of a later protocol
+class Interface:
+    """The properties that both sides must share; as text, for people."""
+
+    protocol: int = PROTOCOL
+    version: str = __version__
+    frame_hz: int = FRAME_HZ
+    audio_hz: int = AUDIO_HZ
+    motion: str = "arkit58"
+    channels: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return it as words."""
+        space = f"{self.motion} ({len(self.channels)} channels)"
+        return (
+            f"sfms-robot {self.version}, protocol {self.protocol}, {self.frame_hz} frames a second, "
+            f"{self.audio_hz} Hz, {space}"
         )
-    return event
+
+    def fits(self, other: Interface) -> bool:
+        """Return whether both understand one another: all but the version of the program must be the same."""
+        return replace(self, version="") == replace(other, version="")
 
 
-# --- words ----------------------------------------------------------------------------------------------------------
+OURS: Final = Interface(channels=CHANNELS)
+Count = Annotated[int, Field(ge=0, lt=1 << 63)]
+_STRICT: Final = ConfigDict(strict=True, extra="forbid")
 
 
-def words_message(said: Join | Welcome | Refusal | Notice) -> bytes:
-    """As JSON."""
-    return json.dumps({"type": type(said).__name__.lower(), **asdict(said)}, allow_nan=False).encode()
+@validated(frozen=True, config=_STRICT)
+class Join:
+    """A robot's request for a stream. `client` tells robots apart, `calmness` is `config.Calmness` as a mapping."""
+
+    type: Literal["join"] = field(default="join", kw_only=True)
+    client: str
+    seed: Count
+    calmness: dict[str, Any] | None = None
+    interface: Interface = OURS
 
 
-def parse_words(data: bytes) -> Join | Welcome | Refusal | Notice:
-    """Raises PacketError, in one line, for everything else than what `words_message` makes."""
+@validated(frozen=True, kw_only=True, config=_STRICT)
+class Welcome:
+    """A stream was begun: its frames go under `stream`. `server` changes when the server is started again."""
+
+    type: Literal["welcome"] = "welcome"
+    stream: str
+    server: str
+    listener: str
+    horizon: Annotated[Count, Field(ge=1)]
+    hop: Annotated[Count, Field(ge=1)]
+    interface: Interface = OURS
+
+
+@validated(frozen=True, config=_STRICT)
+class Refusal:
+    """No stream was begun, and why; `final`: asking again cannot help."""
+
+    type: Literal["refusal"] = field(default="refusal", kw_only=True)
+    reason: str
+    final: bool
+
+
+@validated(frozen=True, config=_STRICT)
+class Notice:
+    """`kind` "unknown": there is no such stream (any more); "skipped": `frames` were left out; "leave", "calm"."""
+
+    type: Literal["notice"] = field(default="notice", kw_only=True)
+    kind: str
+    frames: Count = 0
+    calmness: dict[str, Any] | None = None
+
+
+Words = Join | Welcome | Refusal | Notice
+_WORDS: Final[TypeAdapter[Words]] = TypeAdapter(Annotated[Words, Field(discriminator="type")])
+
+
+def words_message(words: Words) -> bytes:
+    """Return words as JSON."""
+    return _WORDS.dump_json(words)
+
+
+def parse_words(data: bytes) -> Words:
+    """Return the words of a message. Raises PacketError, in one line, for JSON that `words_message` does not make."""
     if len(data) > LONGEST_JSON:
         raise PacketError(f"JSON of more than {LONGEST_JSON} bytes")
     try:
-        told = json.loads(data, parse_int=whole_number)
-        kind = told.pop("type")
-        if "interface" in told:
-            told["interface"] = _interface(told["interface"])
-        said: Join | Welcome | Refusal | Notice = _KINDS[kind](**told)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise PacketError(f"JSON that is none of {', '.join(_KINDS)}") from error
-    _check_words(said)
-    return said
+        return _WORDS.validate_json(data)
+    except ValidationError as error:
+        raise PacketError("JSON that is not a whole join, welcome, refusal or notice") from error
 
 
-_KINDS: Final[Mapping[str, Any]] = {"join": Join, "welcome": Welcome, "refusal": Refusal, "notice": Notice}
-# Of the fields of all kinds.
-_TYPES: Final[Mapping[str, type]] = {
-    **dict.fromkeys(("client", "stream", "server", "listener", "reason", "kind"), str),
-    **dict.fromkeys(("seed", "horizon", "hop", "frames"), int),
-    "final": bool,
-}
+# --- Bytes ------------------------------------------------------------------------------------------------------------
 
 
-def _interface(told: Mapping[str, Any]) -> Interface:
-    """Keys of a later protocol are left out: it is to be named, not to be understood."""
-    known = {each.name: told[each.name] for each in fields(Interface) if each.name in told}
-    return Interface(**{**known, "channels": tuple(map(str, known.get("channels", ())))})
+class _Reader:
+    """The bytes of a message, read from front to back. `what` names it in errors."""
 
-
-def _check_words(said: Join | Welcome | Refusal | Notice) -> None:
-    if not all(isinstance(value, _TYPES.get(name, object)) for name, value in vars(said).items()):
-        raise PacketError(f"a {type(said).__name__.lower()} with a value of another type")
-    if isinstance(said, Join) and said.seed < 0:
-        raise PacketError(f"join: seed: expected 0 or more, got {said.seed}")
-    calmness = getattr(said, "calmness", None)
-    if calmness is not None and not isinstance(calmness, dict):
-        raise PacketError("a calmness that is no mapping")
-
-
-# --- bytes ----------------------------------------------------------------------------------------------------------
-
-
-class _Rest:
-    """What follows a header, taken off its front."""
-
-    def __init__(self, header: tuple[Any, ...], data: bytes, at: int, what: str) -> None:
-        self.header, self._data, self._at, self._what = header, data, at, what
+    def __init__(self, data: bytes, kind: int, form: struct.Struct, what: str) -> None:
+        self._data, self._at, self._what = data, 0, what
+        if len(data) < _START.size:
+            raise PacketError(f"{what}: {len(data)} bytes, cut short")
+        found, protocol = _START.unpack_from(data)
+        if protocol != PROTOCOL:
+            raise PacketError(f"{what}: expected protocol {PROTOCOL}, got protocol {protocol}")
+        if found != kind:
+            raise PacketError(f"{what}: expected a message of kind {kind}, got kind {found}")
+        self.header: tuple[Any, ...] = form.unpack(self.bytes(form.size))
 
     def bytes(self, count: int) -> bytes:
         end = self._at + count
         if end > len(self._data):
-            raise PacketError(f"{self._what} of {len(self._data)} bytes, cut short")
+            raise PacketError(f"{self._what}: {len(self._data)} bytes, cut short")
         taken, self._at = self._data[self._at : end], end
         return taken
 
-    def number(self, form: str, finite: bool = True) -> float:
-        value = float(struct.unpack(form, self.bytes(struct.calcsize(form)))[0])
-        if finite and not math.isfinite(value):
-            raise PacketError(f"{self._what} with a value that is not finite")
-        return value
-
-    def floats(self, count: int, finite: bool = True) -> Floats:
-        values = np.frombuffer(self.bytes(4 * count), dtype="<f4").astype(np.float32)
+    def array(self, kind: str, count: int, finite: bool = True) -> NDArray[Any]:
+        """Return the next `count` numbers; `kind` is a type of numpy's, little-endian."""
+        values = np.frombuffer(self.bytes(count * np.dtype(kind).itemsize), kind)
         if finite and not np.isfinite(values).all():
-            raise PacketError(f"{self._what} with values that are not finite")
-        return values
+            raise PacketError(f"{self._what}: a value is not finite")
+        return values.astype(values.dtype.newbyteorder("="))
 
-    def doubles(self, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-        values = np.frombuffer(self.bytes(8 * count), dtype="<f8").astype(np.float64)
-        if not np.isfinite(values).all():
-            raise PacketError(f"{self._what} with times that are not finite")
-        return values
-
-    def pcm(self, count: int) -> Floats:
-        samples = np.frombuffer(self.bytes(2 * count), dtype="<i2")
-        return (samples / np.float32(_PCM)).astype(np.float32)
+    def number(self, finite: bool = True) -> float:
+        return float(self.array("<f8", 1, finite)[0])
 
     def end(self) -> None:
         if self._at != len(self._data):
-            raise PacketError(f"{self._what} with {len(self._data) - self._at} bytes too many")
-
-
-def _checked(data: bytes, kind: int, form: struct.Struct, what: str) -> _Rest:
-    if len(data) < _START.size:
-        raise PacketError(f"{what} of {len(data)} bytes, cut short")
-    found, protocol = _START.unpack_from(data)
-    if protocol != PROTOCOL:
-        raise PacketError(f"{what} of protocol {protocol}, not {PROTOCOL}")
-    if found != kind:
-        raise PacketError(f"a message of kind {found}, where {what} was expected")
-    if len(data) < form.size:
-        raise PacketError(f"{what} of {len(data)} bytes, cut short")
-    return _Rest(form.unpack_from(data), data, form.size, what)
+            raise PacketError(f"{self._what}: {len(self._data) - self._at} bytes too many")
 
 
 def _pcm(samples: Floats | None) -> bytes:

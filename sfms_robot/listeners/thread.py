@@ -1,7 +1,7 @@
-"""A listener object of somebody's own, stepped in a thread of this process (ports.PlanFeed).
+"""A listener object in a thread of this process (ports.PlanFeed), and what it shares with one in a child process.
 
-For what cannot be loaded by name in a process of its own. It shares the interpreter with the servo loop: a step that
-computes for long without letting go of Python's lock makes ticks late. Listeners by name do not: `process`.
+For a listener that cannot be loaded by name in a child process. It shares the interpreter with the servo loop: a
+step that computes for long without releasing Python's lock makes ticks late. Listeners by name do not: `process`.
 """
 
 from __future__ import annotations
@@ -10,21 +10,106 @@ import logging
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.listeners.inbox import MOST_WAITING, Inbox, calmed
 from sfms_robot.listeners.process import CLOSE_LIMIT_S, HUNG_S, Lateness
+from sfms_robot.config.calmness import Calmness
+from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
+from sfms_robot.processes import LIMITS
 from sfms_robot.signals.quantiles import Quantiles
+
+CLOSE_LIMIT_S: Final = 0.2
+HUNG_S: Final = LIMITS["listener"].hung_s
+LATE_S: Final = 1.0
+MOST_WAITING: Final = FRAME_HZ // 2  # frames
+CATCH_UP: Final = 0.5  # frames by which fewer must wait after each, while it catches up: twice the person's pace
 
 log = logging.getLogger(__name__)
 
 
+class Inbox:
+    """Frames in the order in which they came, until None does.
+
+    A machine that cannot keep up must not answer what was said seconds ago: when more than `most` frames wait, the
+    listener continues with the newest, and the others are counted. Frames that came before the first call of `next` do
+    not count as too many, as long as they become fewer at the pace of `CATCH_UP`.
+
+    Attributes:
+        skipped: frames left out before the last one returned.
+        calmness: requested since `calmed` looked; None: none.
+    """
+
+    def __init__(self, most: int = MOST_WAITING) -> None:
+        self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
+        self._most = most
+        self._allowed: float | None = None  # to wait, while it catches up with those of before
+        self._waiting: deque[SpeakerFrame | None] = deque()
+        self.skipped = 0
+        self.calmness: Calmness | None = None
+
+    def put(self, frame: SpeakerFrame | None) -> None:
+        """Add a frame, or None for the end. Never blocks."""
+        self._queue.put(frame)
+
+    def next(self) -> SpeakerFrame | None:
+        """Return the next frame; blocks until there is one. None, the end, comes before all that waits."""
+        if not self._waiting:
+            self._waiting.append(self._queue.get())
+        while not self._queue.empty():
+            self._waiting.append(self._queue.get())
+        if None in self._waiting:
+            return None
+        waiting = len(self._waiting)
+        self._allowed = waiting + self._most if self._allowed is None else self._allowed - CATCH_UP
+        self.skipped = waiting - 1 if waiting > max(self._most, self._allowed) else 0
+        for _ in range(self.skipped):
+            self._waiting.popleft()
+        return self._waiting.popleft()
+
+
+def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
+    """Return the memory with the rates that were requested since the last frame, if the listener has any."""
+    calmness, inbox.calmness = inbox.calmness, None
+    change = getattr(listener, "calmed", None)
+    return memory if calmness is None or change is None else change(memory, calmness)
+
+
+class Lateness:
+    """A judge of plans: in time to be shown, or not. A listener on a slow computer answers, but always too late.
+
+    Attributes:
+        lasting: for `LATE_S` every plan has come after the time of its last frame. The first one in time ends it.
+    """
+
+    def __init__(self) -> None:
+        self.lasting = False
+        self._since_s: float | None = None  # of the first late one in a row
+
+    def named(self, state: str) -> str:
+        """Return "late" for a listening state whose plans are never in time, else `state`."""
+        return "late" if self.lasting and state == "listening" else state
+
+    def came(self, plan: Plan, now_s: float) -> None:
+        """Judge a plan that arrived at `now_s`, by the clock of its frames."""
+        if now_s <= plan.times_s[-1]:
+            if self.lasting:
+                log.warning("the listener's plans are in time again")
+            self.lasting, self._since_s = False, None
+            return
+        self._since_s = now_s if self._since_s is None else self._since_s
+        if not self.lasting and now_s - self._since_s >= LATE_S:
+            log.warning("the listener's plans come too late to be shown: the run continues without them")
+            self.lasting = True
+
+
 class ListenerThread:
-    """Frames in, plans out, as `ListenerProcess`; what raises ends the listening, not the run."""
+    """Frames in, plans out, as `ListenerProcess`; an exception ends the listening, not the run."""
 
     def __init__(self, listener: Listener, seed: int) -> None:
         self._listener, self._seed = listener, seed
@@ -41,7 +126,7 @@ class ListenerThread:
         self._thread.start()
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
-        """Never blocks. While the listener hangs, frames are dropped and counted."""
+        """Hand over a frame. Never blocks; while the listener hangs, frames are dropped and counted."""
         waiting = self._pushed - self._taken
         if self._state not in ("listening", "hung") or waiting > 2 * MOST_WAITING:
             self._dropped += 1
@@ -52,11 +137,11 @@ class ListenerThread:
         self._inbox.put(frame)
 
     def calm(self, calmness: Calmness) -> None:
-        """As of `ListenerProcess`."""
+        """Use other rates from the next frame on, as `ListenerProcess` does."""
         self._inbox.calmness = calmness
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Plans that came. Never blocks."""
+        """Return plans that came. Never blocks."""
         plans = []
         while not self._plans.empty():
             plans.append(self._plans.get_nowait())
@@ -67,20 +152,20 @@ class ListenerThread:
         silent_s = now_s - self._since_s
         hung = silent_s > HUNG_S
         if hung and self._state == "listening":
-            log.warning("the listener has not answered for %.1f s", silent_s)
+            log.warning("the listener has not answered for %.1f s; the run continues", silent_s)
             self._state = "hung"
         elif not hung and self._state == "hung":
-            log.warning("the listener goes on")
+            log.warning("the listener answers again")
             self._state = "listening"
         return plans
 
     @property
     def lost(self) -> bool:
-        """Hung, failed, or always too late."""
+        """Return whether it hangs, has failed, or is always too late."""
         return self._state != "listening" or self._lateness.lasting
 
     def statistics(self) -> Mapping[str, Any]:
-        """`state` (listening, late, hung, or failed and how), `restarts` 0, `skipped_frames`, `step_ms` p50, p99."""
+        """Return `state` (listening, late, hung, or "failed: " and why), `restarts` 0, `skipped_frames`, `step_ms`."""
         return {
             "state": self._lateness.named(self._state),
             "restarts": 0,
@@ -107,4 +192,4 @@ class ListenerThread:
                 self._taken += 1 + self._inbox.skipped
         except Exception as error:
             self._state = f"failed: {type(error).__name__}: {error}"
-            log.exception("the listener cannot go on; the head goes on without it")
+            log.exception("the listener failed; the run continues without it")

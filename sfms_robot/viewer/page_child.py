@@ -5,33 +5,34 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import os
+import pickle
 import secrets
 import socket
 import ssl
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import orjson
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from sfms_robot.child_process import take_pipes
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.origin import is_loopback
-from sfms_robot.viewer.page_process import BEAT_S, DOCUMENT, HEADER, PERSON, PICTURE, Address, packed_message
+from sfms_robot.processes import ParentPipe, PipeWriter, give_way
+from sfms_robot.viewer.page_process import BEAT_S, Address
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.visitor_commands import LONGEST_PERSON, Command
 
 SceneOf = Callable[[str, Sequence[str]], RobotScene | None]
 NICE: Final = 5  # the servo loop goes first
 TRIED: Final = 20  # ports
-MOST_UNSENT: Final = 2_000_000  # bytes for a run that does not read: a visitor's voice is left out then
+MOST_UNSENT: Final = 100  # pieces of voice and face for a run that does not read: older ones are left out
 SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor: pictures that are a second old are of no use
 HALF_OPEN_S: Final = 10.0  # for a TLS handshake, and for the head of a request
 
@@ -71,52 +72,54 @@ class PageLoop(asyncio.SelectorEventLoop):
 
 
 class RunPipe:
-    """`page_server.Run` at the other end of a pipe."""
+    """`page_server.Run` at the other end of a pipe. Nothing blocks."""
 
-    def __init__(self) -> None:
-        self._transport: asyncio.WriteTransport | None = None
-
-    async def open(self, pipe: IO[bytes]) -> None:
-        loop = asyncio.get_running_loop()
-        self._transport, _ = await loop.connect_write_pipe(asyncio.BaseProtocol, pipe)
+    def __init__(self, parent: ParentPipe) -> None:
+        self._writer = PipeWriter(parent.outgoing, MOST_UNSENT, "run")
 
     def command(self, visitor: int, command: Command) -> None:
+        """Send a command of a visitor."""
         self.send(visitor, command=command.name, values=command.values)
 
     def person(self, visitor: int, message: bytes) -> None:
-        if self._transport is not None and self._transport.get_write_buffer_size() < MOST_UNSENT:
-            self._transport.write(packed_message(PERSON, visitor, message))
+        """Send a piece of a visitor's voice, or a face."""
+        self._writer.offer(pickle.dumps((visitor, message)))
 
     def left(self, visitor: int) -> None:
+        """Report that a visitor has the controls no more."""
         self.send(visitor, left=True)
 
     def watched(self, visitors: int) -> None:
+        """Send the number of visitors."""
         self.send(0, watched=visitors)
 
-    def send(self, visitor: int, **told: Any) -> None:
-        """A document to the run."""
-        if self._transport is not None:
-            self._transport.write(packed_message(DOCUMENT, visitor, orjson.dumps(told)))
+    def beat(self) -> None:
+        """Send a sign of life."""
+        self._writer.send(pickle.dumps(None))
+
+    def send(self, visitor: int, **document: Any) -> None:
+        """Send a document."""
+        self._writer.send(pickle.dumps((visitor, document)))
 
 
-class FromRun(asyncio.Protocol):
-    """What the run sends, done as it comes; of pictures that come at once the newest is shown. Ends with the pipe."""
+class FromRun:
+    """Messages of the run, handled in the server's loop; of pictures that come together the newest is shown."""
 
-    def __init__(self, page: PageServer, over: asyncio.Event, scene_of: SceneOf) -> None:
-        self._page, self._over, self._scene_of = page, over, scene_of
-        self._unread = bytearray()
+    def __init__(self, page: PageServer, scene_of: SceneOf) -> None:
+        self._page, self._scene_of = page, scene_of
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[Any] = deque()
 
-    def data_received(self, data: bytes) -> None:
-        self._unread += data
+    def put(self, message: Any) -> None:
+        """Take a message, in the thread that reads."""
+        self._waiting.append(message)
+        self._loop.call_soon_threadsafe(self._handle)
+
+    def _handle(self) -> None:
         picture: bytes | None = None
-        while len(self._unread) >= HEADER.size:
-            length, kind, visitor = HEADER.unpack_from(self._unread)
-            end = HEADER.size + length
-            if len(self._unread) < end:
-                break
-            message = bytes(self._unread[HEADER.size : end])
-            del self._unread[:end]
-            if kind == PICTURE:
+        for _ in range(len(self._waiting)):
+            message = self._waiting.popleft()
+            if isinstance(message, bytes):
                 if picture is not None:
                     self._page.keep(picture)
                 picture = message
@@ -124,12 +127,9 @@ class FromRun(asyncio.Protocol):
                 if picture is not None:
                     self._page.show(picture)
                     picture = None
-                self._document(visitor, orjson.loads(message))
+                self._document(message[0], orjson.loads(message[1]))
         if picture is not None:
             self._page.show(picture)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._over.set()
 
     def _document(self, visitor: int, told: dict[str, Any]) -> None:
         do = told.pop("do")
@@ -147,36 +147,16 @@ class FromRun(asyncio.Protocol):
 
 
 def main(scene_of: SceneOf = lambda *_: None) -> None:
-    """Serve until the pipe ends. The first message says where. `scene_of`: gives the picture of a head by its name."""
-    incoming, outgoing = take_pipes()
-    first = _first_document(incoming.fileno())
-    if first is None:
-        return
-    if hasattr(os, "nice"):
-        os.nice(NICE)
-    address, run = Address(**first), RunPipe()
+    """Serve until the pipe ends. `scene_of`: returns the picture of a head by its name."""
+    parent = ParentPipe()
+    address = parent.receive()
+    give_way(NICE)
     with asyncio.Runner(loop_factory=PageLoop) as runner:
-        runner.run(_serve(address, run, incoming, outgoing, scene_of))
+        runner.run(_serve(address, parent, scene_of))
 
 
-def _first_document(pipe: int) -> dict[str, Any] | None:
-    """Byte for byte: what follows it is read by others. None at the end of the pipe."""
-
-    def exactly(length: int) -> bytes:
-        data = b""
-        while len(data) < length and (more := os.read(pipe, length - len(data))):
-            data += more
-        return data
-
-    header = exactly(HEADER.size)
-    if len(header) < HEADER.size:
-        return None
-    first: dict[str, Any] = orjson.loads(exactly(HEADER.unpack(header)[0]))
-    return first
-
-
-async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: IO[bytes], scene_of: SceneOf) -> None:
-    await run.open(outgoing)
+async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> None:
+    run = RunPipe(parent)
     try:
         place = listen_at(address)
         _check_certificate(address)
@@ -186,7 +166,7 @@ async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: 
     over = asyncio.Event()
     page = PageServer(run, place.token)
     loop = asyncio.get_running_loop()
-    await loop.connect_read_pipe(lambda: FromRun(page, over, scene_of), incoming)
+    parent.forward(FromRun(page, scene_of).put, lambda: loop.call_soon_threadsafe(over.set))
     server = web_server(
         page.app,
         ws="websockets-sansio",
@@ -200,7 +180,7 @@ async def _serve(address: Address, run: RunPipe, incoming: IO[bytes], outgoing: 
     page.prepare()
     run.send(0, bound=place.url, token=place.token, taken=place.taken)
     while not over.is_set():
-        run.send(0, alive=True)
+        run.beat()
         with suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), BEAT_S)
     server.should_exit = True

@@ -5,7 +5,7 @@ import pytest
 from sfms_robot.app.listen.page_facts import people_per_minute
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS
-from sfms_robot.listeners.events.hazards import load_tables
+from sfms_robot.listeners.events.model import load_tables
 
 
 @pytest.mark.parametrize("listener", ["sfms-small", "arig-small", "zenoh/somewhere"])

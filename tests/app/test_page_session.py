@@ -120,7 +120,7 @@ def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_pa
     [
         (["--fast", "--view"], "--view auto: a page shows what takes real time"),
         (["--dry-run", "--view", "9000"], "--view 9000: nothing moves in a --dry-run"),
-        (["--view", "nowhere"], "--view nowhere: is no TCP port"),
+        (["--view", "nowhere"], "--view nowhere: not a TCP port"),
         (["--view-cert", "a.pem"], "no page is served"),
         (["--view", "--view-cert", "a.pem"], "https needs both"),
         (["--fast", "--audio", "browser"], "a page shows what takes real time"),

@@ -171,7 +171,7 @@ def test_a_fleet_without_a_router_is_told_in_one_line(zenoh_files):
         (["run", "--fleet", "listen", "--duration", "1"], "that name is taken"),
         (["run", "--listener", "zenoh/x", "--zenoh", "nowhere.json5"], "nowhere.json5: no such file"),
         (["serve", "--listener", "psychic"], "listener 'psychic'"),
-        (["serve", "--metrics", "high"], "--metrics high: is no TCP port"),
+        (["serve", "--metrics", "high"], "--metrics high: not a TCP port"),
     ],
 )
 def test_bad_input_is_one_line(command_line, words, said):

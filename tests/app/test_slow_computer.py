@@ -7,7 +7,7 @@ from sfms_robot.app.open_head import HeadOptions, open_head
 from sfms_robot.app.session import Programme, drive_head
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
 from sfms_robot.lab.bench.throttle_bench import state_problems
-from sfms_robot.listeners.process import LATE_S, Lateness
+from sfms_robot.listeners.thread import LATE_S, Lateness
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.app.serve.worker_pool import WorkerPool
+from sfms_robot.app.serve.service import WorkerPool
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners.registry import at_hop, load_listener
@@ -28,7 +28,7 @@ from sfms_robot.listeners.remote_messages import (
 LISTENER = "sfms-small"
 HOP = 3
 LIMIT_S = 240.0
-SERVED = Served(LISTENER, "tested", hop=HOP, everybody=True)
+SERVED = Served(listener=LISTENER, name="tested", hop=HOP, all_heads=True)
 
 
 def joined(pool, client, seed=0):
@@ -79,7 +79,7 @@ def test_a_process_that_dies_is_replaced_and_its_robots_are_told_to_join_again()
     with closing(WorkerPool(SERVED, lambda stream, message: came.put((stream, message)), processes=1)) as pool:
         stream, first = joined(pool, "a"), pool._workers[0]
         assert joined(pool, "a") == stream
-        os.kill(first._process.pid, signal.SIGKILL)
+        os.kill(first.child.process.pid, signal.SIGKILL)
         pool._wait(lambda: pool._workers[0] is not first and pool._workers[0].capacity is not None)
         pool.receive(stream, b"anything")
         assert came.get(timeout=LIMIT_S) == (stream, words_message(Notice("unknown")))
@@ -96,8 +96,8 @@ def test_what_is_no_question_for_a_stream_is_refused():
 @pytest.mark.parametrize(
     ("served", "error", "said"),
     [
-        (Served(LISTENER, "tested", hop=99), ConfigError, "--hop 99: listener 'sfms-small' has 1, 2"),
-        (Served("arig-paper", "tested"), ModelError, "arig-paper"),
+        (Served(listener=LISTENER, name="tested", hop=99), ConfigError, "--hop 99: .*sfms-small.*valid: 1, 2"),
+        (Served(listener="arig-paper", name="tested"), ModelError, "arig-paper"),
     ],
 )
 def test_what_cannot_be_served_is_said_as_it_is_in_one_process(served, error, said):

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_S, FaceFrame, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.remote import RemoteListener
-from sfms_robot.listeners.serving.stream_server import StreamServer
+from sfms_robot.listeners.stream_server import StreamServer
 from sfms_robot.motion.timeline import PlanTimeline
 
 TICK_S = 0.01

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from remote_rig import SILENCE, Counting, Network, Robot, Server
 from tiny_sfms import speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
-from sfms_robot.listeners.inbox import MOST_WAITING
+from sfms_robot.listeners.capacity import Capacity, measure_capacity
 from sfms_robot.listeners.remote_messages import (
-    Interface,
+    OURS,
     Join,
     SentFrame,
     Welcome,
@@ -20,8 +21,8 @@ from sfms_robot.listeners.remote_messages import (
     parse_words,
     words_message,
 )
-from sfms_robot.listeners.serving.capacity import Capacity, measure_capacity
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
+from sfms_robot.listeners.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
+from sfms_robot.listeners.thread import MOST_WAITING
 
 
 def joined(server, client="a", now_s=0.0, seed=0):
@@ -91,7 +92,7 @@ def test_memory_of_a_stream_is_bounded_and_what_is_left_out_is_told():
         notices += server.receive(stream, frame(number), 0.0)
     assert len(server._streams[stream].waiting) <= MOST_WAITING
     left_out = sum(parse_words(each).frames for each in notices)
-    assert left_out == server.skipped == 500 - len(server._streams[stream].waiting)
+    assert left_out == server.counts.skipped == 500 - len(server._streams[stream].waiting)
 
 
 def test_frames_that_come_late_or_twice_are_not_stepped_twice():
@@ -100,7 +101,7 @@ def test_frames_that_come_late_or_twice_are_not_stepped_twice():
     for number in (0, 2, 1, 2, 3):
         server.receive(stream, frame(number), 0.0)
     stepped(server)
-    assert server._streams[stream].memory == (0, 4) and server.lost == 1
+    assert server._streams[stream].memory == (0, 4) and server.counts.lost == 1
 
 
 def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
@@ -155,10 +156,10 @@ def test_who_asks_again_keeps_its_stream():
 @pytest.mark.parametrize("changed", [{"motion": "deca56", "channels": ("x",)}, {"protocol": 2}, {"frame_hz": 30}])
 def test_a_robot_of_another_kind_is_refused_with_both_sides_named(changed):
     server = StreamServer(Counting(), "counting", server="big")
-    interface = Interface(**{"version": "9.9", **changed})
+    interface = replace(OURS, version="9.9", **changed)
     refusal = parse_words(server.join(words_message(Join("a", 0, None, interface)), 0.0))
     assert refusal.final and "sfms-robot 9.9" in refusal.reason and "server big" in refusal.reason
-    assert server.refused == 1 and server.heads == 0
+    assert server.counts.refused == 1 and server.heads == 0
 
 
 @pytest.mark.parametrize("message", [b"", b"{}", b"\x00\x01", b'{"type": "join", "client": "a", "seed": "x"}'])

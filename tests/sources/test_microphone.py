@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import soundfile
+from scripted_worker import wait_for_message
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, PortError
@@ -43,9 +44,7 @@ class Hearing:
         before = len(self.frames)
         while not enough():
             assert time.monotonic() < self.origin_s + PATIENCE_S
-            arrived = self.microphone._worker._child.arrived
-            arrived.wait(FRAME_S)
-            arrived.clear()
+            wait_for_message(self.microphone._worker, FRAME_S)
             self.frames += self.source.read(time.monotonic() - self.origin_s)
         return self.frames[before:]
 

@@ -9,6 +9,7 @@ import pytest
 import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
+from scripted_worker import wait_for_message
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -292,10 +293,8 @@ def test_of_many_channels_the_first_two_speak(channels):
 
 
 def pause(played):
-    """Until its worker says something."""
-    arrived = played._loudspeaker._child.arrived
-    arrived.wait(FRAME_S)
-    arrived.clear()
+    """Wait until its worker has sent something."""
+    wait_for_message(played._loudspeaker, FRAME_S)
 
 
 def recorded(seconds, begin):

@@ -34,10 +34,10 @@ def camera():
     opened = []
 
     def of(*messages):
-        worker = SourceWorker("webcam 0", shows, messages, silent_s=1e12)
+        worker = SourceWorker("webcam 0", shows, messages)
         opened.append(worker)
-        while len(worker._child.messages) < len(messages):
-            worker._child.arrived.wait(0.1)
+        for _ in messages:
+            worker.wait()
         return Webcam(worker, LiveFace(FaceArgument("").signs), None)
 
     yield of
@@ -170,7 +170,7 @@ def test_a_recorded_video_is_played_from_the_start_on_in_its_own_process(tmp_pat
             sighting = webcam.at(time.monotonic() - origin_s)
             if sighting is not None:
                 told[sighting.face.time_s] = sighting.face.motion
-        child = Path(f"/proc/{webcam._worker._child.process.pid}/fd")
+        child = Path(f"/proc/{webcam._worker._supervised.child.process.pid}/fd")
         assert not [fd for fd in child.glob("*") if fd.is_symlink() and "socket" in str(fd.readlink())]
     finally:
         webcam.close()

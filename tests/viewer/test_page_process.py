@@ -400,7 +400,7 @@ def test_beyond_loopback_a_token_is_made_and_asked_for(tmp_path):
 
 @pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", ":80", "host:", "١"])
 def test_what_is_no_port_is_refused_in_one_line(wanted):
-    with pytest.raises(ConfigError, match=r"^--view .*is no TCP port"):
+    with pytest.raises(ConfigError, match=r"^--view .*not a TCP port"):
         Address.parsed(wanted)
 
 
@@ -426,13 +426,12 @@ def test_https_needs_a_certificate_and_its_key(tmp_path):
 def test_a_page_whose_process_dies_takes_no_run_with_it(caplog):
     with closing(PageProcess(Address(port=0))) as page:
         page.wait()
-        page._process.kill()
-        page._process.wait()
+        os.kill(page.process_id, signal.SIGKILL)
         for _ in range(100):
             page.show(picture(1.0))
             page.say("status", status={})
-        page._reading.join(WAIT_S)
-        assert page.visitors == 0 and "the page is away" in caplog.text
+        page._supervised.child.reader.join(WAIT_S)
+        assert page.visitors == 0 and "page: its process died" in caplog.text
 
 
 def test_a_page_whose_process_hangs_is_named_once_and_once_when_it_is_back(caplog):
@@ -453,10 +452,10 @@ def test_a_page_whose_process_hangs_is_named_once_and_once_when_it_is_back(caplo
             page.watch(now_s := now_s + 1e-6)
         page.watch(0.0)  # another run begins
         assert page.statistics() == {"hung": False, "hangs": 1}
-    told = [(each.levelname, each.message) for each in caplog.records if each.name.endswith("page_process")]
+    told = [(each.levelname, each.message) for each in caplog.records if each.name.endswith("processes")]
     assert told == [
-        ("WARNING", "the page has not answered for 2.6 s; the run continues"),
-        ("INFO", "the page answers again"),
+        ("WARNING", "page (running): no sign of life for 2.6 s; the run continues"),
+        ("INFO", "page: answers again"),
     ]
 
 

@@ -24,7 +24,7 @@ from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError, RobotError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.open_feed import NamedFeed, open_feed
+from sfms_robot.listeners.remote import NamedFeed, open_feed
 from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter

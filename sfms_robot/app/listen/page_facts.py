@@ -12,7 +12,7 @@ from sfms_robot.app.listen.page_commands import NAMED_EXPRESSIONS
 from sfms_robot.config import Calmness, Head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.frames import CHANNELS
-from sfms_robot.listeners.events.hazards import load_tables
+from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder
 from sfms_robot.viewer.visitor_commands import VERSION
 

@@ -25,7 +25,7 @@ from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.listeners.open_feed import NamedFeed, open_feed
+from sfms_robot.listeners.remote import NamedFeed, open_feed
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet

@@ -22,7 +22,7 @@ from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
     from sfms_robot.listeners.engine import EngineName
-    from sfms_robot.listeners.open_feed import NamedFeed
+    from sfms_robot.listeners.remote import NamedFeed
     from sfms_robot.viewer.page_process import PageProcess
 
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
@@ -71,7 +71,7 @@ def begin_listening(
     insecure: bool = False,
 ) -> NamedFeed:
     """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. Closed by the caller."""
-    from sfms_robot.listeners.open_feed import open_feed  # numpy: not for who only mistyped a name
+    from sfms_robot.listeners.remote import open_feed  # numpy: not for who only mistyped a name
     from sfms_robot.network import Router
 
     return open_feed(listener, seed, calmness, Router(zenoh, insecure), engine)

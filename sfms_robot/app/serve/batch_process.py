@@ -1,17 +1,17 @@
 """One process of `sfms-robot serve`: a `StreamServer`, its model, and the one thread that steps its batches.
 
-Most of what a frame costs is Python, so a core is a process: threads of one would wait for one another. It ends when
-its pipe does. All times are `time.monotonic`, which processes of one machine share.
+Most of what a frame costs is Python, so a core is a process: threads of one would wait for one another. All times are
+`time.monotonic`, which processes of one machine share.
 
-    parent -> child    pickle: lists; of all their items the first is a `Served`, the second one an int, the hop; then
+    parent -> child    a `Served`, then an int: the hop, which it waits for; then
         (stream, message, came_s)    for one of its streams
-        (None, message, number)      of somebody who asks for a stream
-        int                          asks for figures by that number
-    child -> parent    pickle: (kind, value)
+        (None, message, number)      a request for a stream
+        int                          a request for figures, by that number
+    child -> parent    (kind, value)
         loaded     the hop that a robot would choose by what a plan takes here; it waits for its hop
         ready      its `Capacity`: it serves
-        clients    {stream: client} whenever those that it holds have changed; before the answer that tells of one
-        answer     (number, message) to somebody who asked for a stream
+        clients    {stream: client} whenever those that it holds have changed; before the answer that names a new one
+        answer     (number, message) to a request for a stream
         send       [(stream, message)]
         figures    (number, `Figures`)
         error      a `RobotError`: it cannot serve
@@ -20,45 +20,42 @@ its pipe does. All times are `time.monotonic`, which processes of one machine sh
 from __future__ import annotations
 
 import logging
-import os
-import pickle
 import queue
 import signal
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import IO, Any, Final
+from typing import Any, Final
 
-from sfms_robot.child_process import messages, take_pipes
 from sfms_robot.config.hop import Latencies, choose_hop
 from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.listeners.capacity import measure_capacity
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.process_child import plan_times_s
-from sfms_robot.listeners.serving.capacity import measure_capacity
-from sfms_robot.listeners.serving.stream_server import StreamServer
+from sfms_robot.listeners.process import plan_times_s
+from sfms_robot.listeners.stream_server import StreamServer
 from sfms_robot.ports import Listener
+from sfms_robot.processes import ParentPipe
 
 LEAD_S: Final = 0.080  # longest lead of a joint, for the hop that a robot would choose
 TICK_S: Final = 0.010
-LOOK_S: Final = 1.0  # for streams that went away
+LOOK_S: Final = 1.0  # between two looks for streams that went away
 
-Say = Callable[[str, Any], None]
-Inbox = queue.SimpleQueue[list[Any]]
+Say = Callable[[tuple[str, Any]], None]
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Served:
-    """What is served, and how.
+    """A listener that is served, and how.
 
     Attributes:
-        listener: shipped name or folder; engine: what computes its networks.
-        name: that robots ask for.
-        server: what this server is called.
+        listener: shipped name or folder.
+        name: by which robots request it.
+        server: name of this server.
+        engine: what computes its networks.
         hop: None for the one that a robot would choose by what a plan takes here.
-        everybody: admit without asking what it costs.
+        all_heads: admit all, whatever they cost.
     """
 
     listener: str
@@ -66,95 +63,75 @@ class Served:
     server: str = "server"
     engine: EngineName = "auto"
     hop: int | None = None
-    everybody: bool = False
+    all_heads: bool = False
 
 
 def main() -> None:
     """Load, measure, then serve until the pipe ends."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # whoever stops all processes of a service: the parent sees to it
-    incoming, outgoing = take_pipes()
-    inbox: Inbox = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(incoming, inbox), daemon=True).start()
-
-    def say(kind: str, value: Any) -> None:
-        pickle.dump((kind, value), outgoing, protocol=5)
-        outgoing.flush()
-
-    (served,) = inbox.get()
+    parent, inbox = ParentPipe(), queue.SimpleQueue[Any]()
+    served: Served = parent.receive()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of a service manager that stops all processes: the parent ends this
+    parent.forward(inbox.put)
     try:
         listener = _loaded(served)
-        say("loaded", listener.hop)
-        (hop,) = inbox.get()
+        parent.send(("loaded", listener.hop))
+        hop = inbox.get()
         from sfms_robot.listeners.registry import at_hop
 
         listener = at_hop(listener, hop)
         capacity = measure_capacity(listener)
     except RobotError as error:
-        say("error", error)
+        parent.send(("error", error))
         return
-    say("ready", capacity)
-    _serve(StreamServer(listener, served.name, None if served.everybody else capacity, served.server), inbox, say)
-
-
-def _receive(incoming: IO[bytes], inbox: Inbox) -> None:
-    """The end of the pipe is the end of this process, whatever it computes."""
-    for items in messages(incoming):
-        inbox.put(items)
-    os._exit(0)
+    parent.send(("ready", capacity))
+    server = StreamServer(listener, served.name, None if served.all_heads else capacity, served.server)
+    _serve(server, inbox, parent.send)
 
 
 def _loaded(served: Served) -> Listener:
-    """At the hop it would be served with; blocks for some seconds. Raises ConfigError, ModelError."""
+    """Return the listener at the hop it would be served with; blocks for seconds. Raises ConfigError, ModelError."""
     from sfms_robot.listeners.registry import at_hop, hops_of, load_listener
 
     listener = load_listener(served.listener, engine=served.engine, threads=1)
     hops = hops_of(listener)
     if served.hop is not None:
         if served.hop not in hops:
-            raise ConfigError(f"--hop {served.hop}: listener {served.listener!r} has {', '.join(map(str, hops))}")
+            valid = ", ".join(map(str, hops))
+            raise ConfigError(f"--hop {served.hop}: not a hop of listener {served.listener!r} (valid: {valid})")
         return at_hop(listener, served.hop)
     p50_s, p99_s = plan_times_s(at_hop(listener, min(hops)))
     return at_hop(listener, choose_hop(hops, Latencies(listener.horizon, 0.0, p50_s, p99_s, LEAD_S, TICK_S)).hop)
 
 
-def _serve(server: StreamServer, inbox: Inbox, say: Say) -> None:
-    """Take what came, step what is due, for ever."""
+def _serve(server: StreamServer, inbox: queue.SimpleQueue[Any], say: Say) -> None:
+    """Take messages and step what is due, without end."""
     held: Mapping[str, str] = {}
     while True:
-        notices, answers, asked = _take(server, _waiting(inbox, 0.0 if server.waits else LOOK_S))
+        messages: list[tuple[str, bytes]] = []
+        answers: list[tuple[int, bytes]] = []
+        for item in _waiting(inbox, 0.0 if server.waits else LOOK_S):
+            if isinstance(item, int):
+                say(("figures", (item, server.figures())))
+                continue
+            stream, message, value = item
+            if stream is None:
+                answers.append((value, server.join(message, time.monotonic())))
+            else:
+                messages += [(stream, each) for each in server.receive(stream, message, value)]
         server.expire(time.monotonic())
         clients = server.clients
         if clients != held:
             held = clients
-            say("clients", clients)
+            say(("clients", clients))
         for answer in answers:
-            say("answer", answer)
-        for number in asked:
-            say("figures", (number, server.figures()))
-        messages = notices + _stepped(server)
+            say(("answer", answer))
+        messages += _stepped(server)
         if messages:
-            say("send", messages)
-
-
-def _take(server: StreamServer, items: list[Any]) -> tuple[list[tuple[str, bytes]], list[tuple[int, bytes]], list[int]]:
-    """What the server has to say at once to streams, to those who asked for one, and numbers that ask for figures."""
-    notices: list[tuple[str, bytes]] = []
-    answers: list[tuple[int, bytes]] = []
-    asked: list[int] = []
-    for item in items:
-        if isinstance(item, int):
-            asked.append(item)
-            continue
-        stream, message, value = item
-        if stream is None:
-            answers.append((value, server.join(message, time.monotonic())))
-        else:
-            notices += [(stream, each) for each in server.receive(stream, message, value)]
-    return notices, answers, asked
+            say(("send", messages))
 
 
 def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
-    """What one batch makes; nothing where none waits, and where a listener of somebody else's fails."""
+    """Step one batch and return its messages; none where no frame waits, and where the listener fails."""
     batch = server.batch()
     if batch is None:
         return []
@@ -162,19 +139,19 @@ def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
     try:
         answers = server.step(batch)
     except Exception:
-        log.exception("a batch of %d streams failed: they are given up", len(batch.streams))
+        log.exception("a batch of %d streams failed: they join again", len(batch.streams))
         server.failed(batch)
         return []
     return server.finish(batch, answers, began_s, time.monotonic())
 
 
-def _waiting(inbox: Inbox, limit_s: float) -> list[Any]:
-    """All that came; waits for something for so long."""
+def _waiting(inbox: queue.SimpleQueue[Any], limit_s: float) -> list[Any]:
+    """Return all messages that came; wait for the first one for so long."""
     items: list[Any] = []
     try:
         if limit_s:
-            items += inbox.get(timeout=limit_s)
+            items.append(inbox.get(timeout=limit_s))
         while True:
-            items += inbox.get_nowait()
+            items.append(inbox.get_nowait())
     except queue.Empty:
         return items

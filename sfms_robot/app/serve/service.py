@@ -1,32 +1,48 @@
-"""`sfms-robot serve`: a listener for many heads, over zenoh (`listeners.zenoh_link` has the keys).
+"""`sfms-robot serve`: a listener for many heads, over zenoh (`listeners.remote` has the keys).
 
-Messages come in threads of zenoh's, and go on to the processes that step (`worker_pool`).
+The processes that step (`batch_process`) are one for each core; streams are dealt among them. A request for a stream
+goes to the process with the fewest; its frames go there until it leaves. Weights are in memory once for each. A process
+that dies while it serves is reported and started again: robots whose streams it had receive that they are unknown, and
+join again.
+
+Messages come in threads of zenoh's, and are passed on to the processes.
 """
 
 from __future__ import annotations
 
-import os
+import itertools
+import logging
 import threading
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.app.serve.worker_pool import WorkerPool
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
-from sfms_robot.errors import ConfigError, PortError, optional
-from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S
-from sfms_robot.listeners.zenoh_link import ROOT, down_key, join_key
+from sfms_robot.errors import ConfigError, ModelError, PacketError, PortError, RobotError, optional
+from sfms_robot.listeners.capacity import Capacity
+from sfms_robot.listeners.remote import ROOT, down_key, join_key
+from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
+from sfms_robot.listeners.stream_server import DEADLINE_S, Figures, report
 from sfms_robot.network import Router, check_name, check_zenoh, close_session, serve_session, session_config
+from sfms_robot.processes import Child, Ended, cores
 
 if TYPE_CHECKING:
     import zenoh
 
+FIGURES_LIMIT_S: Final = 2.0  # for the figures of a process; later, its last ones count
+CLOSE_LIMIT_S: Final = 1.0
 _MS: Final = 1e-3
+
+Send = Callable[[str, bytes], None]
+Reply = Callable[[bytes], None]
+
+log = logging.getLogger(__name__)
 
 # Name, kind, what it says, where in the statistics of `StreamServer`, and the factor to the unit of the name.
 _FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
@@ -49,35 +65,169 @@ _FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
 )
 
 
-@dataclass(frozen=True)
-class ServeOptions:
-    """The flags of `sfms-robot serve`.
+class WorkerPool:
+    """Messages in, plans out. Serves from construction, which blocks for some seconds, until `close`.
+
+    Args:
+        served: the listener, and how.
+        send: sends one message to one stream; called from any of the pool's threads, must not block.
+        processes: None for one for each core.
 
     Attributes:
-        listener: shipped name or folder.
-        name: that robots ask for, zenoh/NAME; None: the listener's.
-        zenoh: zenoh's configuration; None: loopback.
-        metrics: TCP port of /metrics; None: none.
-        hop: None for the one that a robot would choose by what a plan takes here.
-        processes: that step; None: one for each core.
-        everybody: admit without asking what it costs.
-        engine: what the listener's networks are computed by.
-        insecure: allow endpoints beyond loopback without TLS.
+        hop: frames from one plan to the next, the same for all.
+        capacities: costs of batches in each process, measured while all were at work.
+        problem: why it cannot continue; None as long as it can.
+
+    Raises ConfigError for an unknown listener or hop, ModelError for one that cannot be loaded.
     """
 
-    listener: str = "sfms-small"
-    name: str | None = None
-    zenoh: Path | None = None
-    metrics: str | None = None
-    hop: int | None = None
-    processes: int | None = None
-    everybody: bool = False
-    engine: EngineName = "auto"
-    insecure: bool = False
+    def __init__(self, served: Served, send: Send, processes: int | None = None) -> None:
+        self._served, self._send = served, send
+        self._changed = threading.Condition()
+        self._numbers = itertools.count()
+        self._closing = False
+        self._figures: Sequence[Figures] = ()
+        self.hop = 0
+        self.problem: RobotError | None = None
+        self._workers = [_Worker(served, self._take)]
+        try:
+            self._wait(lambda: self.hop > 0)
+            self._served = replace(served, hop=self.hop)
+            self._workers += [_Worker(self._served, self._take) for _ in range(1, processes or cores())]
+            self._wait(lambda: all(each.capacity for each in self._workers))
+        except BaseException:
+            self.close()
+            raise
+        self.capacities = [each.capacity for each in self._workers if each.capacity is not None]
+
+    @property
+    def most(self) -> int:
+        """Return the number of heads that are answered within the deadline."""
+        return sum(each.most(DEADLINE_S) for each in self.capacities)
+
+    def receive(self, stream: str, message: bytes) -> None:
+        """Pass on a message of a stream. From any thread; never blocks."""
+        worker = next((each for each in self._workers if stream in each.clients), None)
+        if worker is None:
+            self._send(stream, words_message(Notice("unknown")))
+        else:
+            worker.child.send((stream, message, time.monotonic()))
+
+    def join(self, message: bytes, reply: Reply) -> None:
+        """Pass on a request for a stream. From any thread.
+
+        `reply` is called from one of the pool's threads, or never: a robot without an answer asks again.
+        """
+        client = _client(message)
+        with self._changed:
+            serving = [each for each in self._workers if each.capacity is not None]
+            if not serving:
+                return
+            known = [each for each in serving if client in each.clients_to_be]
+            worker = min(known or serving, key=lambda each: len(each.clients_to_be))
+            number = next(self._numbers)
+            worker.requests[number] = (client, reply)
+        worker.child.send((None, message, number))
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the figures of all processes together (`stream_server.report`), from any thread but the pool's own."""
+        number = next(self._numbers)
+        with self._changed:
+            serving = [each for each in self._workers if each.capacity is not None]
+            for each in serving:
+                each.child.send(number)
+            self._changed.wait_for(lambda: all(each.counted >= number for each in serving), FIGURES_LIMIT_S)
+            self._figures = [each.figures for each in serving if each.figures is not None] or self._figures
+        return report(self._figures)
+
+    def close(self) -> None:
+        """End the processes, whatever they compute. Idempotent."""
+        with self._changed:
+            self._closing = True
+        for each in self._workers:
+            each.child.close(CLOSE_LIMIT_S)
+
+    def _wait(self, done: Callable[[], bool]) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self.problem is not None or done())
+            if self.problem is not None:
+                raise self.problem
+
+    def _take(self, worker: _Worker, message: Any) -> None:
+        """Handle a message of a process, in the thread that reads it."""
+        said: tuple[str, Any] = ("ended", message.code) if isinstance(message, Ended) else message
+        kind, value = said
+        if kind == "send":
+            for stream, plan in value:
+                self._send(stream, plan)
+            return
+        with self._changed:
+            if kind == "answer":
+                _, reply = worker.requests.pop(value[0])
+            elif kind == "clients":
+                worker.clients = value
+            elif kind == "figures":
+                worker.counted, worker.figures = value
+            elif kind == "loaded":
+                self.hop = self.hop or value  # of the first: it measured while nothing else was at work
+                worker.child.send(self.hop)
+            elif kind == "ready":
+                worker.capacity = value
+            elif kind == "error":
+                self.problem = self.problem or value
+            elif kind == "ended":
+                self._replace(worker, value)
+            self._changed.notify_all()
+        if kind == "answer":
+            reply(value[1])
+
+    def _replace(self, worker: _Worker, code: int) -> None:
+        """Start another process in place of one that has ended; one that never served is a problem."""
+        if self._closing:
+            return
+        if worker.capacity is None:
+            error = ModelError(f"{self._served.listener}: a process of the server ended with exit code {code} at once")
+            self.problem = self.problem or error
+            return
+        log.error("a process of the server ended with exit code %d: %d heads join again", code, len(worker.clients))
+        self._workers[self._workers.index(worker)] = _Worker(self._served, self._take)
+
+
+class _Worker:
+    """One process.
+
+    Attributes:
+        capacity: None until it serves.
+        clients: of its streams, by stream.
+        requests: for a stream, without an answer yet, by number: the client, and how to reply.
+        figures: the newest, requested by the number `counted`.
+    """
+
+    def __init__(self, served: Served, take: Callable[[_Worker, Any], None]) -> None:
+        self.capacity: Capacity | None = None
+        self.clients: Mapping[str, str] = {}
+        self.requests: dict[int, tuple[str | None, Reply]] = {}
+        self.counted = -1
+        self.figures: Figures | None = None
+        self.child = Child("sfms_robot.app.serve.batch_process:main", served, name="serve", take=partial(take, self))
+
+    @property
+    def clients_to_be(self) -> set[str | None]:
+        """Return the clients that it has, or will have."""
+        return {*self.clients.values(), *(client for client, _ in self.requests.values())}
+
+
+def _client(message: bytes) -> str | None:
+    """Return the client of a request; None for a message that the process will refuse."""
+    try:
+        words = parse_words(message)
+    except PacketError:
+        return None
+    return words.client if isinstance(words, Join) else None
 
 
 class ZenohService:
-    """A `WorkerPool` on the keys of what it serves. From construction, which blocks for some seconds, until `close`.
+    """A `WorkerPool` on zenoh's keys. Serves from construction, which blocks for some seconds, until `close`.
 
     Raises PortError, and as `WorkerPool`.
     """
@@ -94,7 +244,7 @@ class ZenohService:
         self._session.declare_subscriber(f"{ROOT}/{self._name}/*/up", self._on_frame)
 
     def close(self) -> None:
-        """Idempotent."""
+        """End the processes and close the session. Idempotent."""
         self.pool.close()
         close_session(self._session)
 
@@ -119,27 +269,43 @@ class ZenohService:
         )
 
 
-def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], None]) -> dict[str, Any]:
-    """Serve until `over` is set. Returns the figures. Blocks until then.
+def serve(
+    served: Served,
+    over: threading.Event,
+    say: Callable[[str], None],
+    *,
+    router: Path | None = None,
+    insecure: bool = False,
+    metrics: str | None = None,
+    processes: int | None = None,
+) -> dict[str, Any]:
+    """Serve until `over` is set, and return the figures. Blocks until then.
+
+    Args:
+        served: the listener, and how.
+        over: ends the service.
+        say: prints a line for people.
+        router: zenoh's configuration; None: loopback.
+        insecure: allow endpoints beyond loopback without TLS.
+        metrics: [HOST:]PORT of /metrics; None: none.
+        processes: number of processes; None: one for each core.
 
     Raises ConfigError, MissingExtra, ModelError, PortError.
     """
     from sfms_robot.runtime.observers import ServiceManager
 
     check_zenoh()
-    name = check_name(options.name or Path(options.listener).name, "listener")
-    config = session_config("serve", Router(options.zenoh, options.insecure))
+    name = check_name(served.name, "listener")
+    config = session_config("serve", Router(router, insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
-        metrics = None if options.metrics is None else stack.enter_context(closing(metrics_server(options.metrics)))
-        server = os.uname().nodename
-        served = Served(options.listener, name, server, options.engine, options.hop, options.everybody)
-        service = ZenohService(served, config, options.processes)
+        figures = None if metrics is None else stack.enter_context(closing(metrics_server(metrics)))
+        service = ZenohService(served, config, processes)
         stack.callback(service.close)
         pool = service.pool
-        if metrics is not None:
-            metrics.begin(pool.statistics)
-            say(f"metrics: {metrics.url}")
+        if figures is not None:
+            figures.begin(pool.statistics)
+            say(f"metrics: {figures.url}")
         say(
             f"{name}: a plan every {pool.hop} frames, up to {pool.most} heads in {DEADLINE_S * 1e3:.0f} ms here, "
             f"by {len(pool.capacities)} processes"
@@ -166,7 +332,8 @@ def metrics_server(wanted: str) -> LoopbackServer:
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:
-        raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
+        valid = f"0 to {HIGHEST_PORT}, 0 for a free one, HOST:PORT"
+        raise ConfigError(f"--metrics {wanted}: not a TCP port (valid: {valid})")
     try:
         server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
     except OSError as error:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfms_robot.app.open_head import Motion, build_motion
-from sfms_robot.child_process import cores, process_pool
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
 from sfms_robot.lab.bench.measure import Row
+from sfms_robot.processes import cores, process_pool
 from sfms_robot.runtime.loop import difference
 
 CHUNK = 20_000  # frames that one process does without a pause

@@ -2,7 +2,7 @@
 
     stdout    "plan" at the first plan, then one JSON object: resident_mb, peak_mb after `HEARD_FRAMES` more
 
-It loads no more than `listeners.process_child` does.
+It loads no more than `listeners.process` does.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ from sfms_robot.lab.bench.memory_bench import ResidentMemory
 from sfms_robot.lab.bench.procfs import children_of, processor_time_s
 from sfms_robot.lab.bench.startup_bench import first_goal_s
 from sfms_robot.ports import Observer, Source
-from sfms_robot.realtime import realtime_priority
+from sfms_robot.processes import realtime_priority
 from sfms_robot.runtime.clock import RealClock, tick_times
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.quantiles import Quantiles

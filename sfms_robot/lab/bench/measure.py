@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.child_process import cores
 from sfms_robot.errors import ConfigError
+from sfms_robot.processes import cores
 
 HEAD = "face28"
 LISTENER = "sfms-small"

@@ -23,11 +23,12 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.app.serve.worker_pool import WorkerPool
+from sfms_robot.app.serve.service import WorkerPool
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.lab.bench.listener_bench import with_weights
 from sfms_robot.lab.bench.measure import Told, machine
+from sfms_robot.listeners.capacity import Capacity
 from sfms_robot.listeners.remote_messages import (
     Join,
     Notice,
@@ -38,8 +39,7 @@ from sfms_robot.listeners.remote_messages import (
     parse_words,
     words_message,
 )
-from sfms_robot.listeners.serving.capacity import Capacity
-from sfms_robot.listeners.serving.stream_server import DEADLINE_S
+from sfms_robot.listeners.stream_server import DEADLINE_S
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.sources.speakers import voice_file
 
@@ -74,7 +74,7 @@ def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         folder, weights = with_weights(name, Path(scratch))
         load = _Load()
-        with closing(WorkerPool(Served(str(folder), "bench", everybody=True), load.sent)) as pool:
+        with closing(WorkerPool(Served(listener=str(folder), name="bench", all_heads=True), load.sent)) as pool:
 
             def in_time(heads: int) -> bool:
                 curve.append(_loaded(pool, load, messages, heads))

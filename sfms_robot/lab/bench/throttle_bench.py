@@ -33,7 +33,7 @@ from sfms_robot.frames import Plan
 from sfms_robot.lab.bench.live_bench import patient_head
 from sfms_robot.lab.bench.measure import HEAD, LISTENER, Row, Told, row
 from sfms_robot.lab.bench.throttled_tree import Tree, check
-from sfms_robot.listeners.process import HUNG_S, LATE_S
+from sfms_robot.listeners.thread import HUNG_S, LATE_S
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.runtime.states import ARROWS

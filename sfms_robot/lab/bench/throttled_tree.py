@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.bench.procfs import children_of, processor_time_s
-from sfms_robot.realtime import realtime_priority
+from sfms_robot.processes import realtime_priority
 
 SLICE_S: Final = 0.008  # no multiple of a tick: a tick is not always met at the same place of it
 LOOK_S: Final = 0.2  # for processes that were started since

@@ -13,10 +13,7 @@ leaves a fourth client, until the goals of the first braking tick are written.
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,13 +30,13 @@ from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.listen.preflight import begin_page
 from sfms_robot.app.session import Document, RunOptions, run
-from sfms_robot.child_process import take_pipes
 from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.lab.bench.measure import HEAD, Told, machine, row
 from sfms_robot.lab.bench.procfs import processor_time_s
 from sfms_robot.ports import Observer, Tick
+from sfms_robot.processes import Child, ParentPipe
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import THREAD, PageProcess
 
@@ -53,7 +50,7 @@ MOST_CPU: Final = 3.0  # % of a core
 MOST_HALT_MS: Final = 100.0
 _BETWEEN_S: Final = 2.3  # a halt, and the head is led back into the face; no multiple of a tick
 _LIMIT_S: Final = 60.0
-_CHILD: Final = "from sfms_robot.lab.bench.view_bench import clients; clients()"
+_CLOSE_S: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -260,7 +257,7 @@ def _finished(report: dict[str, Any]) -> dict[str, Any]:
 
 def _spent_s(turns: _Turns, page: PageProcess) -> tuple[float, float, float]:
     """Processor time so far: of this process, of what it does for the page, and of the page's process."""
-    senders = [each.native_id for each in threading.enumerate() if each.name == THREAD]
+    senders = [each.native_id for each in threading.enumerate() if each.name.startswith(THREAD)]
     sending_s = sum(processor_time_s(os.getpid(), thread) for thread in senders)
     return time.process_time(), turns.spent_s + sending_s, processor_time_s(page.process_id)
 
@@ -273,19 +270,12 @@ def _late(document: Document) -> int:
 
 @contextmanager
 def _readers() -> Iterator[Callable[[str | None], None]]:
-    """Clients in a process of their own that read all there is; to be told whose page, or None: nobody's."""
-    with subprocess.Popen([sys.executable, "-P", "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        assert child.stdin is not None
-        pipe = child.stdin
-
-        def look(url: str | None) -> None:
-            pipe.write(json.dumps(url).encode() + b"\n")
-            pipe.flush()
-
-        try:
-            yield look
-        finally:
-            pipe.close()
+    """Start clients in a process of their own; yield a function that has them read all of a page, or of none."""
+    child = Child(f"{__name__}:clients", name="clients")
+    try:
+        yield child.send
+    finally:
+        child.close(_CLOSE_S)
 
 
 def _visitor(url: str) -> ClientConnection:
@@ -299,13 +289,12 @@ def _read_all(visitor: ClientConnection) -> None:
 
 
 def clients() -> None:
-    """The clients' process: a line per page that is to be looked at, until its pipe ends."""
-    incoming, _ = take_pipes()
-    visitors: list[ClientConnection] = []
-    for line in incoming:
+    """Read the page of the newest message, in the clients' process, until its pipe ends."""
+    parent, visitors = ParentPipe(), list[ClientConnection]()
+    while True:
+        url = parent.receive()
         for visitor in visitors:
             visitor.close()
-        url = json.loads(line)
         visitors = [] if url is None else [_visitor(url) for _ in range(CLIENTS)]
         for visitor in visitors:
             threading.Thread(target=_read_all, args=(visitor,), daemon=True).start()

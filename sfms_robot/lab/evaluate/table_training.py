@@ -12,13 +12,13 @@ from rich.progress import Progress
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.child_process import process_pool
 from sfms_robot.lab.evaluation.paper.recipes import SizeName, recipes
 from sfms_robot.lab.evaluation.paper.table_trainer import train
 from sfms_robot.lab.learning import resume
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.watch import Watch, progress_bar
 from sfms_robot.lab.train.train_runs import device_of
+from sfms_robot.processes import process_pool
 from sfms_robot.signals.tracks import Take
 
 WATCHED = 3  # held-out windows of which a history is kept: those that move most, one per take

@@ -10,8 +10,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from sfms_robot.child_process import process_pool
 from sfms_robot.listeners.registry import one_thread
+from sfms_robot.processes import process_pool
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")

@@ -19,12 +19,10 @@ from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.corpora.meeting_evidence import meeting_evidence
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S
 from sfms_robot.lab.evaluation.reference_hazard import mute
+from sfms_robot.lab.evaluation.whole_recordings import Ints, hazards_in, heard_in, most_in, scene_in, steps_in
 from sfms_robot.lab.learning.events.event_trainer import scene_of
-from sfms_robot.listeners.events.evidence import Ints, heard_in
-from sfms_robot.listeners.events.hazards import STEP_FRAMES
-from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel
-from sfms_robot.listeners.events.sensing import Sensed, scene_in
-from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
+from sfms_robot.listeners.events.evidence import Sensed
+from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, STEP_FRAMES, DecideMemory, EventModel
 from sfms_robot.listeners.lots import Use, uniforms_of
 
 
@@ -74,7 +72,7 @@ def _decided(
     memory, found = model.start(seed, calmness).decided, list[ListenerEvent]()
     at, look_back = 0, math.inf  # the frame from which on a look aside is over
     while (frame := min(frames[at], look_back)) < len(heard):
-        decision, memory = model.decide(Sensed(int(frame), heard[int(frame)]), memory)
+        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
         found += decision.events
         at += frame == frames[at]
         look_back = max(frame + STEP_FRAMES, _over(memory))

@@ -29,7 +29,7 @@ from sfms_robot.lab.learning.events.event_trainer import (
 )
 from sfms_robot.lab.learning.events.logistic import Logistic
 from sfms_robot.listeners.events.evidence import HEARD
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S
+from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S
 
 _SILENT: Final = {
     **PHASE,

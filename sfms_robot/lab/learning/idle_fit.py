@@ -1,4 +1,4 @@
-"""What a listener leaves out of the small motion of resting faces, as `listeners.idle_motion` draws it.
+"""What a listener leaves out of the small motion of resting faces, as `listeners.idle` draws it.
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.idle_motion import BANDS, BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
+from sfms_robot.listeners.idle import IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
 from sfms_robot.signals.events import runs
 
 WINDOW: Final = 2 * FRAME_HZ
@@ -63,7 +63,7 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
     people, listener = ([one.windows for one in faces if len(one.windows)] for faces in (theirs, ours))
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
-    lacking = covariances(people) - covariances(listener)  # (BANDS, C, C)
+    lacking = covariances(people) - covariances(listener)  # (IDLE_BANDS, C, C)
     loadings, amplitudes = [], []
     for rows in map(_of_region, REGIONS):
         part = lacking[:, rows[:, None], rows]
@@ -78,7 +78,7 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
             amplitudes.append(np.sqrt(by_band / by_band.sum()))
     idle = IdleMotion(
         np.array(loadings, np.float32).reshape(-1, len(BLENDSHAPES)),
-        np.array(amplitudes, np.float32).reshape(-1, BANDS).T,
+        np.array(amplitudes, np.float32).reshape(-1, IDLE_BANDS).T,
         _spread(people),
         *np.zeros((2, KNOTS, len(BLENDSHAPES)), np.float32),
     )
@@ -110,7 +110,7 @@ def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Fl
 
 
 def unleaked(seen: Doubles) -> Doubles:
-    """(BANDS,) powers of a process of which windows of two seconds show `seen` (BANDS,): none is negative.
+    """(IDLE_BANDS,) powers of a process of which windows of two seconds show `seen` (IDLE_BANDS,): none is negative.
 
     A line of a band is seen in others too, above all one that is slower than a window is long.
     """
@@ -118,32 +118,32 @@ def unleaked(seen: Doubles) -> Doubles:
 
 
 def _leakage() -> Doubles:
-    """(BANDS, BANDS): what `covariances` finds in each band, mean over windows, of power 1 in another."""
-    edges = np.array(BANDS_HZ)
-    hz = edges[:-1] + (np.arange(64)[:, None] + 0.5) / 64 * np.diff(edges)  # (64, BANDS)
-    turn = np.exp(2j * np.pi * hz.T[:, :, None] / FRAME_HZ * np.arange(WINDOW))  # (BANDS, 64, 50)
+    """(IDLE_BANDS, IDLE_BANDS): what `covariances` finds in each band, mean over windows, of power 1 in another."""
+    edges = np.array(IDLE_BANDS_HZ)
+    hz = edges[:-1] + (np.arange(64)[:, None] + 0.5) / 64 * np.diff(edges)  # (64, IDLE_BANDS)
+    turn = np.exp(2j * np.pi * hz.T[:, :, None] / FRAME_HZ * np.arange(WINDOW))  # (IDLE_BANDS, 64, 50)
     power = np.abs(np.fft.fft(turn, axis=-1) / WINDOW) ** 2  # of lines a + ib: half of it at f, half at -f
     both = (power + np.roll(power[..., ::-1], 1, axis=-1)) / 2
-    found = np.zeros((BANDS, BANDS))
+    found = np.zeros((IDLE_BANDS, IDLE_BANDS))
     found[0] = both[..., 0].mean(1)
-    band = np.searchsorted(BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ), side="right") - 1
-    for at in range(1, BANDS):
+    band = np.searchsorted(IDLE_BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ), side="right") - 1
+    for at in range(1, IDLE_BANDS):
         found[at] = 2 * both[..., : WINDOW // 2 + 1][..., band == at].sum(-1).mean(1)
     return found
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
-    """(BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
+    """(IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
     windows = np.concatenate(faces)
     hz = np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ)
-    band = np.searchsorted(BANDS_HZ, hz, side="right") - 1
+    band = np.searchsorted(IDLE_BANDS_HZ, hz, side="right") - 1
     channels = windows.shape[-1]
     means = windows.mean(axis=1, dtype=np.float64)
-    found = np.zeros((BANDS, channels, channels))
+    found = np.zeros((IDLE_BANDS, channels, channels))
     off = means - means.mean(0)
     found[0] = off.T @ off / len(windows)
     lines = np.fft.rfft(windows - means[:, None], axis=1) / WINDOW  # (W, F, C)
-    for at in range(1, BANDS):
+    for at in range(1, IDLE_BANDS):
         chosen = lines[:, band == at].reshape(-1, channels)
         found[at] = 2 * np.real(chosen.conj().T @ chosen) / len(windows)
     return found

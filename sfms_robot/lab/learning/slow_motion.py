@@ -1,4 +1,4 @@
-"""Slow motion of a head told from what it does, and the sway that a listener is given of it (`listeners.sway`)."""
+"""Slow motion of a head told from what it does, and the sway that a listener is given of it (`listeners.idle`)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, ListenerEvent
+from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import BANDS, BANDS_HZ, head_channels
 
 CUT_HZ: Final = 1.0
 HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head

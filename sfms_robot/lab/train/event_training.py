@@ -24,8 +24,7 @@ from sfms_robot.lab.learning.events import borrowed, event_rollout, event_shapes
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, NOD, RIDGE, STUDY_RIDGE, Groups, Student
 from sfms_robot.lab.learning.events.labels import LEARNED
 from sfms_robot.listeners.events.evidence import EVIDENCE
-from sfms_robot.listeners.events.hazards import EventTables, Hazard, HazardBank
-from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.events.model import EventModel, EventTables, Hazard, HazardBank
 from sfms_robot.signals.motion_primitives import read_motions
 
 KNOBS: Final = (1.0, 2.2, 4.0)  # nods a minute, rolled out
@@ -42,7 +41,7 @@ FROM: Final[Mapping[str, str]] = {
     "gaze_shift": "gaze shifts away from a speaker, AMI",
 }
 _HEADER: Final = """When a listener nods, shakes, tilts, laughs, smiles, says "mm-hm", raises brows, blinks, looks away;
-how long and how large. Read by `sfms_robot.listeners.events.hazards`, which says what the numbers mean.
+how long and how large. Read by `sfms_robot.listeners.events.model`, which says what the numbers mean.
 Learned from: The AMI Meeting Corpus, AMI project consortium (Carletta et al. 2005), manual annotations 1.7, CC BY 4.0,
 http://groups.inf.ed.ac.uk/ami/corpus/; annotations taken from github Hasetomo2142/ami-corpus-preprocessing, commit
 6d845bc07b21c8862afbf38f1b1f9ab3bf40c437; the people of the training split. Looks aside: Dembinsky, Watanabe, Dengel,

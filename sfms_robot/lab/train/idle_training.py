@@ -20,7 +20,7 @@ from sfms_robot.lab.corpora.resampling import at_frame_rate
 from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.lab.learning.idle_fit import explained, fit_idle, resting
 from sfms_robot.listeners.checkpoint import load_config
-from sfms_robot.listeners.idle_motion import FILE, IdleMotion
+from sfms_robot.listeners.idle import FILE, IdleMotion
 from sfms_robot.listeners.registry import one_thread
 
 TOLD: Final = 8  # channels that move most, in the figures

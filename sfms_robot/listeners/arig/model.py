@@ -22,7 +22,7 @@ Beyond the paper, too:
    what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
    the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
    draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
- - `sway: true`: slow motion of the head is made apart (`listeners.sway`) and is in no motion here: what is left of the
+ - `sway: true`: slow motion of the head is made apart (`listeners.idle`) and is in no motion here: what is left of the
    head is what it does, and soon over, so `rho` forgets it within frames. Carried on as slowly as a head sways, what
    was drawn beside a nod left it some degrees off when the nod was over. Of what is left neither its past nor what was
    drawn last is told: told of its own head, a network learned to swing it from one end of its range to the other.
@@ -52,7 +52,7 @@ from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, Sho
 from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
-from sfms_robot.listeners.sway import BANDS, head_channels
+from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 

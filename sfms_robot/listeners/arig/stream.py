@@ -28,9 +28,9 @@ from sfms_robot.listeners.arig.audio_frontend import AudioState
 from sfms_robot.listeners.arig.rotary import rotary
 from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST, Sojourn, draw_sojourn, with_feedback
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.idle import HeadSway
 from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import HeadSway
 from sfms_robot.signals.control import COLUMNS
 
 BEYOND = 1e3  # rad, m or of a blendshape: no face

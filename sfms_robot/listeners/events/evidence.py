@@ -1,31 +1,45 @@
-"""What decisions are made from: for how long things have been so, from who speaks, who looks, and what was done.
+"""Evidence for decisions, frame by frame: voices, looks, signs of faces, and the events of before.
 
-A row of evidence is what is known once a frame is over; whatever comes after it changes nothing. Times are seconds,
-`math.inf` for what has never been. NaN: it does not apply, or nobody knows, which speaks neither for nor against
-anything. There are two ways to the same numbers: of whole recordings (`heard_in`, `done_in`) and frame by frame
-(`hear`, `done`).
+    SpeakerFrame -> signs of the face, voice, look (`Instant`) -> a row of evidence (`hear`); own events -> `done`
+
+A row of evidence is known once a frame is over; what comes after it changes nothing. Times are seconds, `math.inf` for
+what has never been. NaN: it does not apply, or is unknown, which speaks neither for nor against anything.
 
 Of the others' voices together (`signals.phase`): how long the phrase lasts so far, their silence, the last phrase. The
-floor is held by whoever, oneself among them, is in a phrase of a second or more; of several the latest to begin, and
-the last one while nobody is. Whose look counts: of those who speak now, else of the holder of the floor.
+floor is held by the person, oneself among them, who is in a phrase of a second or more; of several the latest to begin,
+and the last one while none is. Looks count of those who speak now, else of the holder of the floor.
+
+Sound says whether the person speaks, the face whether they look, nod, smile and laugh. A head that talks moves all the
+time, by more than many a nod: only a silent person nods. Each input may be missing. No microphone: a mouth that moves
+is a voice. No face: no nod and no laugh. No attention: the head is looked at, for one person talks to one head; an
+attention of NaN is unknown, and so is that of a face that has had one before and is lost. Attention flickers; looked-at
+changes only when a quarter second of it, smoothed, has clearly crossed the middle.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import FRAME_S, Doubles, ListenerEvent
-from sfms_robot.signals import phase
+from sfms_robot.frames import (
+    CHANNEL_INDEX,
+    FRAME_S,
+    SMILE_CORNERS,
+    Doubles,
+    FaceFrame,
+    Floats,
+    ListenerEvent,
+    SpeakerFrame,
+    changed,
+)
+from sfms_robot.signals import voice_activity
+from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.phase import SpeechPhase
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from sfms_robot.signals.voice_activity import Ear
 
 # Of the others: seconds, but for flags (0 or 1).
 HEARD: Final = (
@@ -51,97 +65,19 @@ AT: Final[Mapping[str, int]] = {name: index for index, name in enumerate(EVIDENC
 FLOOR_FRAMES: Final = 25  # a phrase this long takes the floor
 COUNTED_S: Final = 30.0
 REMEMBERED_S: Final = 64.0  # after it what was done is long ago
-_EPS_S: Final = 1e-6
-_MINE: Final = 0
-_NOBODY: Final = -1
-
-
-@dataclass(frozen=True)
-class Scene:
-    """N frames of a conversation of P people, oneself the first.
-
-    Attributes:
-        speaks: (N, P).
-        looks: (N, P) he looks at me (1) or not (0); NaN: nobody knows. The first column means nothing.
-        laughs, smiles: (N,) one of the others does.
-        nods: (N,) one of the others begins to.
-    """
-
-    speaks: Bools
-    looks: Doubles
-    laughs: Bools
-    nods: Bools
-    smiles: Bools
-
-
-def heard_in(scene: Scene) -> Doubles:
-    """(N, len(HEARD))."""
-    index = np.arange(len(scene.speaks))
-    others = scene.speaks[:, 1:]
-    phrase, silence, last = phase.times(np.asarray(others.any(axis=1))).T
-    holder, held = _floor_in(scene.speaks)
-    spoke = np.maximum.accumulate(np.where(scene.speaks, index[:, None], -np.inf), axis=0)  # (N, P)
-    another = holder > _MINE
-    relevant = counts_in(scene)[:, 1:]
-    looks = scene.looks[:, 1:]
-    known = (relevant & ~np.isnan(looks)).any(axis=1)
-    looked = (relevant & (looks == 1)).any(axis=1)
-    began = np.maximum.accumulate(np.where(looked & ~np.r_[False, looked[:-1]], index, 0))
-    speaking = others.sum(axis=1)
-    columns = {
-        "phrase_s": np.where(phrase > 0, phrase, np.nan),
-        "silence_s": silence,
-        "last_phrase_s": np.where(last > 0, last, np.nan),
-        "one_speaks": speaking == 1,
-        "several_speak": speaking > 1,
-        "floor_mine": holder == _MINE,
-        "floor_s": np.where(another, (index - held) * FRAME_S, np.nan),
-        "holder_silence_s": np.where(another, (index - spoke[index, np.maximum(holder, 0)]) * FRAME_S, np.nan),
-        "own_voice_s": (index - spoke[:, _MINE]) * FRAME_S,
-        "gaze_known": known,
-        "looked_at": looked,
-        "looked_at_s": np.where(looked, (index - began) * FRAME_S, np.nan),
-        "looked_at_silence_s": np.where(looked, silence, np.nan),
-        "laugh_s": _since(scene.laughs),
-        "others_nod_s": _since(scene.nods),
-        "others_smile_s": _since(scene.smiles),
-    }
-    return np.stack([np.asarray(columns[name], np.float64) for name in HEARD], axis=1)
-
-
-def counts_in(scene: Scene) -> Bools:
-    """(N, P) whose look counts: he speaks, or nobody does and he holds the floor. Never one's own."""
-    others = scene.speaks.copy()
-    others[:, _MINE] = False
-    holder, _ = _floor_in(scene.speaks)
-    waiting = ~others.any(axis=1, keepdims=True) & (holder[:, None] == np.arange(others.shape[1]))
-    waiting[:, _MINE] = False
-    counts: Bools = others | waiting
-    return counts
-
-
-def _since(happens: Bools) -> Doubles:
-    """(N,) seconds since the newest True."""
-    index = np.arange(len(happens))
-    newest = np.maximum.accumulate(np.where(happens, index, -np.inf))
-    return np.asarray((index - newest) * FRAME_S, np.float64)
-
-
-def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
-    """Who holds the floor (N,), -1 nobody yet, and since which frame."""
-    frames, people = speaks.shape
-    index = np.arange(frames)
-    lengths = np.stack([phase.times(speaks[:, who])[:, 0] for who in range(people)], axis=1)
-    lengths[lengths < (FLOOR_FRAMES - 0.5) * FRAME_S] = np.inf
-    newest = np.maximum.accumulate(np.where(np.isfinite(lengths).any(axis=1), index, -1))
-    holder = np.where(newest >= 0, np.argmin(lengths, axis=1)[newest], _NOBODY)
-    changed = holder != np.r_[_NOBODY, holder][:-1]
-    return holder, np.maximum.accumulate(np.where(changed, index, 0))
+EPS_S: Final = 1e-6
+MINE: Final = 0
+NOBODY: Final = -1
 
 
 @dataclass(frozen=True)
 class Instant:
-    """One frame of a `Scene`: speaks (P,), looks (P,), and the rest."""
+    """One frame of a conversation of P people, oneself the first.
+
+    Attributes:
+        speaks, looks: (P,) each speaks; each looks at oneself, NaN: unknown.
+        laughs, nods, smiles: one of the others does, or begins to nod.
+    """
 
     speaks: tuple[bool, ...]
     looks: tuple[float, ...]
@@ -152,13 +88,13 @@ class Instant:
 
 @dataclass(frozen=True)
 class Hearing:
-    """What a stream remembers of the others.
+    """The memory of a stream of the others.
 
     Attributes:
-        frame: how many frames have been heard.
-        voices: of all others together; `each` of everybody, oneself the first.
-        spoke: the newest frame of each one's voice.
-        holder, held: of the floor, and since when.
+        frame: number of frames so far.
+        voices, each: phrases of all others together, and of each person, oneself the first.
+        spoke: newest frame of each one's voice.
+        holder, held: of the floor, and since which frame.
         looked: since which frame one is looked at, None while not.
         laughed, nodded, smiled: newest frames.
     """
@@ -167,7 +103,7 @@ class Hearing:
     voices: SpeechPhase
     each: tuple[SpeechPhase, ...]
     spoke: tuple[float, ...]
-    holder: int = _NOBODY
+    holder: int = NOBODY
     held: int = 0
     looked: int | None = None
     laughed: float = -math.inf
@@ -176,17 +112,17 @@ class Hearing:
 
     @property
     def own_voice_s(self) -> float:
-        """Since the newest own voice; `inf`: there has been none."""
-        return (self.frame - 1 - self.spoke[_MINE]) * FRAME_S
+        """Return the time since the newest own voice [s]; `inf`: there has been none."""
+        return (self.frame - 1 - self.spoke[MINE]) * FRAME_S
 
 
 def hearing(people: int = 2) -> Hearing:
-    """Nothing heard yet of a conversation of so many, oneself among them."""
+    """Return the memory at the beginning of a conversation of so many, oneself among them."""
     return Hearing(0, SpeechPhase(), (SpeechPhase(),) * people, (-math.inf,) * people)
 
 
 def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
-    """One frame -> its row (len(HEARD),) and what is remembered."""
+    """Take one frame; return its row (len(HEARD),) and the memory after it."""
     now = before.frame
     others = instant.speaks[1:]
     speaking = sum(others)
@@ -212,11 +148,11 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
         now if instant.smiles else before.smiled,
     )  # fmt: skip
     phrase_s, silence_s, last_s = voices.times_s
-    another = holder > _MINE
+    another = holder > MINE
     row = (
         phrase_s or math.nan, silence_s, last_s or math.nan,
         float(speaking == 1), float(speaking > 1),
-        float(holder == _MINE),
+        float(holder == MINE),
         (now - held) * FRAME_S if another else math.nan,
         (now - spoke[holder]) * FRAME_S if another else math.nan,
         after.own_voice_s,
@@ -229,57 +165,13 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
     return np.array(row), after
 
 
-# --- what was done ----------------------------------------------------------------------------------------------
-
-_SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
-_SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
-
-
-def done_in(
-    spans_s: Mapping[str, Doubles], frames: int, log_rate: Doubles | float, aside: Bools | None = None
-) -> Doubles:
-    """(frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
-
-    `aside` (K,): which of the gaze shifts go away from the person.
-    """
-    return done_at(spans_s, np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64), log_rate, aside)
-
-
-def done_at(
-    spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
-) -> Doubles:
-    """`done_in` at instants (M,): (M, len(DONE))."""
-    columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
-    for kind in _SINCE_END:
-        columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
-    for name, kind in _SINCE_BEGIN.items():
-        columns[name] = _since_newest(spans_s.get(kind), now_s)
-    nods = np.sort(spans_s.get("nod", np.zeros((0, 2)))[:, 0])
-    begun, earlier = (np.searchsorted(nods, now_s - ago_s - _EPS_S) for ago_s in (0.0, COUNTED_S))
-    columns["root_nods_30s"] = np.sqrt(begun - earlier)
-    columns["log_rate"] = log_rate
-    shifts = spans_s.get("gaze_shift", np.zeros((0, 2)))
-    columns["shift_s"] = _since_newest(shifts, now_s)
-    newest = np.searchsorted(shifts[:, 0], now_s - _EPS_S) - 1
-    away = np.zeros(len(shifts), bool) if aside is None else aside
-    at_person = (newest < 0) | ~np.r_[away, False][newest]
-    columns["at_person_s"] = np.where(at_person, columns["shift_s"], np.nan)
-    return np.stack([np.broadcast_to(np.asarray(columns[name], np.float64), now_s.shape) for name in DONE], axis=1)
-
-
-def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> Doubles:
-    """(N,) seconds since the newest span that had begun, began or ended; inf before the first, 0 inside."""
-    if spans is None or not len(spans):
-        return np.full(len(now_s), np.inf)
-    newest = np.searchsorted(spans[:, 0], now_s - _EPS_S) - 1
-    at = np.maximum.accumulate(spans[:, 1]) if ends else spans[:, 0]
-    return np.where(newest < 0, np.inf, np.maximum(0.0, now_s - at[np.maximum(newest, 0)]))
+# --- Own events -------------------------------------------------------------------------------------------------------
 
 
 def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doubles:
-    """(len(DONE),) at an instant, from events in the order of their beginnings.
+    """Return the row (len(DONE),) at an instant, from events in the order of their beginnings.
 
-    An event that has yet to begin has begun for this purpose if it is among them.
+    Events that have yet to begin count as begun.
     """
     since = dict.fromkeys(DONE, math.inf)
     nods, aside = 0, False
@@ -288,7 +180,7 @@ def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doub
         kind = event.kind
         if kind == "nod":
             since["nod_s"] = begun_s
-            nods += begun_s <= COUNTED_S + _EPS_S
+            nods += begun_s <= COUNTED_S + EPS_S
         elif kind == "gaze_shift":
             since["shift_s"] = begun_s
             aside = event.target_rad is not None and event.target_rad != (0.0, 0.0)
@@ -305,19 +197,216 @@ def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doub
 
 
 def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[ListenerEvent]:
-    """Those that had begun before an instant, and may still matter."""
+    """Return the events that had begun before an instant, and may still matter."""
     return [
         event
         for event in events
-        if event.start_s < now_s - _EPS_S and (event.end_s > now_s - REMEMBERED_S or event.kind == "gaze_shift")
+        if event.start_s < now_s - EPS_S and (event.end_s > now_s - REMEMBERED_S or event.kind == "gaze_shift")
     ]
 
 
 def remembered(events: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
-    """What has to be kept of events in order: nods of the last minute, of every other kind the newest."""
+    """Return the events, in order, that may still matter: nods of the last minute, of every other kind the newest."""
     newest = {event.kind: event for event in events}
     return tuple(
         event
         for event in events
         if newest[event.kind] is event or (event.kind == "nod" and event.end_s > now_s - REMEMBERED_S)
     )
+
+
+# --- Signs of a face --------------------------------------------------------------------------------------------------
+#
+# Trackers make errors: a face may be upside down, stuck, saturated or all noise. So each sign is judged against the
+# last second of the same face or a running neutral, which a constant becomes; angles are taken modulo a whole turn;
+# and a nod is a swing larger than how the head swings anyway, by talking or by noise. A laugh is a broad smile over a
+# mouth that opens and closes: a person who talks and beams at once counts as laughing.
+
+NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most of it back
+BACK: Final = 0.6
+WINDOW: Final = 25  # frames
+NODS_APART: Final = 30  # frames; more than a window, so that no swing counts twice
+STANDS_OUT: Final = 4.0  # times as far as the head swung over the last seconds, on average
+SMILE: Final = 0.25  # over the neutral
+BEAM: Final = 0.35
+HELD_FRAMES: Final = 6
+OPENING: Final = 0.02  # mean change of jawOpen per frame of a mouth that moves
+_SMOOTH: Final = 0.5  # share of a new value
+_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: a person who always beams is neutral within a minute
+_NEUTRAL_FALL: Final = 0.1
+_MOTION: Final = 0.12
+_SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
+_CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
+_JAW: Final = CHANNEL_INDEX["jawOpen"]
+_PITCH: Final = CHANNEL_INDEX["pitch"]
+
+
+@dataclass(frozen=True)
+class Signs:
+    """The signs of one frame: a nod has just been seen; the person smiles, laughs; the mouth moves as in speech."""
+
+    nods: bool = False
+    smiles: bool = False
+    laughs: bool = False
+    mouth_moves: bool = False
+
+
+@dataclass(frozen=True)
+class FaceState:
+    """The memory of a face.
+
+    Attributes:
+        frame: number of frames so far.
+        pitch_rad: smoothed, unwrapped, of the last second.
+        nodded: frame of the newest nod; sway_rad: mean swing of the last seconds.
+        neutral, held: neutral of the smile, and frames for which it has been up.
+        jaw, opening: jawOpen, and its change per frame.
+    """
+
+    frame: int = 0
+    pitch_rad: tuple[float, ...] = ()
+    nodded: int = -NODS_APART
+    sway_rad: float = 0.0
+    neutral: float | None = None
+    held: int = 0
+    jaw: float = 0.0
+    opening: float = 0.0
+
+
+def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
+    """Read the signs of one frame of 40 ms: none without a face, or with one that is not finite."""
+    motion = None if face is None else face.motion
+    if motion is None or not np.isfinite(motion).all():
+        return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
+    pitch, left, right, jaw = (motion.item(channel) for channel in (_PITCH, *_CORNERS, _JAW))
+    nods, state = _nod(pitch, state)
+    smiles, beams, state = _smile(_within((left + right) / 2), state)
+    jaw = _within(jaw)
+    opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
+    moves = opening > OPENING
+    return Signs(nods, smiles, beams and moves, moves), changed(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+
+
+def _within(value: float) -> float:
+    return min(max(value, 0.0), 1.0)
+
+
+def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
+    before = state.pitch_rad
+    smoothed = before[-1] + _SMOOTH * math.remainder(pitch_rad - before[-1], 2 * math.pi) if before else pitch_rad
+    pitch = (*before, smoothed)[-WINDOW:]
+    swing = max(_swing(pitch), _swing([-p for p in pitch]))
+    stands_out = swing >= max(NOD_RAD, STANDS_OUT * state.sway_rad)
+    new = stands_out and state.frame - state.nodded >= NODS_APART
+    sway = state.sway_rad + _SWAY * (swing - state.sway_rad)
+    return new, changed(state, pitch_rad=pitch, nodded=state.frame if new else state.nodded, sway_rad=sway)
+
+
+def _swing(values: tuple[float, ...] | list[float]) -> float:
+    """Return how far up it went, if by now it is most of the way back; else 0."""
+    top = max(values)
+    risen = top - min(values[: values.index(top) + 1])
+    return risen if top - values[-1] >= BACK * risen else 0.0
+
+
+def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
+    """Return (smiles, beams, state); a smile counts after it has been up for a quarter of a second."""
+    neutral = level if state.neutral is None else state.neutral
+    neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
+    over = level - neutral
+    held = state.held + 1 if over > SMILE * (0.6 if state.held >= HELD_FRAMES else 1.0) else 0
+    smiles = held >= HELD_FRAMES
+    return smiles, smiles and over > BEAM, changed(state, neutral=neutral, held=held)
+
+
+# --- The person -------------------------------------------------------------------------------------------------------
+
+Addressed = Literal["sense", "assume", "never"]
+OWN_VOICE_DB: Final = -50.0  # of full scale; what a program says is silent otherwise
+LOOK_S: Final = 0.25
+LOOKED, NOT_LOOKED = 0.6, 0.4
+LOST_FRAMES: Final = 25  # after so many without a face the look is unknown
+_KEPT: Final = math.exp(-FRAME_S / LOOK_S)
+
+
+@dataclass(frozen=True)
+class SenseMemory:
+    """The memory of the person.
+
+    Attributes:
+        addressed: `Calmness.addressed`.
+        ear: of their voice.
+        deaf: there has been no sound at all.
+        attention: smoothed; None before any.
+        looked: 1, 0, or NaN for unknown.
+        unseen: frames since their face; None before the first.
+        tells: there has been an attention.
+    """
+
+    addressed: Addressed = "sense"
+    ear: Ear = field(default_factory=voice_activity.start)
+    deaf: bool = True
+    attention: float | None = None
+    looked: float = math.nan
+    unseen: int | None = None
+    tells: bool = False
+    face: FaceState = FaceState()
+    hearing: Hearing = field(default_factory=hearing)
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """Evidence (len(HEARD),) after the frame of that index in loop time."""
+
+    frame: int
+    heard: Doubles
+
+
+def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemory]:
+    """Take a frame; return its evidence and the memory after it.
+
+    Pure. Several streams of one speaker may share it if their `addressed` is the same.
+    """
+    deaf = memory.deaf and not len(speaker.audio)
+    ear = memory.ear if deaf else voice_activity.step(energy_db(speaker.audio), memory.ear)
+    signs, face = read_signs(speaker.face, memory.face)
+    looked, watching = looks_at_head(speaker, memory)
+    talks = signs.mouth_moves if deaf else ear.active
+    nods = signs.nods and not talks and not memory.hearing.voices.speech
+    instant = Instant((sounds(speaker.agent_audio), talks), (math.nan, looked), signs.laughs, nods, signs.smiles)
+    heard, remembered = hear(instant, memory.hearing)
+    frame = round(speaker.time_s / FRAME_S) - 1
+    return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, face=face, hearing=remembered)
+
+
+def sounds(own_voice: Floats | None) -> bool:
+    """Return whether the robot's own voice sounds."""
+    return own_voice is not None and energy_db(own_voice) > OWN_VOICE_DB
+
+
+def looks_at_head(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMemory]:
+    """Return 1, 0 or NaN (unknown), and the memory after it."""
+    if memory.addressed != "sense":
+        return float(memory.addressed == "assume"), memory
+    if speaker.face is None and speaker.attention is None:
+        unseen = None if memory.unseen is None else memory.unseen + 1
+        if unseen is None:
+            return 1.0, memory
+        lost = unseen > LOST_FRAMES
+        gone = changed(memory, unseen=unseen, attention=None if lost else memory.attention,
+                       looked=math.nan if lost else memory.looked)  # fmt: skip
+        return gone.looked, gone
+    given = speaker.attention
+    if given is None or not math.isfinite(given):
+        if given is None and not memory.tells:
+            return 1.0, changed(memory, unseen=0)
+        return math.nan, changed(memory, unseen=0, attention=None, looked=math.nan)
+    before = 1.0 if memory.attention is None else memory.attention
+    given = min(max(given, 0.0), 1.0)
+    level = given + (before - given) * _KEPT
+    looked = 1.0 if math.isnan(memory.looked) else memory.looked
+    if level > LOOKED:
+        looked = 1.0
+    elif level < NOT_LOOKED:
+        looked = 0.0
+    return looked, changed(memory, unseen=0, attention=level, looked=looked, tells=True)

@@ -1,13 +1,18 @@
 """When a listener nods, smiles, laughs, says "mm-hm", raises its brows, blinks, looks away: learned from people.
 
-    person's frame -> evidence (sensing) -> log-odds of each kind (hazards) -> a number drawn falls below: event
+    person's frame -> evidence -> log-odds of each kind (hazards) -> a number drawn falls below: event
 
-A hazard is asked every 80 ms. What is decided begins `LEAD_FRAMES` later, so that a plan made every fourth frame still
-shows its onset, and is never taken back. Nothing of the head happens inside a nod, a
-shake or a tilt; nobody nods, laughs or says "mm-hm" who is speaking or has not been spoken to for two seconds.
+A hazard is the chance of an event in the next 80 ms, as a sum of curves learned from people: log-odds are added, by
+name. `sim/listeners/events.yaml` holds them: of every kind an intercept and, per evidence (`events.evidence`), either a
+number that multiplies it or the values of a curve at its knots, between which it is straight over log(1 + seconds /
+0.2). A curve whose last value is 0 forgets. `gaze_shift` is the hazard of looking away from the person.
+
+Hazards are drawn every 80 ms. An event begins `LEAD_FRAMES` after it is decided, so that a plan made every fourth frame
+still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or a tilt; a head does
+not nod, laugh or say "mm-hm" while it speaks, or when no other person has spoken for two seconds.
 
 Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
-place; hazards are finite whatever comes in; more of a `Calmness` rate is never less of its hazard.
+place; hazards are finite whatever the input; more of a `Calmness` rate is never less of its hazard.
 """
 
 from __future__ import annotations
@@ -17,23 +22,208 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from sfms_robot.config import Calmness
+from sfms_robot.config import Calmness, Model, load
+from sfms_robot.config.base import Finite, NonNegative, Positive
+from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
-from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
+from sfms_robot.listeners.events.evidence import (
+    AT,
+    EVIDENCE,
+    NUMBERS,
+    Sensed,
+    SenseMemory,
+    begun_before,
+    done,
+    remembered,
+    sense,
+)
 from sfms_robot.listeners.lots import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
+from sfms_robot.signals.hats import log_time
+
+STEP_FRAMES: Final = 2
+STEP_S: Final = 0.08
+FILE: Final = "events.yaml"  # in sim/listeners
+_BOUND: Final = 30.0  # of log-odds
+_LONG_AGO: Final = 50.0  # on the axis of curves, beyond every knot
+
+Curve = Annotated[dict[NonNegative, Finite], Field(min_length=2)]
+Quantiles = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+
+
+class Hazard(Model):
+    """The hazard of one kind of event.
+
+    Attributes:
+        learned_from: people whose events these are.
+        per_minute: their rate, in the time in which the event may happen.
+        intercept: log-odds of 80 ms without evidence.
+        weights: by evidence.
+    """
+
+    learned_from: str
+    per_minute: Positive
+    intercept: Finite
+    weights: Annotated[dict[str, Finite | Curve], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _known(self) -> Hazard:
+        for name, weight in self.weights.items():
+            if name not in EVIDENCE:
+                raise ValueError(f"weights.{name} is not known evidence ({', '.join(EVIDENCE)})")
+            if isinstance(weight, dict) == (name in NUMBERS):
+                wanted = "one number" if name in NUMBERS else "values by knot [s]"
+                raise ValueError(f"weights.{name} needs {wanted}")
+            if isinstance(weight, dict) and list(weight) != sorted(weight):
+                raise ValueError(f"weights.{name}: knots have to rise")
+        return self
+
+
+class Shape(Model):
+    """The distribution of durations and sizes, as evenly spaced quantiles from the least to the greatest.
+
+    Attributes:
+        duration_s: of the whole event; of looking away, until the look back.
+        size: see `frames.ListenerEvent`; nods, shakes and tilts in degrees, a gaze shift too.
+        habit: quantiles of the factor of a stream's sizes; drawn once.
+        swings_hz: quantiles of the pace of nods and shakes; drawn once.
+    """
+
+    duration_s: Quantiles
+    size: Quantiles
+    habit: Quantiles = (1.0, 1.0)
+    swings_hz: Quantiles | None = None
+
+    @model_validator(mode="after")
+    def _rising(self) -> Shape:
+        for name in ("duration_s", "size", "habit", "swings_hz"):
+            values = getattr(self, name)
+            if values is not None and list(values) != sorted(values):
+                raise ValueError(f"{name}: quantiles have to rise")
+        return self
+
+
+class EventTables(Model):
+    """The content of the file: hazards and shapes, by kind; every kind has both."""
+
+    hazards: dict[str, Hazard]
+    shapes: dict[str, Shape]
+
+    @model_validator(mode="after")
+    def _whole(self) -> EventTables:
+        for section in ("hazards", "shapes"):
+            given = getattr(self, section)
+            for kind in [*given, *EVENT_KINDS]:
+                if kind not in EVENT_KINDS or kind not in given:
+                    problem = "is missing" if kind in EVENT_KINDS else "is not a kind of event"
+                    raise ValueError(f"{section}: {kind} {problem} ({', '.join(EVENT_KINDS)})")
+        return self
+
+
+def load_tables(file: Path | None = None) -> EventTables:
+    """Load a file as `train events` writes it, or the bundled one. Raises ConfigError, in one line."""
+    return load(EventTables, data_dir("sim") / "listeners" / FILE if file is None else file)
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """All knots of all curves of all kinds, one after the other (K,), and numbers as curves of one knot.
+
+    Attributes:
+        column: of the evidence.
+        weight: value at the knot.
+        left, left_slope, right, right_slope: zeros of its hat on the axis, and the slopes from there.
+        number: it multiplies a number.
+        first: (T,) index of the first knot of each term; `kind`: (H,) index of the first term of each kind.
+    """
+
+    column: NDArray[np.int64]
+    weight: Doubles
+    left: Doubles
+    left_slope: Doubles
+    right: Doubles
+    right_slope: Doubles
+    number: NDArray[np.bool_]
+    first: NDArray[np.int64]
+    kind: NDArray[np.int64]
+
+
+class HazardBank:
+    """All hazards at once, of one row of evidence or of many."""
+
+    def __init__(self, hazards: Mapping[str, Hazard]) -> None:
+        self.kinds: tuple[str, ...] = tuple(hazards)
+        self.terms: tuple[tuple[str, ...], ...] = tuple(tuple(hazards[kind].weights) for kind in self.kinds)
+        self._intercepts = np.array([hazards[kind].intercept for kind in self.kinds])
+        self._knots = _flat(hazards)
+        self._starts = [int(start) for start in self._knots.kind]
+
+    def contributions(self, evidence: Doubles) -> Doubles:
+        """Return (..., T), the terms of the log-odds of each kind, of evidence (..., len(EVIDENCE)); NaN adds 0."""
+        k = self._knots
+        value = evidence[..., k.column]
+        time = np.minimum(log_time(np.maximum(evidence, 0.0)), _LONG_AGO)[..., k.column]
+        hat = np.minimum((time - k.left) * k.left_slope, (k.right - time) * k.right_slope)
+        hat = np.minimum(np.maximum(hat, 0.0), 1.0)
+        each = np.where(np.isnan(value), 0.0, k.weight * np.where(k.number, value, hat))
+        return np.asarray(np.add.reduceat(each, k.first, axis=-1), np.float64)
+
+    def log_odds(self, contributions: Doubles) -> Doubles:
+        """Return the log-odds (..., H) of terms (..., T); always finite."""
+        total = self._intercepts + np.add.reduceat(contributions, self._knots.kind, axis=-1)
+        return np.asarray(np.minimum(np.maximum(np.where(np.isnan(total), 0.0, total), -_BOUND), _BOUND), np.float64)
+
+    def largest(self, contributions: Doubles, kind: str, most: int = 4) -> dict[str, float]:
+        """Return the largest terms of one kind, by evidence, of terms (T,)."""
+        at = self.kinds.index(kind)
+        own = contributions[self._starts[at] : self._starts[at] + len(self.terms[at])]
+        largest = sorted(range(len(own)), key=lambda index: -abs(own[index]))[:most]
+        return {self.terms[at][index]: round(float(own[index]), 3) for index in largest if own[index]}
+
+
+def _flat(hazards: Mapping[str, Hazard]) -> _Knots:
+    rows: list[tuple[float, ...]] = []
+    first: list[int] = []
+    kind: list[int] = []
+    for hazard in hazards.values():
+        kind.append(len(first))
+        for name, weight in hazard.weights.items():
+            first.append(len(rows))
+            rows += _curve(AT[name], weight)
+    column, weights, left, left_slope, right, right_slope, number = np.array(rows, np.float64).T
+    return _Knots(
+        column.astype(np.int64), weights, left, left_slope, right, right_slope, number.astype(bool),
+        np.array(first), np.array(kind),
+    )  # fmt: skip
+
+
+def _curve(column: int, weight: float | Mapping[float, float]) -> list[tuple[float, ...]]:
+    """Return a row of `_Knots` for each knot. The first hat is 1 before its knot, the last behind it."""
+    if not isinstance(weight, Mapping):
+        return [(column, weight, 0.0, 0.0, 0.0, 0.0, True)]
+    at = log_time(list(weight)).tolist()
+    rows: list[tuple[float, ...]] = []
+    for index, value in enumerate(weight.values()):
+        low, high = index == 0, index == len(at) - 1
+        left, left_slope = (-1.0, 1e9) if low else (at[index - 1], 1 / (at[index] - at[index - 1]))
+        right, right_slope = (np.inf, 1.0) if high else (at[index + 1], 1 / (at[index + 1] - at[index]))
+        rows.append((column, value, left, left_slope, right, right_slope, False))
+    return rows
+
+
+# --- Decisions --------------------------------------------------------------------------------------------------------
 
 LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
-LISTENING_S: Final = 2.0  # somebody else spoke this recently
-_LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s")  # what tells it
+LISTENING_S: Final = 2.0  # since another person spoke
+_LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s")
 AT_PERSON: Final = (0.0, 0.0)
-# What one thing at a time does: while one of a group is under way none of it begins.
+# While one event of a group is under way no other of it begins.
 GROUPS: Final = (
     frozenset(("nod", "shake", "tilt")),
     frozenset(("smile", "laugh")),
@@ -52,11 +242,11 @@ EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
 
 @dataclass(frozen=True)
 class Decision:
-    """What a frame has decided.
+    """The decision of one frame.
 
     Attributes:
         events: new ones; most frames have none.
-        hazards_hz: by kind, events a second if things stayed as they are; 0 while it cannot happen.
+        hazards_hz: by kind, events a second if all evidence stayed the same; 0 while it cannot happen.
     """
 
     events: tuple[ListenerEvent, ...]
@@ -65,12 +255,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class DecideMemory:
-    """What one stream remembers of its own doing.
+    """The memory of one stream of its own events.
 
     Attributes:
         seed, calmness: of the stream.
         done: events decided, in order, as far as they still matter.
-        hazards_hz: the last ones asked for.
+        hazards_hz: the last ones that were drawn.
     """
 
     seed: int
@@ -81,14 +271,14 @@ class DecideMemory:
 
 @dataclass(frozen=True)
 class EventMemory:
-    """What one stream remembers: of the person, and of itself."""
+    """The memory of one stream: of the person, and of its own events."""
 
     sensed: SenseMemory
     decided: DecideMemory
 
 
 class EventModel:
-    """Holds what was learned; streams are values."""
+    """The hazards and shapes that were learned; streams are values."""
 
     def __init__(self, tables: EventTables) -> None:
         self.tables = tables
@@ -99,67 +289,58 @@ class EventModel:
 
     @classmethod
     def load(cls, file: Path | None = None) -> EventModel:
-        """From a file as `train events` writes it, or the bundled one. Raises ConfigError."""
+        """Load a file as `train events` writes it, or the bundled one. Raises ConfigError."""
         return cls(load_tables(file))
 
     def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
-        """Nothing heard, nothing done."""
+        """Return the memory of a new stream."""
         asked = calmness or Calmness()
         return EventMemory(SenseMemory(asked.addressed), DecideMemory(seed, asked))
 
     def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
-        """The same stream, from now on at other rates."""
+        """Return the memory with other rates from now on."""
         return EventMemory(
             changed(memory.sensed, addressed=calmness.addressed), changed(memory.decided, calmness=calmness)
         )
 
-    def step(
-        self, speaker: SpeakerFrame, memory: EventMemory, own: Sequence[ListenerEvent] | None = None
-    ) -> tuple[Decision, EventMemory]:
-        """One frame of 40 ms -> what it decides. Pure; takes some 0.1 ms.
-
-        `own` replaces the history of what was decided by somebody's real one; what has not begun by now is not looked
-        at.
-        """
-        sensed, heard = sense(speaker, memory.sensed)
-        decision, decided = self.decide(sensed, memory.decided, own)
-        return decision, EventMemory(heard, decided)
-
-    def decide(
-        self, sensed: Sensed, memory: DecideMemory, own: Sequence[ListenerEvent] | None = None
-    ) -> tuple[Decision, DecideMemory]:
-        """The second half of `step`. A gaze shift away is followed by one back when its time is over."""
-        if not _asks(sensed):
-            return Decision((), memory.hazards_hz or self._never), memory
-        now_s = (sensed.frame + 1) * FRAME_S
-        history = memory.done if own is None else begun_before(own, now_s)
-        told = self.bank.contributions(self._evidence(sensed, history, memory.calmness))
-        return self._drawn(sensed, memory, history, self.bank.log_odds(told), told)
-
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
     ) -> list[tuple[Decision, EventMemory]]:
-        """`step` of several streams: their hazards are asked together."""
+        """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
-        found = [(Decision((), memory.decided.hazards_hz or self._never), memory.decided) for memory in memories]
-        asking = [row for row, (one, _) in enumerate(sensed) if _asks(one)]
-        if asking:
-            own = [memories[row].decided for row in asking]
-            evidence = [
-                self._evidence(sensed[row][0], one.done, one.calmness) for row, one in zip(asking, own, strict=True)
-            ]
-            told = self.bank.contributions(np.array(evidence))
-            for row, one, odds, terms in zip(asking, own, self.bank.log_odds(told), told, strict=True):
-                found[row] = self._drawn(sensed[row][0], one, one.done, odds, terms)
+        decided = self.decide_each([one for one, _ in sensed], [memory.decided for memory in memories])
         return [
-            (decision, EventMemory(heard, decided))
-            for (decision, decided), (_, heard) in zip(found, sensed, strict=True)
+            (decision, EventMemory(heard, own)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
         ]
 
+    def decide_each(
+        self,
+        sensed: Sequence[Sensed],
+        memories: Sequence[DecideMemory],
+        histories: Sequence[Sequence[ListenerEvent]] | None = None,
+    ) -> list[tuple[Decision, DecideMemory]]:
+        """Draw the hazards of several streams, all of them together: the second half of `step_each`.
+
+        `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
+        is followed by one back when its time is over.
+        """
+        found = [(Decision((), memory.hazards_hz or self._never), memory) for memory in memories]
+        rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
+        if rows:
+            known = [memory.done for memory in memories]
+            if histories is not None:
+                ends_s = [(one.frame + 1) * FRAME_S for one in sensed]
+                known = [tuple(begun_before(*each)) for each in zip(histories, ends_s, strict=True)]
+            evidence = np.array([self._evidence(sensed[row], known[row], memories[row].calmness) for row in rows])
+            terms = self.bank.contributions(evidence)
+            for row, odds, own in zip(rows, self.bank.log_odds(terms), terms, strict=True):
+                found[row] = self._drawn(sensed[row], memories[row], known[row], odds, own)
+        return found
+
     def _drawn(
-        self, sensed: Sensed, memory: DecideMemory, history: Sequence[ListenerEvent], log_odds: Doubles, told: Doubles
+        self, sensed: Sensed, memory: DecideMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
     ) -> tuple[Decision, DecideMemory]:
-        """What happens, by lot, of log-odds (H,) as they are learned, and the terms (T,) that they are of."""
+        """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
         may = _may_happen(sensed, history, now_s)
@@ -173,18 +354,20 @@ class EventModel:
             if draws[at] < probability and not any(event.kind in EXCLUDES[kind] for event in events):
                 event = self.shaped(kind, sensed.frame, memory.seed)
                 events.append(
-                    changed(event, probability=probability, draw=float(draws[at]), evidence=self.bank.told(told, kind))
+                    changed(
+                        event, probability=probability, draw=float(draws[at]), evidence=self.bank.largest(terms, kind)
+                    )
                 )
         kept = remembered((*memory.done, *events), now_s) if events else memory.done
         return Decision(tuple(events), hazards), changed(memory, done=kept, hazards_hz=hazards)
 
     def _evidence(self, sensed: Sensed, history: Sequence[ListenerEvent], calmness: Calmness) -> Doubles:
-        """(len(EVIDENCE),) of a frame and of what was done before it."""
+        """Return the evidence (len(EVIDENCE),) of a frame and of events before it."""
         nods = calmness.nod or self.tables.hazards["nod"].per_minute
         return np.concatenate([sensed.heard, done(history, (sensed.frame + 1) * FRAME_S, math.log(nods))])
 
     def _asked_odds(self, calmness: Calmness) -> list[float]:
-        """What the rates asked for add to the log-odds of each kind that does not have them among its evidence."""
+        """Return what requested rates add to the log-odds of each kind without `log_rate` among its evidence."""
         learned = self.tables.hazards
         return [
             math.log(asked / learned[kind].per_minute)
@@ -194,7 +377,7 @@ class EventModel:
         ]
 
     def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
-        """The look back at the person, once looking away is over."""
+        """Return the look back at the person, once looking away is over."""
         shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
         if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:
             return ()
@@ -219,13 +402,8 @@ class EventModel:
         return ListenerEvent(kind, _begin_s(frame), duration_s, size, times, target)
 
 
-def _asks(sensed: Sensed) -> bool:
-    """Whether hazards are asked at the end of this frame."""
-    return sensed.frame % STEP_FRAMES == STEP_FRAMES - 1
-
-
 def quantile(values: Sequence[float], share: float) -> float:
-    """Evenly spaced quantiles as a distribution: its value at 0..1."""
+    """Return the value at `share` (0..1) of a distribution given by evenly spaced quantiles."""
     return float(np.interp(share * (len(values) - 1), np.arange(len(values)), values))
 
 
@@ -234,7 +412,7 @@ def _begin_s(frame: int) -> float:
 
 
 def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) -> frozenset[str]:
-    """Kinds that the moment allows."""
+    """Return the kinds that may begin at this moment."""
     silence_s, own_s, phrase_s, last_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}

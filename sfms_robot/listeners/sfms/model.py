@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.listeners.layers import Block, sinusoidal
 from sfms_robot.listeners.sfms.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
@@ -16,7 +17,6 @@ from sfms_robot.listeners.sfms.placement import Strategy, place
 from sfms_robot.listeners.sfms.predictor import Predictor, SpeakerEncoder
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
-from sfms_robot.listeners.sway import BANDS, head_channels
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 

@@ -37,11 +37,11 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.idle import HEAD, HeadSway
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
 from sfms_robot.listeners.sfms.draw import Reach, Sampler, Seen, ToldCourse
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import HEAD, HeadSway
 from sfms_robot.signals.control import COLUMNS
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)

@@ -13,10 +13,8 @@ from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting
 from sfms_robot.lab.evaluation.reference_hazard import mute
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.lab.learning.events.event_trainer import student
-from sfms_robot.listeners.events.evidence import HEARD
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, EventTables
-from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.events.sensing import Sensed
+from sfms_robot.listeners.events.evidence import HEARD, Sensed
+from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.events import runs
 from sfms_robot.sources.speakers import shipped_speaker
@@ -107,7 +105,7 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
     _, heard = sensed(speaker[:6000])
     memory, every = when.start(7).decided, []
     for index, row in enumerate(heard):
-        decision, memory = when.decide(Sensed(index, row), memory)
+        ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
     assert decisions(when, heard, [7]) == [tuple(every)]
     assert {"nod", "blink", "gaze_shift"} <= {event.kind for event in every}
@@ -119,7 +117,7 @@ def test_the_same_at_other_rates(speaker, asked):
     _, heard = sensed(speaker[:4000], asked)
     memory, every = when.start(3, asked).decided, []
     for index, row in enumerate(heard):
-        decision, memory = when.decide(Sensed(index, row), memory)
+        ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
     assert decisions(when, heard, [3], asked) == [tuple(every)]
 

@@ -7,7 +7,7 @@ import pytest
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, SHAPES, ListenerEvent
 from sfms_robot.lab.learning.idle_fit import Resting, explained, fit_idle, resting
-from sfms_robot.listeners.idle_motion import BANDS, KNOTS, IdleMotion
+from sfms_robot.listeners.idle import IDLE_BANDS, KNOTS, IdleMotion
 
 SMILES = [BLENDSHAPES.index(f"mouthSmile{side}") for side in ("Left", "Right")]
 FROWN = BLENDSHAPES.index("mouthFrownLeft")
@@ -19,7 +19,7 @@ def learned():
     loadings = np.zeros((2, len(BLENDSHAPES)), np.float32)
     loadings[0, SMILES] = 0.03
     loadings[1, FROWN] = 0.02
-    amplitude = np.zeros((BANDS, 2), np.float32)
+    amplitude = np.zeros((IDLE_BANDS, 2), np.float32)
     amplitude[:3, 0] = amplitude[2:5, 1] = 3**-0.5
     return IdleMotion(loadings, amplitude, 0.0, HELD, HELD)
 
@@ -70,7 +70,7 @@ def with_idle(idle, seed, windows):
 
 def test_slow_motion_is_not_taken_for_faster_motion_nor_for_less_than_it_is():
     """Two seconds show a third of what drifts in five as motion within them."""
-    slow = replace(learned(), amplitude=np.eye(BANDS, 1, dtype=np.float32) * np.ones(2, np.float32))
+    slow = replace(learned(), amplitude=np.eye(IDLE_BANDS, 1, dtype=np.float32) * np.ones(2, np.float32))
     found = fit_idle(people(slow), people(None))
     np.testing.assert_allclose(explained(found)[[*SMILES, FROWN]], [0.03, 0.03, 0.02], rtol=0.2)
     assert np.square(found.amplitude[0]).min() > 0.85

@@ -6,7 +6,7 @@ import torch
 
 from sfms_robot.frames import ListenerEvent
 from sfms_robot.lab.learning.slow_motion import fit_sway, slow_part
-from sfms_robot.listeners.sway import BANDS_HZ, draw_sway, sway_at
+from sfms_robot.listeners.idle import BANDS_HZ, draw_sway, sway_at
 
 TIMES_S = np.arange(1500) * 0.04
 SWAY = 0.02 * np.sin(2 * np.pi * 0.12 * TIMES_S)

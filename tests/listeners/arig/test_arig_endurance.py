@@ -13,7 +13,7 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_C
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig import audio_frontend, load
 from sfms_robot.listeners.arig.sampler import Denoiser
-from sfms_robot.listeners.sway import sway_at
+from sfms_robot.listeners.idle import sway_at
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.control import COLUMNS, control_track
 

@@ -21,7 +21,7 @@ from sfms_robot.listeners.arig.sojourns import (
     with_feedback,
 )
 from sfms_robot.listeners.arig.stream import ArigListener
-from sfms_robot.listeners.sway import sway_at
+from sfms_robot.listeners.idle import sway_at
 from sfms_robot.signals.control import COLUMNS, control_track
 
 TOLD = {"events": True, "draws": "innovation"}

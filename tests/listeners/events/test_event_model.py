@@ -19,7 +19,8 @@ from sfms_robot.frames import (
     ListenerEvent,
     SpeakerFrame,
 )
-from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, EventModel
+from sfms_robot.listeners.events.evidence import sense
+from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, EventMemory, EventModel
 
 MODEL = EventModel.load()
 MINUTES = 4
@@ -65,7 +66,9 @@ def listen(frames, seed=1, calmness=None, own=None, memory=None):
     events: list[ListenerEvent] = []
     hazards = []
     for frame in frames:
-        decision, memory = MODEL.step(frame, memory, own)
+        sensed, heard = sense(frame, memory.sensed)
+        ((decision, decided),) = MODEL.decide_each([sensed], [memory.decided], None if own is None else [own])
+        memory = EventMemory(heard, decided)
         events += decision.events
         hazards.append(decision.hazards_hz["nod"])
     return events, np.array(hazards)
@@ -88,8 +91,8 @@ def test_the_same_evidence_and_seed_give_the_same_events(usual):
 def test_a_step_never_changes_its_memory():
     memory = MODEL.start(1, Calmness())
     for frame in list(conversation())[:500]:
-        first, after = MODEL.step(frame, memory)
-        again, _ = MODEL.step(frame, memory)
+        ((first, after),) = MODEL.step_each([frame], [memory])
+        ((again, _),) = MODEL.step_each([frame], [memory])
         assert first == again
         memory = after
 
@@ -274,7 +277,8 @@ def test_hazards_are_finite_whatever_comes_in(rows):
         face = None if motion is None else FaceFrame.of(index * FRAME_S, np.full(MOTION_DIM, motion))
         audio = np.full(FRAME_SAMPLES, level, np.float32) if heard else NOBODY
         with np.errstate(all="ignore"):
-            decision, memory = MODEL.step(SpeakerFrame((index + 1) * FRAME_S, audio, face, audio, attention), memory)
+            speaker = SpeakerFrame((index + 1) * FRAME_S, audio, face, audio, attention)
+            ((decision, memory),) = MODEL.step_each([speaker], [memory])
         assert all(math.isfinite(rate) and rate >= 0 for rate in decision.hazards_hz.values())
 
 

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, ListenerEvent
+from sfms_robot.lab.evaluation.whole_recordings import Scene, done_in, heard_in
 from sfms_robot.listeners.events.evidence import (
     AT,
     DONE,
@@ -16,12 +17,9 @@ from sfms_robot.listeners.events.evidence import (
     NUMBERS,
     REMEMBERED_S,
     Instant,
-    Scene,
     begun_before,
     done,
-    done_in,
     hear,
-    heard_in,
     hearing,
     remembered,
 )
@@ -149,7 +147,6 @@ def as_events(spans, aside):
     return sorted(events, key=lambda event: event.start_s)
 
 
-@settings(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_done_one_by_one_equals_done_in_whole(seed):
     spans, aside = deeds(seed)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame
-from sfms_robot.listeners.events.sensing import FaceState, read_signs
+from sfms_robot.listeners.events.evidence import FaceState, read_signs
 
 SECONDS = 60
 FRAMES = round(SECONDS / FRAME_S)

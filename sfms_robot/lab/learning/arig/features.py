@@ -32,8 +32,8 @@ from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.modules import StateUnderstanding
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.sojourns import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
+from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import lateral_channels
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.control import control_track
 from sfms_robot.signals.events import runs

@@ -16,7 +16,7 @@ from sfms_robot.frames import Doubles, Floats
 from sfms_robot.lab.learning.events import logistic
 from sfms_robot.lab.learning.events.event_trainer import Groups, Student, hazard, inputs
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE
-from sfms_robot.listeners.events.hazards import STEP_S, Hazard, HazardBank
+from sfms_robot.listeners.events.model import STEP_S, Hazard, HazardBank
 
 AT_PERSON_S: Final = 16.3  # mean seconds near the other's face, listening
 AT_PERSON_SPEAKING_S: Final = 1.47

@@ -14,7 +14,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
 from sfms_robot.lab.corpora.compose.acting import smile_s
 from sfms_robot.lab.corpora.compose.splicing import held
 from sfms_robot.lab.learning.events.event_trainer import Student
-from sfms_robot.listeners.events.hazards import Shape
+from sfms_robot.listeners.events.model import Shape
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import Motions
 

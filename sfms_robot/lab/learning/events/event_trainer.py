@@ -22,6 +22,11 @@ from sfms_robot.lab.learning.events.logistic import Logistic
 from sfms_robot.listeners.events.evidence import AT, NUMBERS, Bools, Scene, counts_in, done_in, heard_in
 from sfms_robot.listeners.events.hazards import STEP_FRAMES, Hazard
 from sfms_robot.signals.phase import piecewise_linear_basis
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
+from sfms_robot.listeners.events.evidence import AT, NUMBERS
+from sfms_robot.listeners.events.model import STEP_FRAMES, Hazard
+from sfms_robot.signals.events import rank_auc
+from sfms_robot.signals.hats import hats
 
 Knots = tuple[float, ...]
 Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number

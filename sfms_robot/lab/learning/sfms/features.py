@@ -27,12 +27,12 @@ from sfms_robot.lab.learning.corpus import (
 )
 from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.keyframes import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.listeners.sway import lateral_channels
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
 from sfms_robot.signals.control import control_track

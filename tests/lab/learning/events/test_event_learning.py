@@ -15,12 +15,12 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.compose.ami import Person, phrases
 from sfms_robot.lab.corpora.meeting_evidence import meeting_evidence
+from sfms_robot.lab.evaluation.whole_recordings import Scene, counts_in
 from sfms_robot.lab.learning.events import event_rollout, logistic
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
 from sfms_robot.lab.learning.events.labels import lesson, looks_of
-from sfms_robot.listeners.events.evidence import AT, Scene, counts_in
-from sfms_robot.listeners.events.hazards import HazardBank, load_tables
-from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.events.evidence import AT
+from sfms_robot.listeners.events.model import EventModel, HazardBank, load_tables
 
 NONE = np.zeros((0, 2))
 

@@ -1,13 +1,13 @@
-"""How many heads one server can answer in time, from what steps cost on this machine.
+"""Number of heads that one server can answer in time, from what steps cost on this machine.
 
 While a batch is made frames wait, and are the next batch. n heads send n / T frames a second, of which every `hop`-th
-asks for a plan, so batches settle at a duration B in which just as many frames come as a batch of that duration takes:
+needs a plan, so batches settle at a duration B in which just as many frames come as a batch of that duration takes:
 
     cost(n B / T) = B,   cost(m) = plan(m / hop) + other(m - m / hop)
 
-Who comes just too late for one batch waits for it and for the next: 2 B, a little more where the machine is uneven.
-That is held against the deadline. Costs are measured at the start for some sizes of batches, lines are drawn between
-them, and while serving they are scaled by how long batches really take.
+A frame that comes just too late for one batch waits for it and for the next: 2 B, a little more where the machine is
+uneven. That is compared with the deadline. Costs are measured at the start for some sizes of batches, lines are drawn
+between them, and while serving they are scaled by how long batches really take.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _BISECTIONS: Final = 20
 def step_each(
     listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]
 ) -> list[tuple[Plan | None, Any]]:
-    """One step of each stream; in one batch where the listener knows how (`ports.BatchListener`)."""
+    """Step each stream once; in one batch where the listener can (`ports.BatchListener`)."""
     together = getattr(listener, "step_each", None)
     if together is None:
         return [listener.step(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]
@@ -44,13 +44,13 @@ def step_each(
 
 @dataclass(frozen=True)
 class Capacity:
-    """What batches cost here.
+    """Costs of batches on this machine.
 
     Attributes:
         hop: frames from one plan to the next.
         sizes: heads in a batch, rising.
-        plan_s, other_s: of a batch in which all plan, or none.
-        scale: how much longer batches take in service.
+        plan_s, other_s: duration of a batch in which all plan, or none.
+        scale: by how much longer batches take in service.
     """
 
     hop: int
@@ -60,11 +60,11 @@ class Capacity:
     scale: float = 1.0
 
     def batch_s(self, plans: float, others: float) -> float:
-        """A batch of so many steps with and without a plan."""
+        """Return the duration of a batch of so many steps with and without a plan."""
         return self.scale * (_between(self.sizes, self.plan_s, plans) + _between(self.sizes, self.other_s, others))
 
     def delay_s(self, heads: int, deadline_s: float) -> float:
-        """From a frame to its plan, at most; inf where `heads` are more than can be kept up with at all."""
+        """Return the longest time from a frame to its plan; inf where `heads` are more than it can keep up with."""
         if not heads:
             return 0.0
         longest_s = 2 * deadline_s
@@ -82,14 +82,14 @@ class Capacity:
         return 2 * high_s * UNEVEN
 
     def most(self, deadline_s: float) -> int:
-        """Heads that are answered within the deadline."""
+        """Return the number of heads that are answered within the deadline."""
         heads = 0
         while self.delay_s(heads + 1, deadline_s) <= deadline_s and heads < 10_000:
             heads += 1
         return heads
 
     def scaled(self, scale: float) -> Capacity:
-        """As measured in service."""
+        """Return the costs with another scale."""
         return replace(self, scale=scale)
 
 
@@ -99,10 +99,7 @@ def measure_capacity(
     rounds: int = ROUNDS,
     now_s: Callable[[], float] = time.perf_counter,
 ) -> Capacity:
-    """Step batches of silence and time them. Blocks for a second or two.
-
-    Medians: what a machine does besides is the scale's to tell.
-    """
+    """Step batches of silence and return the medians of their durations. Blocks for a second or two."""
     plan_s, other_s = [], []
     for size in sizes:
         planned, others = _timed(listener, size, rounds, now_s)
@@ -112,7 +109,7 @@ def measure_capacity(
 
 
 def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float]) -> tuple[list[float], list[float]]:
-    """What steps of `size` streams took, with a plan and without."""
+    """Return the durations of steps of `size` streams, with a plan and without."""
     memories = [listener.start(seed) for seed in range(size)]
     silence = np.zeros(FRAME_SAMPLES, np.float32)
     planned: list[float] = []
@@ -128,7 +125,7 @@ def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float
 
 
 def _between(sizes: Sequence[int], costs_s: Sequence[float], count: float) -> float:
-    """The cost of `count`: 0 for none, a line between two sizes, and the last line beyond."""
+    """Return the cost of `count`: 0 for none, a line between two sizes, and the last line beyond."""
     if count <= sizes[0]:
         return costs_s[0] * max(count, 0.0) / sizes[0]  # some batches have one, most have none
     if count <= sizes[-1]:

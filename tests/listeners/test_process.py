@@ -1,9 +1,7 @@
-"""The listener's own process: what it hears when it cannot keep up, what its parent does when it hangs or dies."""
+"""The listener's own process: what it hears when it cannot keep up, and what its parent does when it hangs or dies."""
 
-import io
 import logging
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -12,71 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stranger_process import ends
 from virtual_time import Time
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
-from sfms_robot.listeners import process
-from sfms_robot.listeners.inbox import CATCH_UP, MOST_WAITING, Inbox
-from sfms_robot.listeners.process import RESTARTS, REVIEW_S, SETTLED_FRAMES, ListenerProcess
-from sfms_robot.listeners.process_child import listen, plan_times_s
+from sfms_robot.listeners.process import REVIEW_S, SETTLED_FRAMES, ListenerProcess, listen, plan_times_s
+from sfms_robot.listeners.thread import HUNG_S, Inbox
+from sfms_robot.processes import LIMITS
 
 SILENCE = np.zeros(640, np.float32)
+RESTART_S, PHASE_LIMIT_S = LIMITS["listener"].silent_s, LIMITS["listener"].phase_s["starting"]
 
 
 def frames(count):
     return [SpeakerFrame((i + 1) * FRAME_S, SILENCE) for i in range(count)]
-
-
-def filled(items):
-    inbox = Inbox()
-    for item in items:
-        inbox.put(item)
-    return inbox
-
-
-@pytest.mark.parametrize("count", [1, 2, MOST_WAITING])
-def test_frames_come_in_their_order_and_none_is_left_out_while_few_are_waiting(count):
-    sent, heard = frames(count), []
-    inbox = filled(sent)
-    for _ in sent:
-        heard.append(inbox.next())
-        assert inbox.skipped == 0
-    assert heard == sent
-
-
-def test_when_too_many_are_waiting_the_newest_is_next_and_the_others_are_counted():
-    sent = frames(MOST_WAITING + 1)
-    inbox = filled(frames(1))
-    inbox.next()
-    for frame in sent:
-        inbox.put(frame)
-    assert inbox.next() is sent[-1] and inbox.skipped == MOST_WAITING
-    inbox.put(after := frames(1)[0])
-    assert inbox.next() is after and inbox.skipped == 0
-
-
-def test_what_was_said_before_the_listener_was_ready_is_heard_in_full():
-    sent = frames(5 * MOST_WAITING)
-    inbox = filled(sent)
-    assert [inbox.next() for _ in sent] == sent and inbox.skipped == 0
-
-
-def test_one_that_never_catches_up_gives_up_what_was_said_before():
-    """Each frame takes it as long as the person takes for one: what waits does not become less."""
-    sent = frames(5 * MOST_WAITING)
-    inbox, left_out = filled(sent), 0
-    for count in range(3 * MOST_WAITING):
-        inbox.next()
-        left_out += inbox.skipped
-        assert (left_out > 0) == (count * CATCH_UP > MOST_WAITING)
-        inbox.put(sent[0])
-    assert len(inbox._waiting) <= MOST_WAITING
-
-
-def test_the_end_waits_for_nothing():
-    assert filled([*frames(3), None]).next() is None
 
 
 class Slow:
@@ -97,10 +44,9 @@ class Slow:
 
 
 def test_a_slow_listener_answers_the_newest_frame_and_tells_how_many_it_left_out():
-    inbox, said = filled(frames(1)), io.BytesIO()
-    listen(Slow(inbox), 0, inbox, said)
-    said.seek(0)
-    messages = [pickle.load(said) for _ in range(4)]
+    inbox, messages = Inbox(), []
+    inbox.put(frames(1)[0])
+    listen(Slow(inbox), 0, inbox, messages.append)
     assert [kind for kind, *_ in messages] == ["ready", "plan", "skipped", "plan"]
     assert messages[2][2] == 59 and messages[3][1].made_at_s == pytest.approx(60 * FRAME_S)
 
@@ -130,34 +76,42 @@ def test_a_probe_measures_plans_and_ends_even_without_time():
 # --- the parent and a real child -----------------------------------------------------------------------------------
 
 
+def take(listener, now_s=0.0):
+    """Take the next message; waits for the child itself, however long that takes on this computer."""
+    return listener._take(listener._supervised.child.receive(60.0), now_s)
+
+
 @pytest.fixture
 def listener():
     child = ListenerProcess("sfms-small", 3)
     child.wait_loaded()
     while child.statistics()["state"] != "listening":
-        child._take(*child._child.message(60.0), 0.0)
+        take(child)
     yield child
     child.close()
 
 
+def probed(child):
+    """Take the probe, as of a computer on which a plan takes 5 ms."""
+    kind, probe, _ = child._supervised.child.receive(60.0)
+    child._take((kind, replace(probe, step_p50_s=0.005, step_p99_s=0.006), 0.0), 0.0)
+
+
 def pid_of(listener):
-    return listener._child._process.pid
+    return listener._supervised.child.process.pid
 
 
 def answered(listener, now_s):
     """What comes of one hop of frames; waits for the child itself, however long that takes on this computer."""
     for frame in frames(8):
         listener.push(frame, now_s)
-    plans = []
-    while not plans:
-        kind, value, number = listener._child.message(60.0)
-        plan = listener._take(kind, value, number, now_s)
-        plans += [plan] if plan is not None else []
-    return plans
+    while (plan := take(listener, now_s)) is None:
+        pass
+    return plan
 
 
 def test_plans_come_back_and_torch_stays_in_the_child(listener):
-    assert answered(listener, 0.0)[0].frames.shape == (8, 58)
+    assert answered(listener, 0.0).frames.shape == (8, 58)
     assert listener.statistics()["state"] == "listening"
     code = (
         "import sys; from sfms_robot.app import session; from sfms_robot.listeners import process\n"
@@ -171,14 +125,14 @@ def test_the_hop_is_chosen_when_the_source_has_settled_and_a_new_child_is_told_o
     child.choose_hop_by(lambda: 0.06, 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.message(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
+        probed(child)
         for frame in frames(SETTLED_FRAMES):
             assert child.statistics()["hop"] is None
             child.push(frame, 0.0)
         assert child.statistics()["hop"] == 1 and child.statistics()["budget_ms"]["source"] == 60
         plans = []
         while len(plans) < SETTLED_FRAMES:
-            plan = child._take(*child._child.message(60.0), 0.0)
+            plan = take(child)
             plans += [plan] if plan is not None else []
         assert [round(plan.made_at_s / FRAME_S) for plan in plans] == list(range(1, SETTLED_FRAMES + 1))
     finally:
@@ -191,22 +145,22 @@ def test_a_hop_gives_way_when_the_source_turns_out_later_than_it_was_and_never_g
     child.choose_hop_by(lambda: late_s[0], 0.047, 0.01)
     try:
         child.wait_loaded()
-        child._take("probed", replace(child._child.message(60.0)[1], step_p50_s=0.005, step_p99_s=0.006), 0.0, 0.0)
+        probed(child)
         for frame in frames(SETTLED_FRAMES):
             child.push(frame, 0.0)
         assert child.statistics()["hop"] == 3
         while child.statistics()["state"] != "listening":
-            child._take(*child._child.message(60.0), 0.0)
+            take(child)
         for _ in range(SETTLED_FRAMES):
-            kind, value, _ = child._child.message(60.0)
-            child._take(kind, value, 5.0, 0.0)  # whatever a plan takes on this machine
+            kind, value, _ = child._supervised.child.receive(60.0)
+            child._take((kind, value, 5.0), 0.0)  # whatever a plan takes on this machine
         for now_s, source_s, hop in ((REVIEW_S - 0.1, 0.06, 3), (REVIEW_S, 0.06, 1), (3 * REVIEW_S, 0.0, 1)):
             late_s[0] = source_s
             child._review(now_s)
             assert child.statistics()["hop"] == hop
         for frame in frames(3):
             child.push(frame, 0.0)
-        assert [child._child.message(60.0)[0] for _ in range(3)] == ["plan"] * 3
+        assert [child._supervised.child.receive(60.0)[0] for _ in range(3)] == ["plan"] * 3
     finally:
         child.close()
 
@@ -220,13 +174,11 @@ def test_an_unknown_listener_is_told_by_name():
 def test_a_child_that_dies_is_started_anew_and_listens_again(listener):
     answered(listener, 0.0)
     os.kill(pid_of(listener), signal.SIGKILL)
-    listener._child._process.wait()
     while listener.statistics()["restarts"] == 0:  # until the reading thread has seen the end of the pipe
         listener.poll(1.0)
-    for kind in ("loaded", "probed", "ready"):
-        message = listener._child.message(60.0)
-        assert message[0] == kind
-        listener._take(*message, 1.0)
+    for state in ("building", "building", "listening"):  # loaded, probed, ready
+        take(listener, 1.0)
+        assert listener.statistics()["state"] == state
     assert answered(listener, 1.0) and listener.statistics()["state"] == "listening"
 
 
@@ -237,7 +189,7 @@ def until_named(listener, caplog, now_s=0.0, step_s=0.125, frame=True):
         if frame:
             listener.push(frames(1)[0], now_s)
         listener.poll(now_s)
-    assert [each.message for each in caplog.records if f"for {process.HUNG_S + step_s:.1f} s" in each.message]
+    assert f"no sign of life for {HUNG_S + step_s:.1f} s" in caplog.text
     return now_s
 
 
@@ -249,7 +201,7 @@ def until_restarted(listener, now_s, step_s=0.125):
     return now_s
 
 
-PHASES = {"starting": "", "building": "loaded", "waiting for its hop": "probed", "listening": "ready"}
+PHASES = {"starting": "", "waiting for its hop": "probed", "listening": "ready"}
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -259,14 +211,14 @@ def test_a_child_that_is_stopped_in_any_phase_is_named_within_a_second_and_resta
             child.choose_hop_by(lambda: 0.06, 0.047, 0.01)  # chosen after half a second of frames
         kind = ""
         while kind != PHASES[phase]:
-            kind, value, number = child._child.message(60.0)
-            child._take(kind, value, number, 0.0)
+            kind, *_ = message = child._supervised.child.receive(60.0)
+            child._take(message, 0.0)
         os.kill(before := pid_of(child), signal.SIGSTOP)
         os.waitid(os.P_PID, before, os.WSTOPPED)
         named_s = until_named(child, caplog, frame=phase == "listening")
         assert child.lost
-        limit_s = process.LOAD_RESTART_S if phase == "starting" else process.RESTART_S
-        assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - process.HUNG_S, abs=0.13)
+        limit_s = RESTART_S["starting" if phase == "starting" else "running"]
+        assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - HUNG_S, abs=0.13)
         assert pid_of(child) != before and child.statistics()["state"] == "starting" and child.lost
 
 
@@ -280,7 +232,7 @@ def test_a_child_that_is_stopped_while_the_run_waits_for_it_is_named_and_restart
         os.kill(pid_of(child), signal.SIGSTOP)
         child.wait_loaded()
         assert child.statistics()["state"] == "building" and child.statistics()["restarts"] == 1
-    assert "(starting) has not answered for 1." in caplog.text and "restarted" in caplog.text
+    assert "listener (starting): no sign of life for 1." in caplog.text and "restarting" in caplog.text
 
 
 STUCK = """
@@ -323,85 +275,44 @@ def stuck(tmp_path, monkeypatch):
     return tmp_path / "reached"
 
 
-@pytest.mark.parametrize("where", ["load", "build", "step"])
-@pytest.mark.parametrize("how", ["waits", "turns"])
+@pytest.mark.parametrize(("where", "how"), [("load", "waits"), ("step", "waits"), ("build", "turns")])
 def test_a_child_that_hangs_while_it_loads_or_measures_is_restarted_also_where_other_threads_work(
     where, how, stuck, caplog
 ):
     with closing(ListenerProcess(f"stuck:{where}-{how}", 0)) as child:
         while where != "load" and child.statistics()["state"] == "starting":
-            child._take(*child._child.message(60.0), 0.0)
+            take(child)
         while not stuck.exists():
             pass
         if how == "waits":
             named_s = until_named(child, caplog)
-            limit_s = process.LOAD_RESTART_S if where == "load" else process.RESTART_S
-            assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - process.HUNG_S, abs=0.13)
+            limit_s = RESTART_S["starting" if where == "load" else "loading"]
+            assert until_restarted(child, named_s) - named_s == pytest.approx(limit_s - HUNG_S, abs=0.13)
         else:
             now_s = 0.0
             while child.statistics()["restarts"] == 0:
-                worked_ns = child._child.worked_ns()
-                while child._child.worked_ns() == worked_ns:
+                worked_ns = child._supervised.child.worked_ns()
+                while child._supervised.child.worked_ns() == worked_ns:
                     pass
                 child.poll(now_s := now_s + 0.9)
-            assert now_s == pytest.approx(process.PHASE_LIMIT_S, abs=1.9) and "answered" not in caplog.text
-    assert "restarted" in caplog.text
+            assert now_s == pytest.approx(PHASE_LIMIT_S, abs=1.9) and "sign of life" not in caplog.text
+    assert "restarting" in caplog.text
 
 
 def test_frames_of_a_child_that_hangs_do_not_pile_up_and_it_goes_on_where_it_was(listener, caplog):
     caplog.set_level(logging.INFO)
     answered(listener, 0.0)
     while listener._unanswered:  # the rest of the hop
-        listener._take(*listener._child.message(60.0), 0.0)
+        take(listener)
     os.kill(pid_of(listener), signal.SIGSTOP)
     os.waitid(os.P_PID, pid_of(listener), os.WSTOPPED)
     for frame in frames(2000):
         listener.push(frame, 10.0)
     listener.poll(10.0)
-    assert len(listener._child._frames) <= MOST_WAITING
-    listener.poll(10.0 + process.HUNG_S + 0.1)
+    assert listener._skipped >= 1900
+    listener.poll(10.0 + HUNG_S + 0.1)
     assert listener.statistics()["state"] == "hung" and listener.lost
     os.kill(pid_of(listener), signal.SIGCONT)
     while listener.statistics()["state"] == "hung":
-        listener.poll(10.0 + process.HUNG_S + 0.1)
+        listener.poll(10.0 + HUNG_S + 0.1)
     assert not listener.lost and listener.statistics()["restarts"] == 0 and "answers again" in caplog.text
-
-
-def test_a_child_that_dies_with_a_full_pipe_leaves_no_file_open(listener):
-    answered(listener, 0.0)
-    child = listener._child
-    os.kill(pid_of(listener), signal.SIGSTOP)
-    for frame in frames(2000):
-        listener.push(frame, 10.0)
-    child.kill()
-    for thread in child._threads:
-        thread.join()
-    assert child._process.stdin.closed and child._process.stdout.closed
-
-
-def test_a_child_that_keeps_dying_is_given_up_and_pushing_goes_on(listener):
-    for _ in range(RESTARTS + 1):
-        listener._child.close()
-        while not listener._child.ended:
-            pass
-        listener.poll(1.0)
-    assert listener.statistics()["state"] == "given up"
-    listener.push(frames(1)[0], 1.0)
-    assert listener.poll(1.0) == []
-
-
-def test_the_child_ends_when_its_parent_is_killed():
-    code = (
-        "import os, signal; from sfms_robot.listeners.process import ListenerProcess\n"
-        "child = ListenerProcess('sfms-small', 0); child.wait_loaded()\n"
-        "print(child._child._process.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    child = int(told.stdout)
-    assert ends(child)
-
-
-def test_a_child_whose_parent_goes_before_it_says_what_to_load_ends_without_a_word():
-    command = [sys.executable, "-c", "from sfms_robot.listeners.process_child import main; main()"]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

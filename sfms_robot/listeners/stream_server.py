@@ -1,17 +1,17 @@
 """Many heads, one model: streams join, send frames, and are stepped in batches. Opens nothing, waits for nothing.
 
-Whoever owns it (`app.serve`) brings messages and the time, and does three things in turn:
+Its owner (`app.serve`) brings messages and the time, and calls three methods in turn:
 
     batch    the frames that are due, earliest deadline first, one of each stream, as many as can be made in time
     step     the listener steps them together
     finish   memories are kept, plans become messages
 
 A frame's deadline is `DEADLINE_S` after it was whole at its robot (as far as the clocks are known, else after it came);
-one that asks for no plan may wait until the one that does. So a stream that is slow, or sends nothing, or sends what it
-missed in one burst, costs the others nothing: it has one place in a batch, like all of them. What a stream remembers is
-the listener's memory, and at most `MOST_WAITING` frames; where more are waiting it goes on at the newest.
+a frame that needs no plan may wait until the one that does. So a stream that is slow, or sends nothing, or sends what
+it missed in one burst, costs the others nothing: it has one place in a batch, like all of them. The memory of a stream
+is the listener's, and at most `MOST_WAITING` frames; where more are waiting it continues with the newest.
 
-A frame that was lost on the way becomes an empty one (nothing heard, nobody seen), so that memories count time.
+A frame that was lost on the way is replaced by an empty one (no sound, no face), so that memories count time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -31,9 +31,9 @@ from sfms_robot.config.base import parse
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import PacketError, RobotError
 from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.inbox import MOST_WAITING
+from sfms_robot.listeners.capacity import Capacity, step_each
 from sfms_robot.listeners.remote_messages import (
-    Interface,
+    OURS,
     Join,
     Notice,
     Refusal,
@@ -45,14 +45,14 @@ from sfms_robot.listeners.remote_messages import (
     plan_message,
     words_message,
 )
-from sfms_robot.listeners.serving.capacity import Capacity, step_each
+from sfms_robot.listeners.thread import MOST_WAITING
 from sfms_robot.ports import Listener
 
 DEADLINE_S: Final = 0.080
-SILENT_S: Final = 10.0  # a stream that sends nothing for so long is given up
+SILENT_S: Final = 10.0  # a stream that sends nothing for so long is dropped
 RECENT: Final = 2048  # delays and batches that p50 and p99 are of
 MOST_FILLED: Final = MOST_WAITING  # lost frames in a row that become empty ones; more is an outage
-TOLD_AGAIN: Final = 2  # plans that tell an event once more
+SENT_AGAIN: Final = 2  # plans that repeat an event
 _STALE_S: Final = 2.0  # a frame that claims to be older has a clock of its own
 _SCALE_STEP: Final = 0.05  # of a batch's weight in the scale of costs
 _EMPTY: Final = np.zeros(0, np.float32)
@@ -60,48 +60,44 @@ _EMPTY: Final = np.zeros(0, np.float32)
 log = logging.getLogger(__name__)
 
 
-# --- Figures ----------------------------------------------------------------------------------------------------------
-#
-# Counts that add up: of one process, or of several that serve one listener.
-
-
-@dataclass(frozen=True)
+@dataclass(kw_only=True)
 class Figures:
-    """Of one `StreamServer`.
+    """Counts of one `StreamServer`; those of several that serve one listener add up.
 
     Attributes:
         server, listener: names.
-        hop: frames between plans; deadline_s: promised from a frame to its plan.
-        heads: streams at this moment; most_heads: that could be answered in time, None where nobody asks.
-        plans, misses, batches, steps, skipped, lost, refused, malformed: counts; `misses` are plans later than the
-            deadline.
+        hop: frames between plans.
+        deadline_s: promised from a frame to its plan.
+        heads: streams at this moment.
+        most_heads: number of heads that could be answered in time; None where all are admitted.
+        misses: plans later than the deadline.
         delays_s, batch_sizes: of the last plans, and of the last batches.
-        cost_scale: how much longer batches take than measured at the start; None where that was not measured.
-        cpu_s: time of a core that its process has used.
+        cost_scale: by how much batches take longer than measured at the start; None where that was not measured.
+        cpu_s: processor time of its process.
     """
 
     server: str
     listener: str
     hop: int
     deadline_s: float
-    heads: int
-    most_heads: int | None
-    plans: int
-    misses: int
-    batches: int
-    steps: int
-    skipped: int
-    lost: int
-    refused: int
-    malformed: int
-    delays_s: Sequence[float]
-    batch_sizes: Sequence[int]
-    cost_scale: float | None
-    cpu_s: float
+    heads: int = 0
+    most_heads: int | None = None
+    plans: int = 0
+    misses: int = 0
+    batches: int = 0
+    steps: int = 0
+    skipped: int = 0
+    lost: int = 0
+    refused: int = 0
+    malformed: int = 0
+    delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    batch_sizes: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT))
+    cost_scale: float | None = None
+    cpu_s: float = 0.0
 
 
 def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
-    """As `serve` tells them; `parts` are the processes of one server, one at least."""
+    """Return the statistics of `serve`; `parts` are the processes of one server, one at least."""
     first = parts[0]
 
     def total(name: str) -> int:
@@ -147,9 +143,9 @@ class _Due:
     deadline_s: float
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Stream:
-    """One head's."""
+    """The stream of one head."""
 
     name: str
     client: str
@@ -159,7 +155,7 @@ class _Stream:
     expected: int | None = None  # number of the next frame
     to_plan: int = 0  # steps until the next one that plans
     stepping: bool = False
-    events: deque[tuple[ListenerEvent, ...]] = field(default_factory=lambda: deque(maxlen=TOLD_AGAIN))
+    events: deque[tuple[ListenerEvent, ...]] = field(default_factory=lambda: deque(maxlen=SENT_AGAIN))
     calmness: Calmness | None = None
 
 
@@ -170,26 +166,18 @@ class Batch:
     streams: Sequence[_Stream]
     dues: Sequence[_Due]
 
-    @property
-    def speakers(self) -> list[SpeakerFrame]:
-        return [due.sent.frame for due in self.dues]
-
-    @property
-    def memories(self) -> list[Any]:
-        return [stream.memory for stream in self.streams]
-
 
 class StreamServer:
-    """Not thread-safe. All times are seconds of one clock.
+    """The streams of a listener's heads. Not thread-safe. All times are seconds of one clock.
 
     Args:
-        listener: that is served, under `name`.
-        capacity: what its batches cost; None admits everybody.
-        server: what this server is called; a fresh number is put behind it.
-        deadline_s: what is promised to each head.
+        listener: the one that is served, under `name`.
+        capacity: costs of its batches; None admits all heads.
+        server: name of this server; a fresh number is put behind it.
+        deadline_s: promised from a frame to its plan.
 
     Attributes:
-        plans, batches, misses, skipped, lost, refused, malformed: counts; `misses` are plans later than the deadline.
+        counts: so far; `figures` completes them.
     """
 
     def __init__(
@@ -200,66 +188,70 @@ class StreamServer:
         server: str = "server",
         deadline_s: float = DEADLINE_S,
     ) -> None:
-        self._listener, self._name, self._capacity = listener, name, capacity
-        self._server = f"{server}-{secrets.token_hex(3)}"
+        self._listener, self._capacity = listener, capacity
         self._deadline_s = deadline_s
+        self.counts = Figures(
+            server=f"{server}-{secrets.token_hex(3)}", listener=name, hop=listener.hop, deadline_s=deadline_s
+        )
         self._streams: dict[str, _Stream] = {}
-        self._recent_s: deque[float] = deque(maxlen=RECENT)
         self._most = self._batch_limit()
-        self._batch_sizes: deque[int] = deque(maxlen=RECENT)
-        self.plans = self.batches = self.misses = self.skipped = self.lost = self.refused = self.stepped = (
-            self.malformed
-        ) = 0
 
     @property
     def heads(self) -> int:
-        """Streams at this moment."""
+        """Return the number of streams at this moment."""
         return len(self._streams)
 
     @property
     def clients(self) -> Mapping[str, str]:
-        """Who each stream is listened to for, by the stream's name."""
+        """Return the client of each stream, by the stream's name."""
         return {name: stream.client for name, stream in self._streams.items()}
 
     @property
     def waits(self) -> bool:
-        """Whether `batch` has something to give."""
+        """Return whether `batch` has something to return."""
         return any(each.waiting and not each.stepping for each in self._streams.values())
 
     # --- coming and going --------------------------------------------------------------------------------------------
 
     def join(self, message: bytes, now_s: float) -> bytes:
-        """The answer to somebody who asks to be listened for: Welcome or Refusal, as bytes. Never raises."""
+        """Return the answer to a request for a stream: Welcome or Refusal, as bytes. Never raises."""
         try:
             said = parse_words(message)
             if not isinstance(said, Join):
-                raise PacketError("something else than Join")
+                raise PacketError("expected a join")
             answer = self._admit(said, now_s)
         except RobotError as error:
             self._count_malformed("join", error)
-            answer = Refusal(f"server {self._server} cannot take that: {error}", final=True)
+            answer = Refusal(f"server {self.counts.server} cannot take that: {error}", final=True)
         if isinstance(answer, Refusal):
-            self.refused += 1
+            self.counts.refused += 1
             log.info("refused: %s", answer.reason)
         return words_message(answer)
 
     def _admit(self, join: Join, now_s: float) -> Welcome | Refusal:
-        ours = Interface()
-        if not ours.fits(join.interface):
-            return Refusal(f"this robot is {join.interface}; server {self._server} is {ours}", final=True)
+        if not OURS.fits(join.interface):
+            return Refusal(f"this robot is {join.interface}; server {self.counts.server} is {OURS}", final=True)
         calmness = None if join.calmness is None else parse(Calmness, dict(join.calmness), "calmness")
         known = next((each for each in self._streams.values() if each.client == join.client), None)
         if known is None:
             if (reason := self._full()) is not None:
                 return Refusal(reason, final=False)
-            known = _Stream(secrets.token_hex(6), join.client, self._listener.start(join.seed), now_s)
+            memory = self._listener.start(join.seed)
+            known = _Stream(name=secrets.token_hex(6), client=join.client, memory=memory, heard_s=now_s)
             known.calmness = calmness
             self._streams[known.name] = known
         known.heard_s = now_s
-        return Welcome(known.name, self._server, self._name, self._listener.horizon, self._listener.hop)
+        listener = self._listener
+        return Welcome(
+            stream=known.name,
+            server=self.counts.server,
+            listener=self.counts.listener,
+            horizon=listener.horizon,
+            hop=listener.hop,
+        )
 
     def _full(self) -> str | None:
-        """Why nobody more is taken; None: one more is."""
+        """Return why no more heads are admitted; None: one more is."""
         if self._capacity is None:
             return None
         delay_s = self._capacity.delay_s(self.heads + 1, self._deadline_s)
@@ -267,21 +259,21 @@ class StreamServer:
             return None
         after = "not be kept up with" if math.isinf(delay_s) else f"be answered after {delay_s * 1e3:.0f} ms"
         return (
-            f"server {self._server} is full: with {self.heads} heads one more would {after}, "
+            f"server {self.counts.server} is full: with {self.heads} heads one more would {after}, "
             f"{self._deadline_s * 1e3:.0f} ms are promised"
         )
 
     def expire(self, now_s: float) -> None:
-        """Give up streams that send nothing."""
+        """Drop streams that send nothing."""
         for name, stream in list(self._streams.items()):
             if now_s - stream.heard_s > SILENT_S and not stream.stepping:
-                log.info("stream %s has sent nothing for %.0f s: given up", name, SILENT_S)
+                log.info("stream %s has sent nothing for %.0f s: dropped", name, SILENT_S)
                 del self._streams[name]
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def receive(self, name: str, message: bytes, now_s: float) -> Sequence[bytes]:
-        """A message to the stream `name`; what is to be answered at once. Never raises."""
+        """Take a message to the stream `name`; return what is to be answered at once. Never raises."""
         stream = self._streams.get(name)
         if stream is None:
             return [words_message(Notice("unknown"))]
@@ -296,14 +288,14 @@ class StreamServer:
             return []
 
     def _count_malformed(self, origin: str, error: RobotError) -> None:
-        self.malformed += 1
-        if self.malformed == 1:
+        self.counts.malformed += 1
+        if self.counts.malformed == 1:
             log.warning("%s: %s (more malformed messages are only counted)", origin, error)
 
     def _heed(self, stream: _Stream, message: bytes) -> None:
         said = parse_words(message)
         if not isinstance(said, Notice):
-            raise PacketError("words that a server is not sent to a stream (leave, calm)")
+            raise PacketError("a stream: expected a notice (leave, calm)")
         if said.kind == "leave":
             self._streams.pop(stream.name, None)
         elif said.kind == "calm" and said.calmness is not None:
@@ -314,7 +306,7 @@ class StreamServer:
             gap = sent.number - stream.expected
             if gap < 0:
                 return []  # it came late, and an empty one has taken its place; or twice
-            self.lost += gap
+            self.counts.lost += gap
             for back in range(min(gap, MOST_FILLED), 0, -1):
                 empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, _EMPTY)
                 filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
@@ -325,7 +317,7 @@ class StreamServer:
             return []
         left_out = len(stream.waiting) - 1
         stream.waiting = deque([stream.waiting[-1]])
-        self.skipped += left_out
+        self.counts.skipped += left_out
         return [words_message(Notice("skipped", frames=left_out))]
 
     def _due(self, sent: SentFrame, now_s: float) -> _Due:
@@ -336,7 +328,7 @@ class StreamServer:
     # --- batches -----------------------------------------------------------------------------------------------------
 
     def batch(self) -> Batch | None:
-        """What is to be stepped next; None while nothing waits. Its streams are not in another batch until `finish`."""
+        """Return what is to be stepped next, or None. Its streams are in no other batch until `finish`."""
         ready = [each for each in self._streams.values() if each.waiting and not each.stepping]
         if not ready:
             return None
@@ -350,13 +342,14 @@ class StreamServer:
         return Batch(chosen, [stream.waiting.popleft() for stream in chosen])
 
     def step(self, batch: Batch) -> list[tuple[Plan | None, Any]]:
-        """What the listener makes of it; may raise whatever that does."""
-        return step_each(self._listener, batch.speakers, batch.memories)
+        """Step the streams of a batch; return (plan, memory) of each. Raises what the listener raises."""
+        speakers = [due.sent.frame for due in batch.dues]
+        return step_each(self._listener, speakers, [stream.memory for stream in batch.streams])
 
     def finish(
         self, batch: Batch, answers: Sequence[tuple[Plan | None, Any]], began_s: float, now_s: float
     ) -> list[tuple[str, bytes]]:
-        """Keep the memories; the messages to be sent, each with its stream. `began_s`: when the step did."""
+        """Keep the memories; return the messages to be sent, each with its stream. `began_s`: when the step did."""
         step_s = now_s - began_s
         messages = []
         for stream, due, (plan, memory) in zip(batch.streams, batch.dues, answers, strict=True):
@@ -364,28 +357,35 @@ class StreamServer:
             stream.to_plan = self._listener.hop - 1 if plan is not None else max(0, stream.to_plan - 1)
             if plan is not None and stream.name in self._streams:
                 earlier = tuple(event for each in stream.events for event in each)
-                sent = SentPlan(due.sent.number, plan, due.sent.sent_s, due.came_s, now_s, step_s * 1e3)
+                sent = SentPlan(
+                    number=due.sent.number,
+                    plan=plan,
+                    echo_s=due.sent.sent_s,
+                    came_s=due.came_s,
+                    sent_s=now_s,
+                    step_ms=step_s * 1e3,
+                )
                 messages.append((stream.name, plan_message(sent, earlier)))
                 stream.events.append(plan.events)
                 self._planned(now_s - due.came_s)
-        self.batches += 1
-        self.stepped += len(batch.streams)
-        self._batch_sizes.append(len(batch.streams))
+        self.counts.batches += 1
+        self.counts.steps += len(batch.streams)
+        self.counts.batch_sizes.append(len(batch.streams))
         self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
         return messages
 
     def failed(self, batch: Batch) -> None:
-        """Its step raised: these streams are given up, and join anew."""
+        """Drop the streams of a batch whose step raised: they join again."""
         for stream in batch.streams:
             self._streams.pop(stream.name, None)
 
     def _planned(self, delay_s: float) -> None:
-        self.plans += 1
-        self.misses += delay_s > self._deadline_s
-        self._recent_s.append(delay_s)
+        self.counts.plans += 1
+        self.counts.misses += delay_s > self._deadline_s
+        self.counts.delays_s.append(delay_s)
 
     def _weigh(self, plans: int, steps: int, step_s: float) -> None:
-        """Batches take as long as they take, whatever was measured at the start."""
+        """Adapt the scale of the costs to how long this batch took."""
         if self._capacity is None:
             return
         expected_s = self._capacity.scaled(1.0).batch_s(plans, steps - plans)
@@ -394,7 +394,7 @@ class StreamServer:
             self._capacity = self._capacity.scaled(self._capacity.scale + _SCALE_STEP * (ratio - self._capacity.scale))
 
     def _batch_limit(self) -> int:
-        """Streams of a batch that takes half of the deadline, all planning."""
+        """Return the number of streams of a batch that takes half of the deadline, all planning."""
         if self._capacity is None:
             return 1 << 16
         size = 1
@@ -405,29 +405,17 @@ class StreamServer:
     # --- figures -----------------------------------------------------------------------------------------------------
 
     def figures(self) -> Figures:
-        """What it has done so far."""
-        return Figures(
-            server=self._server,
-            listener=self._name,
-            hop=self._listener.hop,
-            deadline_s=self._deadline_s,
+        """Return what it has done so far."""
+        capacity = self._capacity
+        return replace(
+            self.counts,
             heads=self.heads,
-            most_heads=None if self._capacity is None else self._capacity.most(self._deadline_s),
-            plans=self.plans,
-            misses=self.misses,
-            batches=self.batches,
-            steps=self.stepped,
-            skipped=self.skipped,
-            lost=self.lost,
-            refused=self.refused,
-            malformed=self.malformed,
-            delays_s=[*self._recent_s],
-            batch_sizes=[*self._batch_sizes],
-            cost_scale=None if self._capacity is None else self._capacity.scale,
+            most_heads=None if capacity is None else capacity.most(self._deadline_s),
+            cost_scale=None if capacity is None else capacity.scale,
             cpu_s=time.process_time(),
         )
 
 
 def _urgency(stream: _Stream) -> float:
-    """When its next frame must be stepped: one that asks for no plan may wait for the one that does."""
+    """Return when its next frame must be stepped: one that needs no plan may wait for the one that does."""
     return stream.waiting[0].deadline_s + stream.to_plan * FRAME_S

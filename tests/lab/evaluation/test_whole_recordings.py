@@ -5,10 +5,9 @@ import pytest
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FRAME_SAMPLES, FaceFrame, ListenerEvent, SpeakerFrame
-from sfms_robot.listeners.events.evidence import HEARD, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in
+from sfms_robot.listeners.events.evidence import HEARD, Sensed, sense
 from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.listeners.events.sensing import Sensed, scene_in, sense
-from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
 
 FRAMES = 4000
 CALMNESS = [Calmness(), Calmness(nod=6.0, blink=0, addressed="assume")]
@@ -78,7 +77,7 @@ def test_hazards_are_those_asked_frame_by_frame(rows, history, calmness):
     found = hazards_in(model, np.stack([one.heard for one in rows]), history, calmness)
     memory = model.start(0, calmness).decided
     for index, one in enumerate(rows):
-        decision, memory = model.decide(one, memory, history)
+        ((decision, memory),) = model.decide_each([one], [memory], [history])
         for kind, hazard_hz in decision.hazards_hz.items():
             assert found[kind][index] == pytest.approx(hazard_hz, abs=1e-9), (kind, index)
 
@@ -101,4 +100,5 @@ def test_nothing_is_asked_of_nothing():
     for frames in (0, 1, 2):
         found = hazards_in(model, np.full((frames, len(HEARD)), np.nan), [], Calmness())
         assert {len(values) for values in found.values()} == {frames}
-        assert not model.decide(Sensed(0, np.full(len(HEARD), np.nan)), model.start(0).decided)[0].events
+        blind = Sensed(0, np.full(len(HEARD), np.nan))
+        assert not model.decide_each([blind], [model.start(0).decided])[0][0].events

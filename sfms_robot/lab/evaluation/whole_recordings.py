@@ -1,0 +1,298 @@
+"""Evidence and hazards of whole recordings at once: what `EventModel.decide_each` draws step by step.
+
+`heard_in` and `done_in` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
+given nothing has to be decided, so every step is asked together (`hazards_in`). Where none is, `most_in` says how
+likely each kind can be at all, whatever was done: at a step whose draws all lie above that nothing can happen, and only
+the others have to be decided one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.config import Calmness
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.listeners.events.evidence import (
+    AT,
+    COUNTED_S,
+    DONE,
+    EPS_S,
+    EVIDENCE,
+    FLOOR_FRAMES,
+    HEARD,
+    MINE,
+    NOBODY,
+    Addressed,
+    SenseMemory,
+    looks_at_head,
+    read_signs,
+    sounds,
+)
+from sfms_robot.listeners.events.model import (
+    ALWAYS,
+    AT_PERSON,
+    EXCLUDES,
+    LISTENING_S,
+    STEP_FRAMES,
+    STEP_S,
+    EventModel,
+)
+from sfms_robot.signals import phase, voice_activity
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.event_sizes import SWING_S
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+_TOGETHER: Final = 1000  # steps: as much as stays in a cache
+_MOST_NODS: Final = 1 + COUNTED_S / SWING_S[0]  # in the time in which they are counted
+_MARGIN: Final = 1e-9  # of log-odds, for sums in another order
+
+
+# --- Evidence ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scene:
+    """N frames of a conversation of P people, oneself the first.
+
+    Attributes:
+        speaks: (N, P).
+        looks: (N, P) each looks at oneself (1) or not (0); NaN: unknown. The first column means nothing.
+        laughs, smiles: (N,) one of the others does.
+        nods: (N,) one of the others begins to.
+    """
+
+    speaks: Bools
+    looks: Doubles
+    laughs: Bools
+    nods: Bools
+    smiles: Bools
+
+
+def heard_in(scene: Scene) -> Doubles:
+    """Return the evidence (N, len(HEARD)) of a scene."""
+    index = np.arange(len(scene.speaks))
+    others = scene.speaks[:, 1:]
+    phrase, silence, last = phase.times(np.asarray(others.any(axis=1))).T
+    holder, held = _floor_in(scene.speaks)
+    spoke = np.maximum.accumulate(np.where(scene.speaks, index[:, None], -np.inf), axis=0)  # (N, P)
+    another = holder > MINE
+    relevant = counts_in(scene)[:, 1:]
+    looks = scene.looks[:, 1:]
+    known = (relevant & ~np.isnan(looks)).any(axis=1)
+    looked = (relevant & (looks == 1)).any(axis=1)
+    began = np.maximum.accumulate(np.where(looked & ~np.r_[False, looked[:-1]], index, 0))
+    speaking = others.sum(axis=1)
+    columns = {
+        "phrase_s": np.where(phrase > 0, phrase, np.nan),
+        "silence_s": silence,
+        "last_phrase_s": np.where(last > 0, last, np.nan),
+        "one_speaks": speaking == 1,
+        "several_speak": speaking > 1,
+        "floor_mine": holder == MINE,
+        "floor_s": np.where(another, (index - held) * FRAME_S, np.nan),
+        "holder_silence_s": np.where(another, (index - spoke[index, np.maximum(holder, 0)]) * FRAME_S, np.nan),
+        "own_voice_s": (index - spoke[:, MINE]) * FRAME_S,
+        "gaze_known": known,
+        "looked_at": looked,
+        "looked_at_s": np.where(looked, (index - began) * FRAME_S, np.nan),
+        "looked_at_silence_s": np.where(looked, silence, np.nan),
+        "laugh_s": _since(scene.laughs),
+        "others_nod_s": _since(scene.nods),
+        "others_smile_s": _since(scene.smiles),
+    }
+    return np.stack([np.asarray(columns[name], np.float64) for name in HEARD], axis=1)
+
+
+def counts_in(scene: Scene) -> Bools:
+    """Return (N, P) whose look counts: of those who speak, else of the holder of the floor. Never one's own."""
+    others = scene.speaks.copy()
+    others[:, MINE] = False
+    holder, _ = _floor_in(scene.speaks)
+    waiting = ~others.any(axis=1, keepdims=True) & (holder[:, None] == np.arange(others.shape[1]))
+    waiting[:, MINE] = False
+    counts: Bools = others | waiting
+    return counts
+
+
+def _since(happens: Bools) -> Doubles:
+    """Return (N,) seconds since the newest True."""
+    index = np.arange(len(happens))
+    newest = np.maximum.accumulate(np.where(happens, index, -np.inf))
+    return np.asarray((index - newest) * FRAME_S, np.float64)
+
+
+def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
+    """Return the holder of the floor (N,), -1 for none yet, and since which frame."""
+    frames, people = speaks.shape
+    index = np.arange(frames)
+    lengths = np.stack([phase.times(speaks[:, who])[:, 0] for who in range(people)], axis=1)
+    lengths[lengths < (FLOOR_FRAMES - 0.5) * FRAME_S] = np.inf
+    newest = np.maximum.accumulate(np.where(np.isfinite(lengths).any(axis=1), index, -1))
+    holder = np.where(newest >= 0, np.argmin(lengths, axis=1)[newest], NOBODY)
+    changed = holder != np.r_[NOBODY, holder][:-1]
+    return holder, np.maximum.accumulate(np.where(changed, index, 0))
+
+
+def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
+    """Return the scene that `sense` sees in a recording; `heard_in` makes its rows of that."""
+    memory = SenseMemory(addressed)
+    deaf, ear, face = True, memory.ear, memory.face
+    speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
+    speaks[:, 0] = [sounds(frame.agent_audio) for frame in speaker]
+    for index, frame in enumerate(speaker):
+        deaf = deaf and not len(frame.audio)
+        ear = ear if deaf else voice_activity.step(energy_db(frame.audio), ear)
+        sign, face = read_signs(frame.face, face)
+        looks[index, 1], memory = looks_at_head(frame, memory)
+        speaks[index, 1] = sign.mouth_moves if deaf else ear.active
+        signs.append((sign.laughs, sign.nods, sign.smiles))
+    laughs, nods, smiles = np.array(signs, bool).reshape(-1, 3).T
+    silent = phase.times(speaks[:, 1])[:, 0] == 0
+    return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
+
+
+_SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
+_SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
+
+
+def done_in(
+    spans_s: Mapping[str, Doubles], frames: int, log_rate: Doubles | float, aside: Bools | None = None
+) -> Doubles:
+    """Return (frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
+
+    `aside` (K,): which of the gaze shifts go away from the person.
+    """
+    return done_at(spans_s, np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64), log_rate, aside)
+
+
+def done_at(
+    spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
+) -> Doubles:
+    """Return `done_in` at instants (M,): (M, len(DONE))."""
+    columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
+    for kind in _SINCE_END:
+        columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
+    for name, kind in _SINCE_BEGIN.items():
+        columns[name] = _since_newest(spans_s.get(kind), now_s)
+    nods = np.sort(spans_s.get("nod", np.zeros((0, 2)))[:, 0])
+    begun, earlier = (np.searchsorted(nods, now_s - ago_s - EPS_S) for ago_s in (0.0, COUNTED_S))
+    columns["root_nods_30s"] = np.sqrt(begun - earlier)
+    columns["log_rate"] = log_rate
+    shifts = spans_s.get("gaze_shift", np.zeros((0, 2)))
+    columns["shift_s"] = _since_newest(shifts, now_s)
+    newest = np.searchsorted(shifts[:, 0], now_s - EPS_S) - 1
+    away = np.zeros(len(shifts), bool) if aside is None else aside
+    at_person = (newest < 0) | ~np.r_[away, False][newest]
+    columns["at_person_s"] = np.where(at_person, columns["shift_s"], np.nan)
+    return np.stack([np.broadcast_to(np.asarray(columns[name], np.float64), now_s.shape) for name in DONE], axis=1)
+
+
+def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> Doubles:
+    """Return (N,) seconds since the newest span that had begun, began or ended; inf before the first, 0 inside."""
+    if spans is None or not len(spans):
+        return np.full(len(now_s), np.inf)
+    newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
+    at = np.maximum.accumulate(spans[:, 1]) if ends else spans[:, 0]
+    return np.where(newest < 0, np.inf, np.maximum(0.0, now_s - at[np.maximum(newest, 0)]))
+
+
+# --- Hazards ----------------------------------------------------------------------------------------------------------
+
+
+def steps_in(frames: int) -> Ints:
+    """Return the frames, of so many, at whose end hazards are drawn."""
+    return np.arange(STEP_FRAMES - 1, frames, STEP_FRAMES)
+
+
+def hazards_in(
+    model: EventModel, heard: Doubles, own: Sequence[ListenerEvent], calmness: Calmness
+) -> dict[str, Doubles]:
+    """Return `Decision.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
+    steps = steps_in(len(heard))
+    now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
+    spans_s = {kind: _spans(own, kind) for kind in EVENT_KINDS}
+    away = np.array([event.target_rad != AT_PERSON for event in own if event.kind == "gaze_shift"], bool)
+    log_rate = _log_rate(model, calmness)
+    odds = [
+        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done_at(spans_s, at_s, log_rate, away)], 1)))
+        for rows, at_s in zip(_blocks(heard[steps]), _blocks(now_s), strict=True)
+    ]
+    asked_hz = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness))) / STEP_S
+    may = _may_happen(heard[steps], spans_s, away, now_s)
+    hazards_hz = {kind: np.zeros(len(heard)) for kind in EVENT_KINDS}
+    for at, kind in enumerate(model.bank.kinds):
+        if calmness.per_minute(kind) != 0:
+            held = np.repeat(np.where(may[kind], asked_hz[:, at], 0.0), STEP_FRAMES)
+            hazards_hz[kind][STEP_FRAMES - 1 :] = held[: len(heard) - STEP_FRAMES + 1]
+    return hazards_hz
+
+
+def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
+    """Return the greatest probability (M, kinds) of each kind, of evidence (M, len(HEARD)) of steps.
+
+    Over all that the stream may have done before: each term is taken at its greatest knot.
+    """
+    nothing = np.full((len(heard), len(DONE)), np.nan)
+    odds = [
+        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done], 1)) + _most_by_doing(model, calmness))
+        for rows, done in zip(_blocks(heard), _blocks(nothing), strict=True)
+    ]
+    most = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness) - _MARGIN))
+    listening = _listening(heard)
+    for at, kind in enumerate(model.bank.kinds):
+        most[:, at] *= calmness.per_minute(kind) != 0
+        if kind not in ALWAYS:
+            most[~listening, at] = 0.0
+    return np.asarray(most)
+
+
+def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
+    """Return (T,) the most that each term can add by events of before; 0 for terms of the others."""
+    curves = [weight for hazard in model.tables.hazards.values() for weight in hazard.weights.values()]
+    knots_s = sorted({knot for curve in curves if isinstance(curve, dict) for knot in curve})
+    rows = np.full((len(knots_s) + 1, len(EVIDENCE)), np.nan)
+    rows[:-1, len(HEARD) :] = np.array(knots_s)[:, None]
+    rows[:-1, AT["root_nods_30s"]] = math.sqrt(_MOST_NODS)
+    rows[-1, AT["root_nods_30s"]] = 0.0
+    rows[:, AT["log_rate"]] = _log_rate(model, calmness)
+    return np.asarray(model.bank.contributions(rows).max(axis=0))
+
+
+def _log_rate(model: EventModel, calmness: Calmness) -> float:
+    return math.log(calmness.nod or model.tables.hazards["nod"].per_minute)
+
+
+def _blocks(rows: Doubles) -> list[Doubles]:
+    return np.array_split(rows, len(rows) // _TOGETHER + 1)
+
+
+def _spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
+    return np.array([(one.start_s, one.end_s) for one in events if one.kind == kind], np.float64).reshape(-1, 2)
+
+
+def _listening(heard: Doubles) -> Bools:
+    """Return (M,) whether another person has spoken just now, and oneself does not."""
+    spoken = ~(np.isnan(heard[:, AT["phrase_s"]]) & np.isnan(heard[:, AT["last_phrase_s"]]))
+    return np.asarray(spoken & (heard[:, AT["silence_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0))
+
+
+def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now_s: Doubles) -> dict[str, Bools]:
+    """Return (M,) by kind whether it may begin, by listening and by the events under way."""
+    under_way = {}
+    for kind, spans in spans_s.items():
+        newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
+        lasts_until_s = np.where(away, np.inf, 0.0) if kind == "gaze_shift" else np.maximum.accumulate(spans[:, 1])
+        under_way[kind] = (newest >= 0) & (np.r_[lasts_until_s, 0.0][newest] > now_s)
+    listening = _listening(heard)
+    return {
+        kind: ~np.any([under_way[other] for other in EXCLUDES[kind]], axis=0) & (listening | (kind in ALWAYS))
+        for kind in EVENT_KINDS
+    }

@@ -1,0 +1,350 @@
+"""Motion of a head and a face that do nothing: slow sway of the head, and the small motion of a resting face.
+
+There is nothing to predict in either, so neither is drawn by a listener's network: as tokens sway steps, since the
+codes of a whole head are as far apart as its sway is wide; drawn frame by frame on its own past it grows, or drags what
+was drawn of a nod along for seconds. Keyframes pay for events, so a face at rest would stand still, and looks dead.
+Both are made of what recorded people do (Shinozuka's spectral representation of a stationary process), as functions of
+the seed and of time alone: any frame of the future is known, a plan may be made again, or in other pieces, and shows
+the same, nothing adds up, and after an hour a head is where it was. They set in over the first `EASE_S`.
+
+Sway, of every line l one cosine a channel:
+
+    x(t) = size * sum over l of  2^1/2 M[l] (a_l cos 2 pi f_l t + b_l sin 2 pi f_l t),   a_l, b_l in R^S
+
+`LINES` frequencies are drawn from each of the `BANDS_HZ`, `M M^T` of each band is what heads do together there: a head
+that leans forward also comes down. Over the lines of a band sum a a^T + b b^T = 1: the direction of a head is random,
+how far it moves in all is not. Only `size` sets that, a stream's own manner, within what people's is. Every other
+stream is mirrored: people lean to either side alike. Heads do not sway evenly, they stand for a second or two and shift
+then. So t is the time of a clock that runs faster and slower, by `UNEVEN` of its pace, once in some `CLOCK_S`; turns of
+the head have one, shifts of it another. How often the head is where stays the same; how far it moves in two seconds
+differs from one to the next as much as it does of people.
+
+Idle motion of the face (`IdleMotion`), components k, lines l, a, b ~ N(0, 1):
+
+    x(t) = size * sum over k of  loadings[k] * sum over l of  amplitude[l, k] (a cos 2 pi f t + b sin 2 pi f t)
+
+Components are patterns of channels that move together. This and the listener's motion together rest elsewhere than
+people do, and not as bells do: a muscle is slack for a third of the time, and hardly ever far above its middle. So each
+channel goes through a map that never falls, from its own quantiles at rest (`held`) to people's (`shown`), and above
+them, where events are, continues by the last difference. Faces never go below 0 nor above 1. A mouth that speaks does
+not rest: it goes through no map until half a second after its own voice, and through all of it half a second later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot import config
+from sfms_robot.errors import ModelError
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    FRAME_S,
+    LATERAL_POSE,
+    MOTION_DIM,
+    POSE_CHANNELS,
+    SHAPES,
+    Doubles,
+    Floats,
+)
+from sfms_robot.listeners.checkpoint import read_weights, write_tensors
+from sfms_robot.listeners.lots import Use, normals, uniforms
+
+BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
+BANDS = len(BANDS_HZ) - 1
+LINES = 6  # of each band; twice as many are no fewer than channels of a head
+WIDEST = 2.0  # deviations by which a manner is off the mean one, at most
+UNEVEN = 0.85
+CLOCK_S = (4.0, 8.0)  # least and most
+
+
+class HeadSway:
+    """The sway of one listener's streams; none for one with `sway: false`.
+
+    Its tensors, fitted by `learning.slow_motion`: `sway_mixture` (BANDS, S, S) and `sway_spread` () of `draw_sway`, in
+    units of its motion space, of the S channels that move the head.
+    """
+
+    def __init__(self, settings: config.Listener, tensors: Mapping[str, Floats]) -> None:
+        self._head = head_channels(settings.channels) if settings.sway else []
+        self._lateral = lateral_channels(settings.channels)
+        self._shifting = shifting_channels(settings.channels)
+        self._tensors = tensors
+
+    def start(self, seed: int) -> Doubles:
+        """Return the sway of a stream, as `sway_at` takes it; empty without."""
+        if not self._head:
+            return np.zeros((3, 0, 0))
+        mixture, spread = self._tensors["sway_mixture"], float(self._tensors["sway_spread"])
+        return draw_sway(mixture, spread, seed, self._lateral, self._shifting)
+
+    def added(self, motion: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
+        """Add the sway of each stream to motion (..., N, C) of frames `first`, `first` + 1, ..., in place.
+
+        `sway`: (..., 3, 1 + L, S). `first` is of all streams, or (...) of each.
+        """
+        if self._head:
+            frames = np.asarray(first)[..., None] + 1.0 + np.arange(motion.shape[-2])
+            motion[..., self._head] += sway_at(sway, FRAME_S * frames)
+        return motion
+
+
+def draw_sway(
+    mixture: Floats, spread: float, seed: int, lateral: Sequence[int] = (), shifting: Sequence[int] = ()
+) -> Doubles:
+    """Draw the lines of one stream's sway.
+
+    Args:
+        mixture: (BANDS, S, S) M of each band, from (a, b) of a line to the channels.
+        spread: deviation of the logarithm of sizes between people.
+        seed: of the stream.
+        lateral: channels that a mirror turns around.
+        shifting: channels that go by the second clock.
+
+    Returns:
+        (3, 1 + BANDS * LINES, S) frequencies [rad/s], sizes in units of the motion, and phases [rad]; first those of
+        each channel's clock, whose sizes are seconds.
+    """
+    bands, channels, _ = mixture.shape
+    edges = np.array(BANDS_HZ)
+    uniform = uniforms(seed, 0, Use.SWAY, 1 + bands * LINES + 4)
+    frequency_hz = edges[:-1, None] + uniform[1:-4].reshape(bands, LINES) * np.diff(edges)[:, None]
+    drawn = normals(seed, 1, Use.SWAY, 1 + 2 * bands * LINES * channels).astype(np.float64)
+    lots, _ = np.linalg.qr(drawn[1:].reshape(bands, 2 * LINES, channels))  # of each band: orthonormal columns
+    factors = np.einsum("bsc,bplc->pbls", mixture.astype(np.float64), lots.reshape(bands, 2, LINES, channels))
+    factors *= math.sqrt(2) * math.exp(spread * min(max(drawn[0], -WIDEST), WIDEST))
+    if uniform[0] < 0.5:
+        factors[..., list(lateral)] *= -1
+    size, phase = as_cosines(*factors)
+    turns = np.broadcast_to(2 * math.pi * frequency_hz[..., None], size.shape)
+    lines = np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
+    return np.concatenate([_clocks(uniform[-4:], channels, shifting)[:, None], lines], axis=1)
+
+
+def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles:
+    """Return (3, S) of each channel's clock, of two that are drawn; `uniform` (4,): their lengths and phases."""
+    second = np.zeros(channels, np.intp)
+    second[list(shifting)] = 1
+    turn = 2 * math.pi / (CLOCK_S[0] + (CLOCK_S[1] - CLOCK_S[0]) * uniform[:2])
+    return np.stack([turn, UNEVEN / turn, 2 * math.pi * uniform[2:]])[:, second]
+
+
+def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
+    """Return sway (..., 3, 1 + L, S) at times (T,) since the stream began, or (..., T) of each: (..., T, S).
+
+    In units of the motion; 0 before the stream began.
+    """
+    lines, clocks = sway[..., 1:, :], sway[..., :1, :]
+    own_s = times_s[..., None] + sum_of_lines(times_s[..., None], *_parts(clocks))  # (..., T, S)
+    return np.asarray(sum_of_lines(own_s, *_parts(lines)) * set_in(times_s)[..., None], np.float32)
+
+
+def _parts(lines: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Return frequencies, sizes and phases of lines (..., 3, L, S)."""
+    return lines[..., 0, :, :], lines[..., 1, :, :], lines[..., 2, :, :]
+
+
+# --- Spectral lines ---------------------------------------------------------------------------------------------------
+#
+# A line a cos 2 pi f t + b sin 2 pi f t is one cosine, |(a, b)| cos(2 pi f t - atan2(b, a)), and is kept as such.
+# Sway and idle motion are both sums of lines.
+
+EASE_S: Final = 3.0
+
+
+def as_cosines(a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
+    """Return size and phase [rad] of lines with the factors a of the cosine and b of the sine."""
+    return np.hypot(a, b), np.arctan2(b, a)
+
+
+def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
+    """Return the sum of lines (..., L, K), frequency [rad/s]: (..., T, K).
+
+    Times are (T, 1) of all, (..., T, 1) of each, or (..., T, K) where every column has another clock.
+    """
+    turn = times_s[..., None, :] * frequency[..., None, :, :]  # (..., T, L, K)
+    turn -= phase[..., None, :, :]
+    waves: Doubles = size[..., None, :, :] * np.cos(turn, out=turn)
+    return np.asarray(waves.sum(-2))
+
+
+def set_in(times_s: NDArray[np.floating]) -> Doubles:
+    """Return 0 before a stream begins, 1 from `EASE_S` on, smooth in between."""
+    begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
+    return np.asarray(begun**2 * (3 - 2 * begun))
+
+
+# --- Channels of the head ---------------------------------------------------------------------------------------------
+
+# Channels of any motion space that turn or move the head, and those of them that a mirror turns around.
+HEAD = frozenset(
+    {*POSE_CHANNELS, *(f"{part}_{axis}" for part in ("rotation", "translation", "head") for axis in "xyz")}
+)
+
+LATERAL = frozenset((*LATERAL_POSE, "rotation_y", "rotation_z", "translation_x", "head_y", "head_z"))
+SHIFTING = frozenset(("x", "y", "z", *(f"translation_{axis}" for axis in "xyz")))
+
+
+def head_channels(channels: Sequence[str]) -> list[int]:
+    """Return which of the channels move the head."""
+    return [index for index, name in enumerate(channels) if name in HEAD]
+
+
+def lateral_channels(channels: Sequence[str]) -> list[int]:
+    """Return which of the `head_channels` a mirror turns around, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]
+
+
+def shifting_channels(channels: Sequence[str]) -> list[int]:
+    """Return which of the `head_channels` move the head without turning it, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in SHIFTING]
+
+
+# --- Idle motion of a face --------------------------------------------------------------------------------------------
+
+FILE: Final = "idle_motion.safetensors"  # in a listener's folder; without it a listener has none
+IDLE_BANDS_HZ: Final = (0.04, 0.4, 0.75, 1.25, 2.0, 3.0, 5.0, 8.0)  # edges
+IDLE_BANDS: Final = len(IDLE_BANDS_HZ) - 1
+IDLE_LINES: Final = 3  # of each band
+LARGEST: Final = 0.5  # no resting face moves so far
+_SEED: Final = 0x1D1E  # apart from what else a stream draws by its seed
+_COUNT: Final = MOTION_DIM - SHAPES.start
+KNOTS: Final = 9  # of the map of each channel
+STEEPEST: Final = 2.0
+AFTER_SPEECH_S: Final = 0.5  # a mouth rests; so much later it rests as people's do
+MOUTH: Final = ("jaw", "mouth", "cheek", "nose", "tongue")  # what names of its channels begin with
+_OF_MOUTH: Final = np.array([name.startswith(MOUTH) for name in BLENDSHAPES])
+_ROUNDING: Final = 1e-6
+_TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
+
+
+@dataclass(frozen=True)
+class RestMap:
+    """Maps of 52 channels, pieces of straight lines; beyond the first and last knot a channel is only shifted.
+
+    Attributes:
+        base: (52,) added everywhere.
+        low: (52, J) beginning of each piece.
+        width: (52, J) its length.
+        gain: (52, J) its slope minus 1.
+    """
+
+    base: Doubles
+    low: Doubles
+    width: Doubles
+    gain: Doubles
+
+    @classmethod
+    def between(cls, held: Floats, shown: Floats) -> RestMap:
+        """Return the map from values (J + 1, 52), which never fall, to others."""
+        low, width = held[:-1].T.astype(np.float64), np.diff(held, axis=0).T.astype(np.float64)
+        gain = np.diff(shown, axis=0).T / np.maximum(width, 1e-9) - 1
+        return cls((shown[0] - held[0]).astype(np.float64), low, width, gain)
+
+    def off(self, shapes: Doubles) -> Doubles:
+        """Return by how much the map changes shapes (N, 52)."""
+        part = shapes[:, :, None] - self.low
+        np.minimum(np.maximum(part, 0, out=part), self.width, out=part)
+        return np.asarray(self.base + np.einsum("ncj,cj->nc", part, self.gain), np.float64)
+
+
+@dataclass(frozen=True)
+class IdleStream:
+    """The idle motion of one stream.
+
+    Of each line, one cosine, frequency [rad/s], size and phase [rad], (L, K) each; loadings (K, 52); the map of rest.
+    """
+
+    frequency: Doubles
+    size: Doubles
+    phase: Doubles
+    loadings: Doubles
+    rest: RestMap
+
+    def added(self, frames: Floats, times_s: Doubles, silent_s: Doubles | float = math.inf) -> Floats:
+        """Return motion (N, 58) with the idle motion of times (N,) since the stream began: a new array.
+
+        `silent_s`: (N,) since its own voice ended; `inf`: it has never spoken.
+        """
+        parts = sum_of_lines(times_s[:, None], self.frequency, self.size, self.phase)  # (N, K)
+        idle = parts @ self.loadings  # (N, 52)
+        rest = self.rest.off(frames[:, SHAPES] + idle)
+        at_rest = np.minimum(np.maximum(np.divide(silent_s, AFTER_SPEECH_S) - 1, 0), 1)  # 0: the mouth speaks
+        rest[:, _OF_MOUTH] *= np.reshape(at_rest, (-1, 1))
+        idle += rest
+        out = frames.copy()
+        out[:, SHAPES] = np.minimum(np.maximum(out[:, SHAPES] + idle * set_in(times_s)[:, None], 0), 1)
+        return out
+
+
+@dataclass(frozen=True)
+class IdleMotion:
+    """Idle motion as learned, of K components.
+
+    Attributes:
+        loadings: (K, 52) blendshapes of each component, of deviation 1.
+        amplitude: (IDLE_BANDS, K) deviation of each component within each band; of all bands together about 1.
+        spread: deviation of the logarithm of sizes between people.
+        held, shown: (KNOTS, 52) quantiles of the listener's resting face with this motion, and of people's.
+    """
+
+    loadings: Floats
+    amplitude: Floats
+    spread: float
+    held: Floats
+    shown: Floats
+
+    def start(self, seed: int) -> IdleStream:
+        """Draw the idle motion of a stream by its seed."""
+        rng = np.random.default_rng([_SEED, seed])
+        edges, (bands, parts) = np.array(IDLE_BANDS_HZ), self.amplitude.shape
+        uniform = rng.random((bands, IDLE_LINES, parts))
+        frequency_hz = edges[:-1, None, None] + uniform * np.diff(edges)[:, None, None]
+        size = math.exp(self.spread * rng.standard_normal() - self.spread**2)  # of power 1 in the mean
+        factors = (
+            size
+            * rng.standard_normal((2, bands, IDLE_LINES, parts))
+            * (self.amplitude / math.sqrt(IDLE_LINES))[:, None]
+        )
+        cosine, sine = factors.reshape(2, bands * IDLE_LINES, parts)
+        sizes, phase = as_cosines(cosine, sine)
+        frequency = 2 * math.pi * frequency_hz.reshape(bands * IDLE_LINES, parts)
+        rest = RestMap.between(self.held, self.shown)
+        return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), rest)
+
+    def save(self, file: Path) -> None:
+        """Write the tensors to `file`. Raises ModelError if it cannot be written."""
+        write_tensors(file, {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in _TENSORS})
+
+    @classmethod
+    def load(cls, file: Path) -> IdleMotion:
+        """Read `file`. Raises ModelError if it is missing, cut off, of another shape, or moves a face too far."""
+        found = read_weights(file)
+        if set(found) != {*_TENSORS}:
+            raise ModelError(f"{file}: expected {', '.join(_TENSORS)}, got {', '.join(sorted(found))}")
+        loadings, amplitude, spread, held, shown = (found[name] for name in _TENSORS)
+        parts = len(loadings) if loadings.ndim else 0
+        shapes = [(parts, _COUNT), (IDLE_BANDS, parts), (KNOTS, _COUNT), (KNOTS, _COUNT)]
+        if [one.shape for one in (loadings, amplitude, held, shown)] != shapes or spread.size != 1:
+            raise ModelError(
+                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}, held "
+                f"{held.shape}, shown {shown.shape}; expected (K, {_COUNT}), ({IDLE_BANDS}, K), one number and twice "
+                f"({KNOTS}, {_COUNT})"
+            )
+        steps = np.diff(np.stack([held, shown]).astype(np.float64), axis=1)
+        if steps.min() < 0 or (steps[1] > STEEPEST * steps[0] + _ROUNDING).any():
+            raise ModelError(f"{file}: held, shown: the map of rest falls, or is steeper than {STEEPEST:g}")
+        largest = float(np.abs(loadings).max(initial=0.0) * np.linalg.norm(amplitude, axis=0).max(initial=0.0))
+        largest = max(largest, float(np.abs(shown - held).max()))
+        if largest > LARGEST or not 0 <= float(spread.item()) <= 1:
+            raise ModelError(
+                f"{file}: expected motion up to {LARGEST:g} and a spread of 0..1, got {largest:.3g} and "
+                f"{float(spread.item()):.3g}"
+            )
+        return cls(loadings, amplitude, float(spread.item()), held, shown)

@@ -1,0 +1,177 @@
+"""Times of a listener on another machine: its clock relative to ours, and plans that come unevenly (`JitterBuffer`).
+
+Clock offset and delay of a round trip are those of NTP (RFC 5905, section 8). A message leaves at t1 of our clock and
+arrives at t2 of the server's; its answer leaves at t3 of the server's and arrives at t4 of ours:
+
+    offset = ((t2 - t1) + (t3 - t4)) / 2        delay = (t4 - t1) - (t3 - t2)
+
+The offset is wrong by half the difference between the two ways, at most by delay / 2, so the sample with the least
+delay of the last seconds is used. Clocks drift apart, so an old sample is dropped.
+
+The buffer delays plans so that the next one is always there in time, in order and each once. A plan of H frames is
+followed until the next one comes, hop T + delay after its own last speaker frame, and plans know (H - 1) T of the
+future; T of it where they are single frames, which the timeline plays one late. What the delay's 95th percentile of
+the last seconds needs beyond that is added to the times of all plans:
+
+    shift = hop T + delay p95 + MARGIN - max(H - 1, 1) T, at least 0
+
+So plans of eight frames are mostly not shifted at all, since they reach further than networks are late, and those of
+one frame by the delay itself. The shift grows at once, where plans come later than it allows for, and shrinks slowly:
+a face that is a little late is not seen to be, one that hurries is.
+
+Plans that overtook one another are put in order while there is time: a plan is held back for one that is missing until
+its own first frame is due.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from sfms_robot.frames import FRAME_S, Plan
+
+WINDOW_S: Final = 10.0
+SET_S: Final = 1.0  # an offset so far from the one believed: a clock was set, or the server is another one
+
+DELAYS: Final = 128  # that are remembered
+PERCENT: Final = 95.0
+MARGIN_S: Final = 0.01  # a tick
+SHRINKS: Final = 0.02  # seconds a second
+LONGEST_S: Final = 0.6  # a longer delay is an outage: it is reported, not waited for
+
+
+@dataclass(frozen=True)
+class ClockSample:
+    """One exchange, complete at `at_s` of our clock; seconds."""
+
+    at_s: float
+    offset_s: float
+    delay_s: float
+
+
+class ClockOffset:
+    """The samples of the last `WINDOW_S` that could still become the best one."""
+
+    def __init__(self) -> None:
+        self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
+
+    def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
+        """Add an exchange: t1 to t4 of the module's text."""
+        sample = ClockSample(
+            came_s,
+            ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,
+            max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s)),
+        )
+        if self._samples and abs(sample.offset_s - self._samples[0].offset_s) > SET_S + sample.delay_s:
+            self._samples.clear()
+        while self._samples and self._samples[-1].delay_s >= sample.delay_s:
+            self._samples.pop()
+        self._samples.append(sample)
+        while came_s - self._samples[0].at_s > WINDOW_S:
+            self._samples.popleft()
+
+    def forget(self) -> None:
+        """Drop all samples: the server is another one."""
+        self._samples.clear()
+
+    @property
+    def best(self) -> ClockSample | None:
+        """Return the sample with the least delay; None before the first."""
+        return self._samples[0] if self._samples else None
+
+    def theirs(self, our_s: float) -> float | None:
+        """Return a time of our clock by the server's; None while nothing is known of it."""
+        return None if self.best is None else our_s + self.best.offset_s
+
+
+class JitterBuffer:
+    """The plans of one stream; time is loop time.
+
+    Args:
+        horizon: frames of a plan.
+        hop: frames from one plan to the next.
+
+    Attributes:
+        lost, late, doubled: plans that never came, came after a newer one was played, or came twice.
+    """
+
+    def __init__(self, horizon: int, hop: int) -> None:
+        self._reach_s = max(horizon - 1, 1) * FRAME_S
+        self._hop = hop
+        self._delays_s: deque[float] = deque(maxlen=DELAYS)
+        self._waiting: dict[int, Plan] = {}  # by number
+        self._given: int | None = None  # number of the newest plan given
+        self._from_s = -math.inf  # plans made before it were delayed by an outage
+        self._shift_s = self._wanted_s = 0.0
+        self._shifted_s: float | None = None  # when
+        self.lost = self.late = self.doubled = 0
+
+    @property
+    def shift_s(self) -> float:
+        """Return what is added to the times of plans at this moment [s]."""
+        return self._shift_s
+
+    @property
+    def delay_s(self) -> float | None:
+        """Return the delay that the shift allows for; None before the first plan."""
+        return float(np.percentile(self._delays_s, PERCENT)) if self._delays_s else None
+
+    def put(self, number: int, plan: Plan, came_s: float) -> None:
+        """Add a plan, made for frame `number`, which came at `came_s`."""
+        if self._given is not None and number <= self._given:
+            self.late += number != self._given
+            self.doubled += number == self._given
+            return
+        if number in self._waiting:
+            self.doubled += 1
+            return
+        self._observe(came_s - plan.made_at_s, plan.made_at_s)
+        self._waiting[number] = plan
+
+    def take(self, now_s: float) -> Sequence[Plan]:
+        """Return plans whose turn it is, oldest first, with their times shifted."""
+        self._follow(now_s)
+        taken = []
+        while self._waiting and self._is_due(number := min(self._waiting), now_s):
+            if self._given is not None:
+                self.lost += max(0, (number - self._given) // self._hop - 1)
+            self._given = number
+            taken.append(self._shifted(self._waiting.pop(number)))
+        return taken
+
+    def restart(self, now_s: float) -> None:
+        """Drop what waits, after an outage or for another stream.
+
+        Measured delays are kept, and plans for frames from before `now_s` add none.
+        """
+        self._waiting.clear()
+        self._given, self._from_s = None, now_s
+
+    def _observe(self, delay_s: float, made_at_s: float) -> None:
+        if made_at_s < self._from_s or delay_s > LONGEST_S:
+            return
+        self._delays_s.append(delay_s)
+        self._wanted_s = max(0.0, self._hop * FRAME_S + (self.delay_s or 0.0) + MARGIN_S - self._reach_s)
+
+    def _is_due(self, number: int, now_s: float) -> bool:
+        """Return whether it is the next in turn, or waiting longer for the one before is of no use."""
+        if self._given is None or number <= self._given + self._hop:
+            return True
+        return bool(now_s + MARGIN_S >= self._waiting[number].times_s[0] + self._shift_s)
+
+    def _shifted(self, plan: Plan) -> Plan:
+        if not self._shift_s:
+            return plan
+        events = tuple(replace(event, start_s=event.start_s + self._shift_s) for event in plan.events)
+        return replace(plan, times_s=plan.times_s + self._shift_s, events=events)
+
+    def _follow(self, now_s: float) -> None:
+        """Update the shift: up at once, down slowly."""
+        passed_s = 0.0 if self._shifted_s is None else max(0.0, now_s - self._shifted_s)
+        self._shifted_s = now_s
+        self._shift_s = max(self._wanted_s, self._shift_s - SHRINKS * passed_s)
