@@ -95,7 +95,7 @@ def test_bus_on_which_nobody_answers_any_more_fails_in_the_end(make_rig):
         held = rig.hold()
         rig.ticks(held, 5)
         rig.chain.hang_up()
-        with pytest.raises(BusError, match="nobody has answered for 1 s"):
+        with pytest.raises(BusError, match="no answer from any servo for 1 s"):
             rig.ticks(held, 200)
 
 

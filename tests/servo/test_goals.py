@@ -1,19 +1,18 @@
 import numpy as np
 import pytest
-from emulated_port import Straight
+from emulated_port import Straight, bus_servo
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.servo.goals import Goals
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.bus import Goals
 
 RAD = 2 * np.pi / 4096
 
 
 def goals_of(count=1) -> Goals:
     table = load_firmware_map("sts3215")
-    return Goals("face", [BusServo(f"joint{i}", i, table, -1.0, 1.0) for i in range(count)], Straight(table, 1.0))
+    return Goals("face", [bus_servo(f"joint{i}", i, table) for i in range(count)], Straight(table, 1.0))
 
 
 FIRST, BOTH, NOBODY = np.array([0]), np.array([0, 1]), np.zeros(0, np.intp)

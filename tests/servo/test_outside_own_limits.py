@@ -6,18 +6,17 @@ import math
 import pytest
 from chain_rig import ServoRig
 from emulated_devices import device_of, servos_of
-from emulated_port import BAUD, LossyPort, Straight, link_on
+from emulated_port import BAUD, LossyPort, Straight, bus_servo, link_on, switched_on
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
-from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
-from sfms_robot.servo.chain.slow_profile import SPEED_DEG_S, way_inside
-from sfms_robot.servo.chain.verified_write import Silent, finish
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.chain.link import Silent, finish
+from sfms_robot.servo.chain.protocol1 import Protocol1Startup
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
+from sfms_robot.servo.chain.startup import SPEED_DEG_S, way_inside
 from sfms_robot.servo.registers import Table
 
 MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
@@ -44,8 +43,7 @@ class Rig(ServoRig):
         self.leg = self.servo(1)
         self.fastest_deg_s, self.goals = 0.0, []
         self.port.write = self._watched(self.port.write)
-        limit_rad = LIMIT_DEG * 6.283185307179586 / 360.0
-        servos = [BusServo("leg", 1, firmware_map, -limit_rad, limit_rad, Safety())]
+        servos = [bus_servo("leg", 1, firmware_map, LIMIT_DEG * 6.283185307179586 / 360.0)]
         kind = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
         self.startup = kind("neck", link_on(self.port, table), servos, [table], Straight(table), BAUD, tries)
 
@@ -86,7 +84,7 @@ class Rig(ServoRig):
 def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, outside_deg):
     rig = Rig(model, outside_deg)
     rig.startup.run()
-    held = rig.startup.switch_on(0)
+    held = switched_on(rig.startup)
     assert rig.inside(held) and rig.held("torque_enable") == 1 and rig.held("goal_position") == held
     assert rig.usual_profile()
     assert all(rig.inside(goal) for goal in rig.goals)
@@ -100,7 +98,7 @@ def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, 
 def test_a_profile_that_is_told_in_time_is_as_slow(model):
     rig = Rig(model, -12.0, {"drive_mode": BY_TIME})
     rig.startup.run()
-    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    assert rig.inside(switched_on(rig.startup)) and rig.usual_profile()
     assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
@@ -111,7 +109,7 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
     rig.port.fate = iter(fate)
     try:
         rig.startup.run()
-        held = rig.startup.switch_on(0)
+        held = switched_on(rig.startup)
         assert rig.inside(held) and rig.usual_profile()
     except (BusError, ServoError):
         assert set(fate) - {""}
@@ -119,7 +117,7 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
     rig.port.fate, rig.clock.t = iter(()), rig.clock.t + 0.3
     rig.startup.run()  # by now perhaps inside, perhaps lost half way
-    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    assert rig.inside(switched_on(rig.startup)) and rig.usual_profile()
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
@@ -131,7 +129,7 @@ def test_one_that_does_not_come_is_let_go_and_named(model):
     low, high = rig.limits
     expected = rf"leg \(id 1\) stands at {rig.start}, outside its own limits {low}\.\.{high}.*torque is off"
     with pytest.raises(ServoError, match=expected):
-        rig.startup.switch_on(0)
+        switched_on(rig.startup)
     assert not rig.state()["torque"] and rig.clock.t < 5.0 and rig.usual_profile()
 
 
@@ -164,7 +162,7 @@ def test_one_that_was_lost_sight_of_half_way_is_let_go_before_its_profile_is_mad
     assert rig.state()["torque"]  # nobody could tell it
     rig.startup.run()
     assert not rig.state()["torque"] and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
-    assert rig.inside(rig.startup.switch_on(0)) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert rig.inside(switched_on(rig.startup)) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
 @given(low=st.integers(0, 4000), width=st.integers(1, 4095), present=st.integers(0, 4095))
@@ -190,7 +188,7 @@ def test_one_that_would_go_round_the_other_side_is_refused():
     assert table.center_ticks == 2048
     with pytest.raises(ServoError, match=r"stands at 4060, outside its own limits 20\.\.3000.*turn it in by hand"):
         rig.startup.run()
-        rig.startup.switch_on(0)
+        switched_on(rig.startup)
     assert not rig.state()["torque"]
 
 

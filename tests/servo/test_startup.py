@@ -3,18 +3,17 @@
 import pytest
 from chain_rig import ServoRig
 from emulated_devices import device_of
-from emulated_port import BAUD, LossyPort, Straight, link_on
+from emulated_port import BAUD, LossyPort, Straight, bus_servo, link_on, switched_on
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Safety, load_firmware_map
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
-from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
+from sfms_robot.servo.chain.link import Silent, finish
+from sfms_robot.servo.chain.protocol1 import Protocol1Startup
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
 from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of
-from sfms_robot.servo.chain.verified_write import Silent, finish
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, contradictions, offset_ticks
 
@@ -33,7 +32,7 @@ class Rig(ServoRig):
         there = [EmulatedServo(**{"id": i, **usual, **row}) for i, row in enumerate(rows or ({},), 1)]
         self.port = LossyPort(device_of(*there))
         servos = [
-            BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(stored=stored or {}))
+            bus_servo(f"joint{i}", i, firmware_map, limit_rad, safety=safety or Safety(stored=stored or {}))
             for i in wanted or range(1, 1 + len(there))
         ]
         kind = Dynamixel2Startup if self.table.protocol == 2 else Protocol1Startup
@@ -65,7 +64,7 @@ def limits_of(table):
 def test_absent_servos_do_not_stop_the_others(model):
     rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
     assert rig.startup.run() == {0: 0, 2: 0}
-    assert rig.startup.switch_on(2) == rig.table.center_ticks
+    assert switched_on(rig.startup, 2) == rig.table.center_ticks
     assert [rig.held("torque_enable", i) for i in (1, 3)] == [0, 1]
     assert rig.clock.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
 
@@ -86,7 +85,7 @@ def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
     rig.port.fate = iter(fate)
     try:
         rig.startup.run()
-        assert rig.startup.switch_on(0) == 500
+        assert switched_on(rig.startup) == 500
     except (BusError, ServoError):
         assert set(fate) - {""}
     if rig.held("torque_enable"):
@@ -194,7 +193,7 @@ def test_an_sts_offset_counts_with_its_own_sign():
 def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_its_own_sign(shaft, offset):
     table = Table.of(load_firmware_map("sts3215"))
     values = {"present_position": shaft - offset, "homing_offset": offset, "phase": 28}
-    needs = JointNeeds(1462, 2634, {"homing_offset": offset})
+    needs = JointNeeds(1462, 2634, stored={"homing_offset": offset})
     assert contradictions(values, table, needs) == []
 
 
@@ -243,7 +242,7 @@ def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
 def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
     rig = Rig(model, {"start_ticks": found})
     rig.startup.run()
-    assert rig.startup.switch_on(0) == found % 4096
+    assert switched_on(rig.startup) == found % 4096
     assert rig.held("torque_enable") == 1
     assert rig.servo(1).state(rig.clock.t + 1.0)["position"] == found % 4096
 
@@ -282,7 +281,7 @@ def test_a_geared_joint_works_in_extended_position_control(model):
     rig = Rig(model, **GEARED)
     rig.startup.run()
     assert rig.held("operating_mode") == 4 and rig.startup.wanted(0)["operating_mode"] == 4
-    rig.startup.switch_on(0)
+    switched_on(rig.startup)
     servo, goal = rig.servo(1), rig.table["goal_position"]
     assert servo.write(goal.address, goal.to_bytes(5000), rig.clock.t) == 0
     assert servo.state(rig.clock.t + 60.0)["position"] == pytest.approx(5000, abs=2)
@@ -296,7 +295,7 @@ def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(tic
     places = [read + turn * 4096 for turn in (-2, -1, 0, 1, 2)]
     if [each for each in places if -1081 <= each <= 5177] == [read] == [ticks]:
         rig.startup.run()
-        assert rig.startup.switch_on(0) == ticks
+        assert switched_on(rig.startup) == ticks
     else:
         with pytest.raises(ServoError, match="turns is lost.*by hand to where it will read 1082..3014"):
             rig.startup.run()
@@ -306,7 +305,7 @@ def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(tic
 def test_a_geared_joint_that_kept_its_torque_kept_its_count():
     rig = Rig("xl330-m288", **GEARED)
     rig.startup.run()
-    rig.startup.switch_on(0)
+    switched_on(rig.startup)
     servo, goal = rig.servo(1), rig.table["goal_position"]
     servo.write(goal.address, goal.to_bytes(5000), rig.clock.t)
     servo.advance(60.0)
@@ -347,7 +346,7 @@ def test_a_register_that_the_model_does_not_have_is_named(model):
 def test_what_is_wanted_is_in_force_after_startup(model):
     rig = Rig(model, safety=Safety(torque_limit_percent=50))
     rig.startup.run()
-    rig.startup.switch_on(0)
+    switched_on(rig.startup)
     wanted = rig.startup.wanted(0)
     assert wanted
     assert {name: rig.held(name) for name in wanted} == dict(wanted)
