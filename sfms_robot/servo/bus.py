@@ -64,12 +64,17 @@ class Goals:
         self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
         self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
 
-    def hold(self, index: int, angle_rad: float) -> bool:
-        """Extend the range in force to the angle at which a servo holds; return whether its own range contains it."""
-        self._last_rad[index] = angle_rad
-        inside = bool(self._servos[index].min_rad <= angle_rad <= self._servos[index].max_rad)
-        self._outside |= not inside
-        return inside
+    def hold(self, index: int, angle_rad: float) -> None:
+        """Extend the range in force to the angle at which a servo holds, and warn if it is outside its own range."""
+        self._last_rad[index], servo = angle_rad, self._servos[index]
+        if not servo.min_rad <= angle_rad <= servo.max_rad:
+            self._outside = True
+            stands, low, high = np.degrees([angle_rad, servo.min_rad, servo.max_rad]).round(1)
+            log.warning(
+                "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
+                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
+                servo, stands, low, high,
+            )  # fmt: skip
 
     def allows(self, index: int, goal_rad: float) -> bool:
         """Return whether a goal lies in the range in force of a servo."""
@@ -138,7 +143,7 @@ class WireBus(ABC, Generic[L]):
         self._reconnect_s = reconnect_s
         self._counts = dict.fromkeys(COUNTS, 0)
         self._link: L | None = None
-        self._powered: frozenset[int] = frozenset()  # indices whose torque came on and is not confirmed off
+        self._powered: frozenset[int] = frozenset()  # ids whose torque came on and is not confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:
@@ -208,7 +213,7 @@ class WireBus(ABC, Generic[L]):
 
         `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
         """
-        powered = [self._servos[index] for index in sorted(self._powered)] if off else []
+        powered = [servo for servo in self._servos if off and servo.id in self._powered]
         return {"torque_unconfirmed": [servo.joint for servo in powered if servo.safety.stop == "release"]}
 
     def _connected(self) -> L:

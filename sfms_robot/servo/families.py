@@ -74,7 +74,7 @@ _BOARDS: Final = "sfms_robot.servo.pulse_bus"
 _OWN: Final = {
     "dynamixel2": BusFamily(
         "Dynamixel 2.0",
-        f"{_CHAIN}.bus:Dynamixel2Bus",
+        f"{_CHAIN}.protocol2:Dynamixel2Bus",
         ("dynamixel", 2),
         link=f"{_CHAIN}.protocol2:Dynamixel2Link",
         bauds=(1_000_000, 57_600, 4_000_000, 2_000_000, 3_000_000, 115_200, 9_600, 4_500_000),
@@ -83,14 +83,14 @@ _OWN: Final = {
     ),
     "dynamixel1": BusFamily(
         "Dynamixel 1.0",
-        f"{_CHAIN}.bus:Dynamixel1Bus",
+        f"{_CHAIN}.protocol1:Dynamixel1Bus",
         ("dynamixel", 1),
         link=f"{_CHAIN}.protocol1:Dynamixel1Link",
         bauds=(1_000_000, 57_600, 115_200, 500_000, 200_000, 250_000, 400_000, 19_200, 9_600),
     ),
     "feetech": BusFamily(
         "Feetech",
-        f"{_CHAIN}.bus:FeetechBus",
+        f"{_CHAIN}.protocol1:FeetechBus",
         ("feetech", 1),
         link=f"{_CHAIN}.protocol1:FeetechLink",
         bauds=(1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),

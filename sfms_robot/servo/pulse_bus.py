@@ -207,7 +207,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
         """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` comes."""
         servo, new = self._servos[index], index not in self._enabled
-        self._powered |= {index}
+        self._powered |= {servo.id}
         self._resting -= {servo.id}
         pulse = self._pulses.get(servo.id, 0)
         if pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
@@ -327,7 +327,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             if wire.port.now_s() >= until_s:
                 break
             on = self._still_on(wire)
-            self._powered = frozenset(i for i in self._powered if self._channels[i] in on)
+            self._powered &= on
             if not on:
                 return True
             self._send_off(restarted)

@@ -19,11 +19,13 @@ class Way:
 
     can_reboot = True
 
-    def __init__(self):
+    def __init__(self, **safety):
+        self.servo = bus_servo("jaw", 4, load_firmware_map("xl330-m288"), safety=Safety(**safety))
+        self.table = Table.of(self.servo.map)
         self.failure = None
         self.asked = []
 
-    def bring_back(self, index, reboot):
+    def bring_back(self, reboot):
         self.asked.append(reboot)
         yield 0.5 if reboot else 0.0
         if self.failure is not None:
@@ -43,9 +45,8 @@ def member(way):
 
 def made(way, **safety):
     """An enabled servo."""
-    servo = bus_servo("jaw", 4, load_firmware_map("xl330-m288"), safety=Safety(**safety))
-    member = Member(0, servo, Table.of(servo.map), Faults(), {})
-    member.attach(way)
+    way.servo = Way(**safety).servo
+    member = Member(0, way, Faults(), {})
     member.connected(True)
     member.enabled()
     return member

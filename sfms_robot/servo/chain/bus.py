@@ -12,18 +12,6 @@ Four promises:
 4. Torque off is written before any request, to all servos at once, and then again until it is confirmed.
 
 Follow a lost answer through three files: `poll` notices it, `member` decides what it means, and this file acts on it.
-
-The families:
-
-    Dynamixel 2.0   One fast sync read (all answer in one packet) while that works, else a plain sync read. A watchdog
-                    that stops the servo is armed after the first goal, fed by the goals themselves, and switched off
-                    after the torque at the end.
-    Dynamixel 1.0   MX servos answer a bulk read, one request for all. AX servos do not, nor does a bus with one of
-                    them: there servos are read one by one, in rotation. The bus finds out when it connects.
-    Feetech         STS and SMS (low byte first) answer a sync read. SCS (high byte first) do not reliably, so they
-                    are read one by one, in rotation.
-
-Servos of the last two families switch their torque on when they get a goal: withholding goals keeps a limp one limp.
 """
 
 from __future__ import annotations
@@ -48,10 +36,8 @@ from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
 from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member
 from sfms_robot.servo.chain.poll import TURN_S, StatusPoll
-from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink, Protocol1Startup
-from sfms_robot.servo.chain.protocol2 import Dynamixel2Link, Dynamixel2Startup
 from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
-from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup
+from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -65,7 +51,6 @@ _ROUNDS: Final = 20  # of asking them; each takes a mute servo's patience
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
 _EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
 _SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
-_GROUP_TRIAL_S: Final = 0.05
 _WATCHDOG_TICK_S: Final = 0.02
 _STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
 _NO_PLACES: Final = np.zeros(0, np.intp)
@@ -106,23 +91,27 @@ class ChainBus(WireBus[RegisterLink]):
         config = config or BusConfig(family="dynamixel2", baud=baud)
         self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
-        self._tables = [Table.of(servo.map) for servo in servos]
+        tables = [Table.of(servo.map) for servo in servos]
         self._ids = np.array([servo.id for servo in servos])
-        self._telemetry = Telemetry(name, *self.maps, self._tables, conversion)
+        self._telemetry = Telemetry(name, *self.maps, tables, conversion)
         self._faults: dict[str, None] = {}  # reported so far, for the statistics
-        each = enumerate(zip(servos, self._tables, strict=True))
-        self._members = [Member(i, servo, table, faults or Faults(), self._faults) for i, (servo, table) in each]
+        self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
+        self._startups = [
+            self.startup(servo, table, needs, self._warnings, self._coming_back)
+            for servo, table, needs in zip(servos, tables, needs_of(servos, conversion), strict=True)
+        ]
+        self._members = [Member(i, each, faults or Faults(), self._faults) for i, each in enumerate(self._startups)]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
-        self._settings = Settings(self._members, self._tables, self._telemetry.torque)
+        self._settings = Settings(self._members, self._telemetry.torque)
         self._enabled = False
         self._places: NDArray[np.intp] = _NO_PLACES  # members that get goals
         self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
         self._arrived: list[Member] = []  # members that came to hold a position in this poll
         self._stamp_s = 0.0
         self._peak_mA = 0.0
+        self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]
         self._release_packet = b""
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
-        self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._asked: deque[tuple[int, bool]] = deque()  # released, or resumed (True); not yet passed to members
         self._sending = RLock()
         goal = self._telemetry.goal
@@ -141,12 +130,6 @@ class ChainBus(WireBus[RegisterLink]):
     def _open(self) -> RegisterLink:
         return self.link(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _begin(self, link: RegisterLink, tries: int = TRIES) -> Startup:
-        servos, tables = self._servos, self._tables
-        return self.startup(
-            self.name, link, servos, tables, self._conversion, self._baud, tries=tries, warnings=self._warnings
-        )
-
     # --- start --------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
@@ -158,17 +141,18 @@ class ChainBus(WireBus[RegisterLink]):
         link = self._open()
         try:
             self._warnings.clear()
-            bits = self._begin(link).run()
+            for startup in self._startups:
+                startup.attach(link)
+            bits = start_up(self.name, link, self._startups, self._baud)
             present = [self._servos[index].id for index in bits]
             self._read_deadline_s = link.adapt(present[0], *self._telemetry.position)
             self._poll.read_deadline_s = self._read_deadline_s
             self._telemetry.forget()
-            released = [servo.id for servo in self._servos if servo.safety.stop == "release"]
-            self._release_packet = self._packet_off(released)
-            self._attach(link)
+            self._release_packet = self._packet_off(self._released_ids)
+            self._now_s = link.port.now_s
             for member in self._members:
                 member.connected(member.index in bits)
-            self._find_reads(link, present)
+            self._poll.find_reads(link, present, self._startups[0].table.byte_order == "little")
             self._wrote_s = math.inf
             self._stamp_s = link.port.now_s()
             self._poll.measure(link, self._stamp_s)
@@ -182,30 +166,8 @@ class ChainBus(WireBus[RegisterLink]):
         self._powered, self._released = frozenset(), False
         self._enabled, self._link = False, link
 
-    def _attach(self, link: RegisterLink) -> None:
-        self._now_s = link.port.now_s
-        startup = self._begin(link, tries=1)
-        startup.others = lambda: [member.index for member in self._members if member.comes_back]
-        self._settings.attach(startup)
-        for member in self._members:
-            member.attach(startup)
-
-    def _find_reads(self, link: RegisterLink, present: list[int]) -> None:
-        """Find out how the servos that answered can be read together."""
-        if link.has_fast_read:
-            wanted, position = self._config.fast_read, self._telemetry.position
-            fast = wanted == "on"
-            if wanted == "auto":
-                fast = len(link.read_many(*position, present, fast=True)) == len(present)
-            self._poll.restart(grouped=True, fast=fast, proven=wanted == "auto")
-            return
-        grouped = self._tables[0].byte_order == "little"
-        if grouped:
-            with link.patient(_GROUP_TRIAL_S):
-                grouped = len(link.read_many(*self._telemetry.block, present)) == len(present)
-            if not grouped:
-                log.info("bus %r: not every servo answers a request for several: they are read one by one", self.name)
-        self._poll.restart(grouped)
+    def _coming_back(self) -> list[Startup]:
+        return [member.startup for member in self._members if member.comes_back]
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Switch torque on for `joints` without a jump, one after the other; return the angles held, rad.
@@ -219,22 +181,21 @@ class ChainBus(WireBus[RegisterLink]):
         meanwhile, BusError if `torque_off` comes meanwhile; others may then have torque, so call `stop`.
         """
         link = self._connected()
-        startup = self._begin(link)
         self._released = False
         self._asked.clear()
         held = []
         for joint in joints:
             index = self.joints.index(joint)
-            member = self._members[index]
+            member, startup = self._members[index], self._startups[index]
             if not member.listed:
                 member.awaited()
                 held.append(member.servo.nearest_to_zero_rad)
                 log.warning("%s does not answer; it comes in when it does", member.servo)
                 continue
-            self._forget(index)
-            self._powered |= {index}
-            with link.patient(PATIENCE_S):
-                steps = startup.torque_on(index) if member.identified else startup.bring_back(index, reboot=False)
+            self._forget(member)
+            self._powered |= {member.id}
+            with link.patient(PATIENCE_S, TRIES):
+                steps = startup.torque_on() if member.identified else startup.bring_back(reboot=False)
                 self._telemetry.ticks[index] = finish(steps, partial(self._wait_enabling, link, joint))
             self._wait_enabling(link, joint, 0.0)
             member.enabled()
@@ -244,9 +205,9 @@ class ChainBus(WireBus[RegisterLink]):
         self._update_places()
         return np.array(held)
 
-    def _forget(self, index: int) -> None:
+    def _forget(self, member: Member) -> None:
         """Forget what was changed on a servo that is, or was, prepared again: its watchdog is off, too."""
-        self._settings.forget(index)
+        self._settings.forget(member.id)
         self._fed = None
 
     def _wait_enabling(self, link: RegisterLink, joint: str, duration_s: float) -> None:
@@ -259,14 +220,7 @@ class ChainBus(WireBus[RegisterLink]):
     def _hold(self, index: int) -> float:
         """Return the angle of a servo that holds where it stands; its range now reaches there."""
         angle = float(self._conversion.to_rad(self._telemetry.ticks)[index])
-        if not self._goals.hold(index, angle):
-            servo = self._servos[index]
-            stands, low, high = np.degrees([angle, servo.min_rad, servo.max_rad]).round(1)
-            log.warning(
-                "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
-                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
-                servo, stands, low, high,
-            )  # fmt: skip
+        self._goals.hold(index, angle)
         return angle
 
     # --- torque off, and on again -------------------------------------------------------------------------------
@@ -298,7 +252,7 @@ class ChainBus(WireBus[RegisterLink]):
     def _packet_off(self, ids: Iterable[int]) -> bytes:
         """Return torque off for servos in one packet; empty for none."""
         torque = self._telemetry.torque
-        values = {servo: torque.to_bytes(0) for servo in ids}
+        values = dict.fromkeys(ids, torque.to_bytes(0))
         return self.link.sync_write_packet(torque.address, values) if values else b""
 
     def _send_at_once(self, packet: bytes) -> None:
@@ -339,8 +293,8 @@ class ChainBus(WireBus[RegisterLink]):
             link = self._open_again()  # perhaps it has just come back
         if link is None:
             return
-        limp = [i for i, servo in enumerate(self._servos) if policy == "release" and servo.safety.stop == "release"]
-        torque, watchdog = self._telemetry.torque, self._tables[0].role(BUS_WATCHDOG)
+        limp = self._released_ids if policy == "release" else []
+        torque, watchdog = self._telemetry.torque, self._startups[0].table.role(BUS_WATCHDOG)
         self._write_off(link, torque, limp)
         if watchdog is not None:
             self._write_off(link, watchdog, armed)
@@ -348,41 +302,41 @@ class ChainBus(WireBus[RegisterLink]):
         with link.patient(_STOP_PATIENCE_S), link.within(budget_s, budget_s):
             self._powered -= self._confirm_off(link, torque, limp)
             if watchdog is not None:
-                self._confirm_off(link, watchdog, [i for i in armed if i not in limp])
+                self._confirm_off(link, watchdog, [servo for servo in armed if servo not in limp])
 
     def _stop_members(self) -> None:
         self._settings.clear()
         for member in self._members:
             member.stopped()
 
-    def _write_off(self, link: RegisterLink, field: Field, indices: Iterable[int]) -> None:
-        values = {self._servos[i].id: field.to_bytes(0) for i in indices}
+    def _write_off(self, link: RegisterLink, field: Field, ids: Iterable[int]) -> None:
+        values = dict.fromkeys(ids, field.to_bytes(0))
         if values:
             self._attempt(lambda: link.sync_write(field.address, values))
 
-    def _confirm_off(self, link: RegisterLink, field: Field, indices: Sequence[int]) -> frozenset[int]:
+    def _confirm_off(self, link: RegisterLink, field: Field, ids: Sequence[int]) -> frozenset[int]:
         """Read a register of all back, and write 0 again to those that do not report 0; return those that do.
 
         The servo that is asked first in one round is asked last in the next: behind a dead servo the others are silent.
         """
-        rest, where, off = list(indices), (field.address, field.size), field.to_bytes(0)
-        for _ in range(len(indices) + _ROUNDS):
+        rest, where, off = list(ids), (field.address, field.size), field.to_bytes(0)
+        for _ in range(len(ids) + _ROUNDS):
             if not rest or not link.affords(link.framing.reads(1, field.size)):
                 break
-            ids = [self._servos[i].id for i in rest]
-            got = self._attempt(partial(self._poll.read_some, link, "stop", where, ids))
+            got = self._attempt(partial(self._poll.read_some, link, "stop", where, rest))
             if got is None:
                 break  # the port is gone
-            rest = [i for i, servo in zip(rest, ids, strict=True) if servo not in got or got[servo].data != off]
+            rest = [servo for servo in rest if servo not in got or got[servo].data != off]
             rest = rest[1:] + rest[:1]
             self._write_off(link, field, rest)
-        for index in sorted(rest):
-            log.warning("%s does not confirm that its %s is off", self._servos[index], field.name)
-        return frozenset(indices).difference(rest)
+        for servo in self._servos:
+            if servo.id in rest:
+                log.warning("%s does not confirm that its %s is off", servo, field.name)
+        return frozenset(ids).difference(rest)
 
     def close(self) -> None:
         """Close the port; watchdogs that are still on are switched off, so that a held pose stays held."""
-        link, watchdog = self._link, self._tables[0].role(BUS_WATCHDOG)
+        link, watchdog = self._link, self._startups[0].table.role(BUS_WATCHDOG)
         if link is not None and watchdog is not None:
             self._write_off(link, watchdog, self._settings.changed(BUS_WATCHDOG))
         self._enabled = False
@@ -433,7 +387,7 @@ class ChainBus(WireBus[RegisterLink]):
         link.sync_write_block(goal.address, self._streamed[1], goal.size, data)
         if self._watchdog and places is not self._fed:
             self._fed = places
-            self._settings.arm(places.tolist(), self._watchdog)
+            self._settings.arm(self._streamed[1], self._watchdog)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Return whether a rejoining member gets goals from now on."""
@@ -510,12 +464,12 @@ class ChainBus(WireBus[RegisterLink]):
                 if not link.grants("return", longest, alone=True, late_s=AWAY_LATE_S):
                     return
                 left -= 1
-                self._powered |= {member.index}
+                self._powered |= {member.id}
                 member.step(now_s)
                 if member.rejoined:
                     self._counts["reconnects"] += not member.recalled
                     self._arrived.append(member)
-                    self._forget(member.index)
+                    self._forget(member)
                     self._telemetry.ticks[member.index] = member.stands_ticks
                     self._telemetry.seen_s[member.index] = member.stands_s
                 elif member.job is None or not link.judged:
@@ -530,30 +484,7 @@ class ChainBus(WireBus[RegisterLink]):
 
     def _returned(self, link: RegisterLink, now_s: float) -> None:
         """Ask every member alone first."""
-        self._attach(link)
+        self._now_s = link.port.now_s
         for member in self._members:
+            member.startup.attach(link)
             member.suspect(link.port.now_s(), pause_s=0.0)
-
-
-class Dynamixel2Bus(ChainBus):
-    """A bus of Dynamixel servos of Protocol 2.0, in position mode."""
-
-    maps = "dynamixel", 2
-    link = Dynamixel2Link
-    startup = Dynamixel2Startup
-
-
-class Dynamixel1Bus(ChainBus):
-    """A bus of Dynamixel servos of Protocol 1.0: AX, and MX with their old firmware."""
-
-    maps = "dynamixel", 1
-    link = Dynamixel1Link
-    startup = Protocol1Startup
-
-
-class FeetechBus(ChainBus):
-    """A bus of Feetech servos, all of one byte order."""
-
-    maps = "feetech", 1
-    link = FeetechLink
-    startup = Protocol1Startup

@@ -64,6 +64,7 @@ class RegisterLink(ABC):
     Attributes:
         framing: bytes of its packets.
         has_fast_read: whether servos can answer in one packet.
+        tries: how often a startup asks before a servo counts as silent; 1 while the bus is running.
         judged: whether the last request waited for the full silence. Inside `within` it may not have, and then a servo
             that did not answer may still be there.
     """
@@ -74,6 +75,7 @@ class RegisterLink(ABC):
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         self.port = port
         self.silence_s = silence_s
+        self.tries = 1
         self.judged = True
         self._byte_s = BITS / baud
         self._end_s = math.inf
@@ -132,13 +134,14 @@ class RegisterLink(ABC):
     # --- time ---------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def patient(self, silence_s: float) -> Iterator[None]:
-        """Wait at least `silence_s` for answers inside the block."""
-        usual, self.silence_s = self.silence_s, max(self.silence_s, silence_s)
+    def patient(self, silence_s: float, tries: int = 1) -> Iterator[None]:
+        """Wait at least `silence_s` for answers inside the block, and let a startup ask `tries` times."""
+        usual = self.silence_s, self.tries
+        self.silence_s, self.tries = max(self.silence_s, silence_s), tries
         try:
             yield
         finally:
-            self.silence_s = usual
+            self.silence_s, self.tries = usual
 
     @contextmanager
     def within(self, budget_s: float, silence_s: float) -> Iterator[None]:

@@ -29,8 +29,7 @@ from sfms_robot.config import Faults
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.link import Silent, Steps
 from sfms_robot.servo.chain.startup import Startup
-from sfms_robot.servo.policy import BusServo, counts, load_rules
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.policy import counts, load_rules
 
 log = logging.getLogger(__name__)
 
@@ -82,8 +81,7 @@ class Member:
 
     Args:
         index: place in the bus.
-        servo: joint, id, limits and safety.
-        table: its control table.
+        startup: starts it up; has its joint, id, limits, safety and control table.
         faults: which of its faults count.
         reported: faults of the bus, `joint: fault` in the order of appearance, for the report; each is logged once.
 
@@ -101,11 +99,11 @@ class Member:
         mismatch: registers that do not hold what was written, in words.
     """
 
-    def __init__(self, index: int, servo: BusServo, table: Table, faults: Faults, reported: dict[str, None]) -> None:
+    def __init__(self, index: int, startup: Startup, faults: Faults, reported: dict[str, None]) -> None:
         self.index = index
-        self.id = servo.id
-        self.servo = servo
-        self.table = table
+        self.startup = startup
+        self.servo = startup.servo
+        self.id = self.servo.id
         self.identified = False
         self.state = State.OFF
         self.torque_seen: bool | None = None
@@ -119,13 +117,12 @@ class Member:
         self._faults = faults
         self._reported = reported
         self._ignored: set[str] = set()  # faults that do not count, each logged once
-        self._startup: Startup | None = None
         self._bits = 0
         self._named: list[str] = []  # faults it reports, those that count
         self._trouble: str | None = None  # any other fault
         self._back_s = math.inf  # when a limp one may come back
         self._attempts_s: list[float] = []
-        self._rules = load_rules(servo)
+        self._rules = load_rules(self.servo)
         self._over_s: dict[str, float] = {}  # since when a rule is broken
         self.lowest_mA = min((rule.current_mA for _, rule in self._rules), default=math.inf)
         self._forget_silence(True)
@@ -171,10 +168,6 @@ class Member:
         return "; ".join(filter(None, (", ".join(self._named) or self._trouble, self.mismatch))) or None
 
     # --- start and stop -----------------------------------------------------------------------------------------
-
-    def attach(self, startup: Startup) -> None:
-        """Use this startup, over the wire in use from now on."""
-        self._startup = startup
 
     def connected(self, there: bool) -> None:
         """Note that `connect` has identified and prepared it, or (not `there`) that it did not answer."""
@@ -292,7 +285,8 @@ class Member:
         if not bits and not self._bits:
             return
         self._bits = bits
-        texts = self.table.faults if self.table.protocol == 2 else self.table.status_faults
+        table = self.startup.table
+        texts = table.faults if table.protocol == 2 else table.status_faults
         names = []
         for name in (texts.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1):
             if counts(name, self._faults, measured):
@@ -390,7 +384,7 @@ class Member:
 
     def accepts(self, goal_ticks: int) -> bool:
         """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
-        if abs(goal_ticks - self.stands_ticks) > NEAR * self.table.ticks_per_revolution:
+        if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
         self.state = State.ONLINE
         return True
@@ -417,7 +411,7 @@ class Member:
         elif policy == "reduce":
             if self.state is not State.FAULTY:  # one that holds got no goals: the next may be far from where it stands
                 self.state = State.REDUCED
-        elif policy == "reboot_and_ease_in" and self._startup is not None and self._startup.can_reboot:
+        elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)
         else:
             self._release(now_s + limp_s)
@@ -442,11 +436,9 @@ class Member:
 
     def _return(self, due_s: float, reboot: bool = False) -> None:
         self._drop_job()
-        if self._startup is None:
-            raise ServoError(f"{self.servo} has no wire to come back on")
         self.state = State.REBOOTING if reboot else State.RETURNING
         self.torque_seen = None
-        self.job, self.job_due_s = self._startup.bring_back(self.index, reboot), due_s
+        self.job, self.job_due_s = self.startup.bring_back(reboot), due_s
         self.stands_s = None
 
     def _drop_job(self) -> None:

@@ -58,6 +58,7 @@ _HEALTH_POLLS: Final = 5  # between two reads of torque and error status, if sev
 _HEALTH_SHARE: Final = 8  # servos in one such read
 _ALERTS_READ: Final = 2  # per poll
 _IN_TURN_SHARE: Final = 0.6  # of a tick that reading servos one by one may take
+_GROUP_TRIAL_S: Final = 0.05
 _TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answer
 
 
@@ -108,7 +109,7 @@ class StatusPoll:
         self.read_deadline_s = config.read_deadline_ms / 1e3
         self._tells = {each.id for each in members if telemetry.currents[each.index] is not None}
         # Bits of an answer's error byte that are about the servo; the others are about the request.
-        status_bits = [sum(1 << bit for bit in member.table.status_faults) for member in members]
+        status_bits = [sum(1 << bit for bit in member.startup.table.status_faults) for member in members]
         self._error_bits = status_bits if telemetry.error is None else [ALERT] * len(members)
         self.restart(grouped=False)
 
@@ -130,6 +131,25 @@ class StatusPoll:
         self._missing = set(self._ids)  # ids of members that have to be notified when they answer
         self._answered: list[int] = []  # ids that answered in this poll, and may be asked for more
         self._plan()
+
+    def find_reads(self, link: RegisterLink, present: list[int], group: bool) -> None:
+        """Find out how the servos that answered, `present`, can be read together, and begin with this connection.
+
+        `group`: one request for several is worth a try. All servos with fast reads answer it.
+        """
+        if link.has_fast_read:
+            wanted, position = self._config.fast_read, self._telemetry.position
+            fast = wanted == "on"
+            if wanted == "auto":
+                fast = len(link.read_many(*position, present, fast=True)) == len(present)
+            self.restart(grouped=True, fast=fast, proven=wanted == "auto")
+            return
+        if group:
+            with link.patient(_GROUP_TRIAL_S):
+                group = len(link.read_many(*self._telemetry.block, present)) == len(present)
+            if not group:
+                log.info("bus %r: not every servo answers a request for several: they are read one by one", self._bus)
+        self.restart(group)
 
     def _plan(self) -> None:
         """Compute how many whole blocks fit into a tick, and the budget of a poll."""

@@ -1,4 +1,4 @@
-"""Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests and answers over a port, and their startup.
+"""Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
 
 The vendor's SDK builds the Dynamixel packets (`sdk_packets`), our codec those of Feetech, which has other instructions.
 
@@ -9,7 +9,7 @@ the servo is first asked for data of another length (a fence). It answers in ord
 nothing older can come.
 
 These servos switch their torque on when a goal is written, so the first goal written is always the present position.
-They have no reboot, and report their faults in every answer.
+Withholding goals keeps a limp one limp. They have no reboot, and report their faults in every answer.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import ClassVar, Final
 
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import PacketError, ServoError
+from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
 from sfms_robot.servo.chain.sdk_packets import SdkPackets1
 from sfms_robot.servo.chain.startup import Startup
@@ -255,73 +256,97 @@ class Protocol1Startup(Startup):
     can_reboot = False
     unlimited = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")
 
-    def _ping(self, index: int) -> Found | None:
-        who = super()._ping(index)
+    def ping(self) -> Found | None:
+        who = super().ping()
         if who is not None and who.model_number is None:
-            self._acknowledge(index)
+            self._acknowledge()
             return None
         return who
 
-    def _acknowledge(self, index: int) -> None:
+    def _acknowledge(self) -> None:
         """Raise its status level, unconfirmed: while that is low, it answers pings and nothing else."""
-        servo, lock = self._servos[index].id, self.tables[index].role("lock")
-        level = self._field(index, "status_level")
+        servo, lock = self.servo.id, self.table.role("lock")
+        level = self._field("status_level")
         if lock is not None:
             self._link.write(servo, lock.address, lock.to_bytes(0))
         self._link.write(servo, level.address, level.to_bytes(level.high))
         if lock is not None:
             self._link.write(servo, lock.address, lock.to_bytes(1))
 
-    def prepare(self, index: int) -> Steps[int]:
-        level = self._field(index, "status_level")
-        if self.value(index, level) != level.high:
-            self._acknowledge(index)
+    def prepare(self) -> Steps[int]:
+        level = self._field("status_level")
+        if self.value(level) != level.high:
+            self._acknowledge()
         yield 0.0
-        now = yield from self._snapshot(index, self.tables[index].size)
-        now = yield from self._release_outside(index, now)
-        for name, target in self._settings(index, now).items():
-            if name == self._name(index, "torque_limit") and not now[name]:
+        now = yield from self._snapshot(self.table.size)
+        now = yield from self._release_outside(now)
+        for name, target in self._settings(now).items():
+            if name == self._name("torque_limit") and not now[name]:
                 continue  # a torque limit of 0 is a shutdown, and stays until the goal is the present position
-            yield from self._set(index, now, name, target)
+            yield from self._set(now, name, target)
         return 0
 
-    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
-        number = self.tables[index]["model_number"]
-        self._recognise(index, Found(self.value(index, number), None))
+    def bring_back(self, reboot: bool) -> Steps[int]:
+        number = self.table["model_number"]
+        self.recognise(Found(self.value(number), None))
         yield 0.0
-        yield from self.prepare(index)
-        return (yield from self.torque_on(index))
+        yield from self.prepare()
+        return (yield from self.torque_on())
 
-    def _settings(self, index: int, now: Mapping[str, int]) -> dict[str, int]:
+    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
         """Return position mode, no delay, no speed limit, and all of its torque unless the head's file says less."""
-        settings = self._corrections(index, now)
-        settings[self._name(index, "return_delay")] = 0
-        limit = self.tables[index].role("torque_limit")
+        settings = self._corrections(now)
+        settings[self._name("return_delay")] = 0
+        limit = self.table.role("torque_limit")
         if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
             settings[limit.name] = now["max_torque"]
-        settings |= self.wanted(index)
+        settings |= self.wanted()
         return {name: target for name, target in settings.items() if name in now}
 
-    def _restore_torque(self, index: int) -> Steps[None]:
+    def _restore_torque(self) -> Steps[None]:
         """Restore the torque limit, which a shutdown sets to 0, also when torque is switched on again."""
-        table, limit = self.tables[index], self.tables[index].role("torque_limit")
-        if limit is None or self.value(index, limit):
+        table, limit = self.table, self.table.role("torque_limit")
+        if limit is None or self.value(limit):
             return
         yield 0.0
-        full = torque_limit(self._servos[index])
+        full = torque_limit(self.servo)
         if not full and "max_torque" in table.fields:
-            full = {limit.name: self.value(index, table["max_torque"])}
+            full = {limit.name: self.value(table["max_torque"])}
         for name, value in full.items():
-            yield from self._write(index, table[name], value)
+            yield from self._write(table[name], value)
 
-    def _write(self, index: int, field: Field, value: int) -> Steps[None]:
+    def _write(self, field: Field, value: int) -> Steps[None]:
         """Write and verify; an error adds the fault that the servo reports."""
         try:
-            yield from super()._write(index, field, value)
+            yield from super()._write(field, value)
         except Silent:
             raise
         except ServoError as error:
-            torque = self._field(index, "torque_enable")
-            answer = self._link.read(self._servos[index].id, torque.address, torque.size)
-            fault = "" if answer is None else self.tables[index].status_fault_names(answer.error)
+            torque = self._field("torque_enable")
+            answer = self._link.read(self.servo.id, torque.address, torque.size)
+            fault = "" if answer is None else self.table.status_fault_names(answer.error)
             raise ServoError(f"{error}, and it reports a hardware error ({fault})" if fault else str(error)) from None
+
+
+class Dynamixel1Bus(ChainBus):
+    """A bus of Dynamixel servos of Protocol 1.0: AX, and MX with their old firmware.
+
+    MX servos answer a bulk read, one request for all. AX servos do not, nor does a bus with one of them: there servos
+    are read one by one, in rotation. The bus finds out when it connects.
+    """
+
+    maps = "dynamixel", 1
+    link = Dynamixel1Link
+    startup = Protocol1Startup
+
+
+class FeetechBus(ChainBus):
+    """A bus of Feetech servos, all of one byte order.
+
+    STS and SMS (low byte first) answer a sync read, one request for all. SCS (high byte first) do not reliably, so they
+    are read one by one, in rotation.
+    """
+
+    maps = "feetech", 1
+    link = FeetechLink
+    startup = Protocol1Startup

@@ -1,4 +1,4 @@
-"""Dynamixel servos of Protocol 2.0: requests and answers over a port, and their startup.
+"""Dynamixel servos of Protocol 2.0: requests and answers over a port, their startup, and their bus.
 
 The vendor's SDK builds what is sent on every tick (`sdk_packets`). A request that is sent again is not built again:
 reads are sent unchanged, and of a sync write only data and crc are new. Single writes are built by our own codec,
@@ -18,6 +18,7 @@ import numpy as np
 from sfms_robot.config import variant
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import ConfigError
+from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
 from sfms_robot.servo.chain.sdk_packets import SdkPackets2
 from sfms_robot.servo.chain.startup import Startup
@@ -202,81 +203,94 @@ class Dynamixel2Startup(Startup):
     can_reboot = True
     unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
 
-    def _recognise(self, index: int, found: Found) -> None:
+    def recognise(self, found: Found) -> None:
         """Raise ServoError for another model; take the table of the firmware that answers."""
-        super()._recognise(index, found)
-        low, high = self.tables[index].firmware
+        super().recognise(found)
+        low, high = self.table.firmware
         if found.firmware is not None and not low <= found.firmware <= high:
             try:
-                self.tables[index] = Table.of(variant(self._servos[index].map.model, found.firmware))
+                self.table = Table.of(variant(self.servo.map.model, found.firmware))
             except ConfigError as error:
-                raise self._error(index, f"has firmware {found.firmware}: {error}") from error
+                raise self._error(f"has firmware {found.firmware}: {error}") from error
 
-    def prepare(self, index: int) -> Steps[int]:
-        table = self.tables[index]
+    def prepare(self) -> Steps[int]:
+        table = self.table
         if (level := table.role("status_level")) is not None:
             # Status return level 2, unconfirmed: at level 0 a servo answers pings and nothing else.
-            self._link.sync_write(level.address, {self._servos[index].id: level.to_bytes(2)})
-        now = yield from self._clear_turns(index, (yield from self._state(index)))
-        now = yield from self._release_outside(index, now)
-        for name, target in self._settings(index, now).items():
+            self._link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
+        now = yield from self._clear_turns((yield from self._state()))
+        now = yield from self._release_outside(now)
+        for name, target in self._settings(now).items():
             if name not in now:
-                now[name] = self.value(index, table[name])
+                now[name] = self.value(table[name])
                 yield 0.0
-            written = yield from self._set(index, now, name, target)
-            if written and name == self._name(index, "operating_mode"):
-                now = yield from self._state(index)  # another mode resets gains, profile and goals
+            written = yield from self._set(now, name, target)
+            if written and name == self._name("operating_mode"):
+                now = yield from self._state()  # another mode resets gains, profile and goals
         error = table.role("error_status")
         return now[error.name] if error is not None else 0
 
-    def bring_back(self, index: int, reboot: bool) -> Steps[int]:
-        servo = self._servos[index].id
+    def bring_back(self, reboot: bool) -> Steps[int]:
+        servo = self.servo.id
         if reboot:
             answer = self._link.reboot(servo)
             if answer is None:
-                raise Silent(self._about(index, "does not answer to a reboot"))
+                raise Silent(self._about("does not answer to a reboot"))
             if refusal := self._link.refusal(answer):
-                raise self._error(index, f"refuses to reboot: {refusal}")
+                raise self._error(f"refuses to reboot: {refusal}")
             yield _REBOOT_S
         found = self._link.ping(servo)
         if found is None:
-            raise Silent(self._about(index, "does not answer to a ping"))
-        self._recognise(index, found)
+            raise Silent(self._about("does not answer to a ping"))
+        self.recognise(found)
         yield 0.0
-        yield from self.prepare(index)
-        return (yield from self.torque_on(index))
+        yield from self.prepare()
+        return (yield from self.torque_on())
 
-    def _settings(self, index: int, now: Mapping[str, int]) -> dict[str, int]:
+    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
         """Return register values before torque; the mode comes first, since it resets others."""
-        settings = self._corrections(index, now)
+        settings = self._corrections(now)
         settings["drive_mode"] = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
-        settings[self._name(index, "return_delay")] = 0
+        settings[self._name("return_delay")] = 0
         settings["bus_watchdog"] = 0
         if "pwm_limit" in now:  # an earlier run may have left less
             settings["goal_pwm"] = now["pwm_limit"]
-        settings |= self.wanted(index)
-        return {name: target for name, target in settings.items() if name in self.tables[index].fields}
+        settings |= self.wanted()
+        return {name: target for name, target in settings.items() if name in self.table.fields}
 
-    def _clear_turns(self, index: int, now: dict[str, int]) -> Steps[dict[str, int]]:
+    def _clear_turns(self, now: dict[str, int]) -> Steps[dict[str, int]]:
         """Let a servo that was turned by hand past its one turn forget whole turns (CLEAR), at rest without torque.
 
         The shaft stays; only its reading comes back into the turn of position mode.
         """
-        present = self._field(index, "present_position")
-        found = contradictions(now, self.tables[index], self._needs[index])
+        present = self._field("present_position")
+        found = contradictions(now, self.table, self._needs)
         turned = any(each.register == present.name and each.fixable for each in found)
-        if not turned or now[self._name(index, "torque_enable")] or now.get("moving"):
+        if not turned or now[self._name("torque_enable")] or now.get("moving"):
             return now
-        answer = cast(Dynamixel2Link, self._link).clear_turns(self._servos[index].id)
+        answer = cast(Dynamixel2Link, self._link).clear_turns(self.servo.id)
         yield 0.0
         if answer is not None and (refusal := self._link.refusal(answer)):
-            raise self._error(index, f"stands at {now[present.name]}, beyond one turn, and refuses CLEAR: {refusal}")
-        cleared = self.value(index, present)
+            raise self._error(f"stands at {now[present.name]}, beyond one turn, and refuses CLEAR: {refusal}")
+        cleared = self.value(present)
         yield 0.0
-        log.warning("%s", self._about(index, f"was turned past one turn: {now[present.name]} now reads {cleared}"))
+        log.warning("%s", self._about(f"was turned past one turn: {now[present.name]} now reads {cleared}"))
         return {**now, present.name: cleared}
 
-    def _state(self, index: int) -> Steps[dict[str, int]]:
+    def _state(self) -> Steps[dict[str, int]]:
         """Return the values of all registers up to those that report the present."""
-        fields = [field for role in _AT_REST if (field := self.tables[index].role(role)) is not None]
-        return (yield from self._snapshot(index, max(field.address + field.size for field in fields)))
+        fields = [field for role in _AT_REST if (field := self.table.role(role)) is not None]
+        return (yield from self._snapshot(max(field.address + field.size for field in fields)))
+
+
+class Dynamixel2Bus(ChainBus):
+    """A bus of Dynamixel servos of Protocol 2.0, in position mode.
+
+    They are read by one fast sync read (all answer in one packet) while that works, else by a plain sync read. A
+    watchdog that stops the servo is armed after the first goal, fed by the goals themselves, and switched off after the
+    torque at the end.
+    """
+
+    maps = "dynamixel", 2
+    link = Dynamixel2Link
+    startup = Dynamixel2Startup
