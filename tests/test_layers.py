@@ -43,6 +43,8 @@ SHARED_NAMES = {
     "stream": "the listener that plans with SFMS, and that with ARIG",
     "features": "what SFMS is trained on, and what ARIG is trained on",
     "losses": "what SFMS learns by, and what ARIG learns by",
+    "bus": "what all buses share, and the bus of a chain of servos",
+    "protocol1": "bytes of the FF FF frame, and requests over a port",
     "registry": "the kinds of listeners, and those of sources",
     "idle": "what a listener adds to a face at rest, and what a head does without one",
 }

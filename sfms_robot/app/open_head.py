@@ -36,6 +36,8 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.safety import HeatGuard
 from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
+from sfms_robot.runtime.heat import HeatGuard
+from sfms_robot.servo.bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
@@ -216,7 +218,15 @@ def build_bus(
 def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[BusServo]:
     maps = firmware_maps(dict(joints))
     return [
-        BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad, head.safety_of(key), doctor)
+        BusServo(
+            joint=key,
+            id=j.id,
+            map=maps[j.model],
+            min_rad=j.min_rad,
+            max_rad=j.max_rad,
+            safety=head.safety_of(key),
+            doctor=doctor,
+        )
         for key, j in joints.items()
     ]
 

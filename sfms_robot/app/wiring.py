@@ -16,9 +16,8 @@ from sfms_robot.emulator.launch import Chain, EmulatedServo
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
-from sfms_robot.servo.discovery import list_ports, stable_name
+from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
 from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
-from sfms_robot.servo.port_choice import AUTO, choose_ports, parse_ports
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from sfms_robot.emulator.device import Reply
 from sfms_robot.emulator.protocol1_servo import Protocol1Servo
 from sfms_robot.emulator.register_servo import ServoChain
-from sfms_robot.servo.codecs import dxl1, feetech, protocol1
+from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
 
 
@@ -33,17 +33,17 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
         code, params = frame.code, frame.params
         try:
             if code == protocol1.SYNC_WRITE:
-                address, parts = dxl1.sync_write_parts(params)
+                address, parts = protocol1.sync_write_parts(params)
                 for servo_id, data in parts:
                     for servo in _of(listening, servo_id):
                         servo.write(address, data, now_s)
-            elif code == feetech.SYNC_READ:
-                address, length, ids = feetech.sync_read_parts(params)
+            elif code == protocol1.SYNC_READ:
+                address, length, ids = protocol1.sync_read_parts(params)
                 readers = [servo for servo in listening if servo.is_sync_reader]
                 yield from self._group([(servo_id, address, length) for servo_id in ids], readers, now_s)
-            elif code == dxl1.BULK_READ:
+            elif code == protocol1.BULK_READ:
                 readers = [servo for servo in listening if servo.is_bulk_reader]
-                yield from self._group(dxl1.bulk_read_parts(params), readers, now_s)
+                yield from self._group(protocol1.bulk_read_parts(params), readers, now_s)
             elif frame.servo == BROADCAST:
                 for servo in sorted(listening, key=lambda servo: servo.id):
                     answers = list(_single(servo, code, params, now_s))
@@ -90,13 +90,13 @@ def _single(servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> It
         error = servo.action(now_s)
     elif code == protocol1.FACTORY_RESET:
         servo.factory_reset(now_s)
-    elif code == feetech.CALIBRATE_OFFSET and servo.is_sync_reader:
+    elif code == protocol1.CALIBRATE_OFFSET and servo.is_sync_reader:
         torque = servo.table["torque_enable"]
-        error = servo.write(torque.address, torque.to_bytes(feetech.CALIBRATE_HERE), now_s)
-    elif code == feetech.RESET_TURNS and servo.is_sync_reader:
+        error = servo.write(torque.address, torque.to_bytes(protocol1.CALIBRATE_HERE), now_s)
+    elif code == protocol1.RESET_TURNS and servo.is_sync_reader:
         servo.reset_turns(now_s)
     else:
-        error, answers = dxl1.INSTRUCTION, not is_feetech and servo.answers_writes
+        error, answers = protocol1.INSTRUCTION, not is_feetech and servo.answers_writes
     if answers:
         yield _reply(servo, asked, error, data)
 

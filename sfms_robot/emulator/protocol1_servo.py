@@ -15,7 +15,7 @@ from typing import Final
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.protocol1_modes import POSITIONING, Mode, PositionFrame, angle_limits, mode_of, motor_command
 from sfms_robot.emulator.register_servo import RegisterServo, same_baud
-from sfms_robot.servo.codecs import dxl1, feetech
+from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.registers import Field, Table
 
 _CHECK_S: Final = 0.1  # how often it looks whether its motor is overloaded
@@ -80,7 +80,7 @@ class Protocol1Servo(RegisterServo):
         self.advance(now_s)
         end = address + length
         if length == 0 or end > len(self._file.raw):
-            return (0 if self._feetech else dxl1.RANGE), b""
+            return (0 if self._feetech else protocol1.RANGE), b""
         self._measure()
         return 0, bytes(self._file.raw[address:end])
 
@@ -89,12 +89,12 @@ class Protocol1Servo(RegisterServo):
         self.advance(now_s)
         touched = self._file.covered(address, len(data))
         wanted: dict[str, int] = {}
-        error = 0 if touched or self._feetech else dxl1.RANGE
+        error = 0 if touched or self._feetech else protocol1.RANGE
         for field in touched:
             at = field.address - address
             whole = at >= 0 and at + field.size <= len(data)
             value = field.from_bytes(data[at : at + field.size]) if whole else 0
-            bad = dxl1.RANGE if not whole or not field.writable else self._refusal(field, value)
+            bad = protocol1.RANGE if not whole or not field.writable else self._refusal(field, value)
             error |= bad
             if not bad:
                 wanted[field.name] = value
@@ -114,7 +114,7 @@ class Protocol1Servo(RegisterServo):
         kept, self._registered = self._registered, None
         self._show_pending()
         if kept is None:
-            return 0 if self._feetech else dxl1.INSTRUCTION
+            return 0 if self._feetech else protocol1.INSTRUCTION
         return self.write(*kept, now_s)
 
     def factory_reset(self, now_s: float) -> None:
@@ -180,10 +180,10 @@ class Protocol1Servo(RegisterServo):
     def _refusal(self, field: Field, value: int) -> int:
         signed_duty = field.name == "goal_time" and self._mode is Mode.PWM
         if not (-field.high if signed_duty else field.low) <= value <= field.high:
-            return dxl1.RANGE
+            return protocol1.RANGE
         if field.name == "goal_position" and not self._feetech:
             lowest, highest = angle_limits(self._file)
-            return 0 if lowest == highest or lowest <= value <= highest else dxl1.ANGLE_LIMIT
+            return 0 if lowest == highest or lowest <= value <= highest else protocol1.ANGLE_LIMIT
         return 0
 
     def _apply(self, wanted: dict[str, int]) -> None:
@@ -226,7 +226,7 @@ class Protocol1Servo(RegisterServo):
         self._stored = self._stored[: field.address] + bytes(self._file.raw[field.address : end]) + self._stored[end:]
 
     def _torque_written(self, value: int, locked: bool) -> None:
-        if value == feetech.CALIBRATE_HERE and "homing_offset" in self.table.fields:
+        if value == protocol1.CALIBRATE_HERE and "homing_offset" in self.table.fields:
             one_turn = round(self.plant.position % self.table.ticks_per_revolution)
             self._put("homing_offset", one_turn - _CENTER_ON_STS)
             if not locked:

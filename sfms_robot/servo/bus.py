@@ -1,7 +1,7 @@
-"""What every bus does about its wire, whatever hangs on it: refuse bad goals, lose the port and find it again.
+"""What all buses share: checking goals, losing the port and finding it again; and the bus of joints without servos.
 
-A port that fails is closed and opened again, a few times a second, by what its adapter is called; meanwhile nothing is
-sent and nothing is raised. A bus on which nobody has answered for `reconnect_s` has failed.
+A port that fails is closed and opened again a few times a second, by the name of its adapter. Meanwhile nothing is sent
+and nothing is raised. A bus on which no servo has answered for `reconnect_s` has failed.
 """
 
 from __future__ import annotations
@@ -10,19 +10,22 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, PacketError, PortError, RobotError, ServoError
-from sfms_robot.frames import Reading
+from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.servo.goals import Goals
+from sfms_robot.ranges import Range
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 
 
 class Link(Protocol):
-    """Whatever speaks over a port."""
+    """Requests and answers over a port: a `RegisterLink` for servos with registers, a `RateLimitedPort` for boards."""
 
     @property
     def port(self) -> Port: ...
@@ -32,21 +35,91 @@ T = TypeVar("T")
 L = TypeVar("L", bound=Link)
 log = logging.getLogger(__name__)
 
-REOPEN_S: Final = 0.2
+REOPEN_S: Final = 0.2  # between two tries to open a lost port
 RECONNECT_S: Final = BusConfig.model_fields["reconnect_s"].default
+COUNTS: Final = ("writes", "reads", "errors", "retries", "reconnects")  # of the statistics of every bus
+LEFT_OUT: Final = "left out"  # fault of a joint without a servo in this run
+_SLACK_RAD: Final = 1e-9
+
+
+class Goals:
+    """Checks and conversion of the goals of one bus, joints in bus order.
+
+    A goal may be sent if it lies in the range in force of its joint (`sfms_robot.ranges`).
+
+    Args:
+        bus: name of the bus, for messages.
+        servos: in joint order.
+        conversion: joint angles (J,) <-> ticks (J,), affine per joint.
+    """
+
+    def __init__(self, bus: str, servos: Sequence[BusServo], conversion: TickConversion) -> None:
+        self._bus = bus
+        self._servos = tuple(servos)
+        self._conversion = conversion
+        self._own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
+        self._last_rad = self._own.low.copy()  # where each joint was found, or sent last
+        self._lowest, self._highest = self._own.low - _SLACK_RAD, self._own.high + _SLACK_RAD
+        self._outside = False  # a joint was found outside its own range, and may still be there
+        self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
+        self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
+
+    def hold(self, index: int, angle_rad: float) -> None:
+        """Extend the range in force to the angle at which a servo holds, and warn if it is outside its own range."""
+        self._last_rad[index], servo = angle_rad, self._servos[index]
+        if not servo.min_rad <= angle_rad <= servo.max_rad:
+            self._outside = True
+            stands, low, high = np.degrees([angle_rad, servo.min_rad, servo.max_rad]).round(1)
+            log.warning(
+                "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
+                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
+                servo, stands, low, high,
+            )  # fmt: skip
+
+    def allows(self, index: int, goal_rad: float) -> bool:
+        """Return whether a goal lies in the range in force of a servo."""
+        return bool(self._own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
+
+    def ticks(self, goals_rad: Doubles, sent: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Convert goals (J,) to ticks (J,). Those at the indices `sent` (n,) are to be sent, and are checked.
+
+        The range in force of a joint that is sent shrinks to its goal; the others keep theirs. Raises ValueError, with
+        nothing changed, for another shape, a goal that is not finite, or one of `sent` outside its range in force.
+        """
+        if goals_rad.shape != self._last_rad.shape:
+            raise ValueError(f"bus {self._bus!r} has {len(self._servos)} joints, got goals of shape {goals_rad.shape}")
+        if not self._outside and np.logical_and.reduce((goals_rad >= self._lowest) & (goals_rad <= self._highest)):
+            return self._conversion.to_ticks(goals_rad)  # the usual case: every own range is the range in force
+        finite = np.isfinite(goals_rad)
+        if not finite.all():
+            raise ValueError(f"goal of {self._servos[int(np.argmin(finite))].joint} is not finite")
+        in_force = self._own.reaching(self._last_rad)
+        allowed = in_force.holds(goals_rad, _SLACK_RAD)
+        refused = sent[~allowed[sent]]
+        if refused.size:
+            first = int(refused[0])
+            valid = f"{in_force.low[first]:g}..{in_force.high[first]:g} rad"
+            raise ValueError(f"goal of {self._servos[first].joint} = {goals_rad[first]:g} rad is not in {valid}")
+        ticks = self._conversion.to_ticks(goals_rad)
+        # On the way in from outside: the conversion would clip to the limit, so the tick is computed here.
+        for i in np.flatnonzero(~self._own.holds(goals_rad, _SLACK_RAD) & allowed):
+            ticks[i] = round((goals_rad[i] - self._rad_at_zero[i]) / self.rad_per_tick[i])
+        self._last_rad[sent] = in_force.nearest(goals_rad)[sent]
+        self._outside = not self._own.holds(self._last_rad).all()
+        return ticks
 
 
 class WireBus(ABC, Generic[L]):
-    """The part of `ports.Bus` that is about one wire.
+    """The part of `ports.Bus` that all buses with a port share.
 
     Args:
-        name: of the bus, for messages.
+        name: name of the bus, for messages.
         servos: in joint order.
         conversion: joint angles (J,) <-> ticks (J,), affine per joint.
-        open_port: opens the port at `baud`, also again when the device was gone; the bus owns what it returns.
+        open_port: opens the port at `baud`, again after the device was gone; the bus owns what it returns.
         baud: bits per second.
-        read_deadline_s: silence that makes a servo, or a board, silent.
-        reconnect_s: silence of everybody that makes a failed bus.
+        read_deadline_s: time without a byte after which a servo, or a board, counts as silent.
+        reconnect_s: time without any answer after which the bus has failed.
     """
 
     def __init__(
@@ -68,46 +141,48 @@ class WireBus(ABC, Generic[L]):
         self._baud = baud
         self._read_deadline_s = read_deadline_s
         self._reconnect_s = reconnect_s
-        self._counts = {"writes": 0, "reads": 0, "errors": 0, "retries": 0, "reconnects": 0}
+        self._counts = dict.fromkeys(COUNTS, 0)
         self._link: L | None = None
-        self._powered: frozenset[int] = frozenset()  # places whose torque came on and is not confirmed off
+        self._powered: frozenset[int] = frozenset()  # ids whose torque came on and is not confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:
         self._lost_s: float | None = None
         self._tried_s = -math.inf
-        self._heard_s: float | None = None
+        self._answered_s: float | None = None
 
-    # --- what a family adds -------------------------------------------------------------------------------------
+    # --- what a subclass defines --------------------------------------------------------------------------------
 
     @abstractmethod
     def _open(self) -> L:
-        """The port, and who speaks over it."""
+        """Open the port and return the link over it."""
 
     @abstractmethod
     def _ask(self, link: L, now_s: float) -> bool:
-        """A poll's share of questions; whether anybody answered."""
+        """Make the requests of one poll; return whether any was answered."""
 
     @abstractmethod
     def _left(self) -> None:
-        """The port is gone."""
+        """Note that the port is gone."""
 
     @abstractmethod
     def _returned(self, link: L, now_s: float) -> None:
-        """The port is there again; nobody has been asked yet."""
+        """Note that the port is open again; nothing has been sent yet."""
 
     @abstractmethod
-    def _readings(self, now_s: float) -> Mapping[str, Reading]: ...
+    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+        """Return the readings of all joints."""
 
     @abstractmethod
-    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None: ...
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
+        """Switch torque off and confirm it, as `ports.Bus`."""
 
     # --- what all do --------------------------------------------------------------------------------------------
 
     def poll(self, now_s: float) -> Mapping[str, Reading]:
-        """What is known of every joint now; whoever is away is looked after.
+        """Return what is known of every joint, after one poll's share of requests.
 
-        Raises BusError when nobody has answered for so long that the bus has failed.
+        Raises BusError if no servo has answered for so long that the bus has failed.
         """
         if self._lost_s is not None:
             self._reopen(now_s)
@@ -115,20 +190,19 @@ class WireBus(ABC, Generic[L]):
         if link is not None:
             try:
                 if self._ask(link, now_s):
-                    self._heard_s = now_s
+                    self._answered_s = now_s
             except BusError as error:
                 self._lose(error, now_s)
             except (ServoError, PacketError) as error:  # about one servo or one packet: the port is there
-                self._counts["errors"] += 1
-                log.warning("bus %r: %s", self.name, error)
-        if self._heard_s is None:
-            self._heard_s = now_s
-        if now_s - self._heard_s > self._reconnect_s:
-            raise BusError(f"bus {self.name!r}: nobody has answered for {self._reconnect_s:g} s")
+                self._count_error(error)
+        if self._answered_s is None:
+            self._answered_s = now_s
+        if now_s - self._answered_s > self._reconnect_s:
+            raise BusError(f"bus {self.name!r}: no answer from any servo for {self._reconnect_s:g} s")
         return self._readings(now_s)
 
     def close(self) -> None:
-        """Give the port back. Idempotent."""
+        """Close the port. Idempotent."""
         if self._link is not None:
             self._link.port.close()
         self._link = None
@@ -139,7 +213,7 @@ class WireBus(ABC, Generic[L]):
 
         `off`: torque off was sent. Joints that hold on purpose, and those whose torque never came on, are left out.
         """
-        powered = [self._servos[place] for place in sorted(self._powered)] if off else []
+        powered = [servo for servo in self._servos if off and servo.id in self._powered]
         return {"torque_unconfirmed": [servo.joint for servo in powered if servo.safety.stop == "release"]}
 
     def _connected(self) -> L:
@@ -147,17 +221,20 @@ class WireBus(ABC, Generic[L]):
             raise BusError(f"bus {self.name!r} is not connected")
         return self._link
 
+    def _count_error(self, error: RobotError) -> None:
+        self._counts["errors"] += 1
+        log.warning("bus %r: %s", self.name, error)
+
     def _attempt(self, request: Callable[[], T]) -> T | None:
-        """What must not raise: the failure is said and counted."""
+        """Make a request that must not raise; return None if it failed, which is logged and counted."""
         try:
             return request()
         except RobotError as error:
-            self._counts["errors"] += 1
-            log.warning("bus %r: %s", self.name, error)
+            self._count_error(error)
             return None
 
     def _check(self, enabled: bool) -> None:
-        """Raises BusError before `connect`, ValueError before `enable`."""
+        """Raise BusError before `connect`, ValueError before `enable`."""
         if self._lost_s is None:
             self._connected()
         if not enabled:
@@ -187,3 +264,48 @@ class WireBus(ABC, Generic[L]):
             return None  # still gone
         self._lost_s = None
         return self._link
+
+
+class AbsentBus:
+    """`ports.Bus` of joints that have no servo in this run: left out by the user, or not built yet.
+
+    It accepts goals, sends nothing, and marks every joint as left out. It opens no port and never raises.
+
+    Args:
+        servos: in joint order; only joint names and limits count.
+    """
+
+    def __init__(self, servos: Sequence[BusServo]) -> None:
+        self._held = {servo.joint: servo.nearest_to_zero_rad for servo in servos}
+
+    @property
+    def joints(self) -> Sequence[str]:
+        """Return the joint names in the order of `servos`."""
+        return tuple(self._held)
+
+    @property
+    def capabilities(self) -> Mapping[str, frozenset[str]]:
+        """Return nothing for every joint."""
+        return dict.fromkeys(self._held, frozenset[str]())
+
+    def _nothing(self, *arguments: Any, **more: Any) -> None:
+        """Do nothing: there is no servo, and no torque."""
+
+    connect = write = release = resume = torque_off = stop = close = _nothing
+
+    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+        """Return 0 rad for every joint, or the end of its range nearest to 0."""
+        return np.array([self._held[joint] for joint in joints])
+
+    def poll(self, now_s: float) -> Mapping[str, Reading]:
+        """Return a reading without a position for every joint."""
+        return {joint: Reading(None, math.inf, LEFT_OUT) for joint in self.joints}
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the counters of the report."""
+        faults = [f"{joint}: {LEFT_OUT}" for joint in self.joints]
+        return {
+            **dict.fromkeys(("writes", "reads", "errors", "retries", "reconnects"), 0),
+            "silent": [],
+            "faults": faults,
+        }

@@ -1,12 +1,13 @@
 """Several buses as one, addressed by joint in the order of the head.
 
-Where time is real and there are several, each has its own writer thread and rate, so that one at 9600 baud does not
-hold up the others. In virtual time they take their turns, and a run is the same every time.
+In real time each of several buses has its own writer thread and rate, so that one at 9600 baud does not delay the
+others. In virtual time they take turns, and a run is the same every time.
 
-A bus that has failed is said once, by `poll`, and left out from then on: the others go on. Torque off reaches all.
+A bus that has failed is reported once, by `poll`, and left out from then on; the others continue. Torque off reaches
+all.
 
 Goals are limited once, at the rate of the loop, and a slower bus sends every k-th of them. Those keep the limits at its
-own rate as well: finite differences of a curve are averages of its derivatives, however far apart the samples lie.
+own rate too: finite differences of a curve are averages of its derivatives, however far apart the samples are.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,12 +25,93 @@ from numpy.typing import NDArray
 from sfms_robot.errors import BusError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, Bus, StopPolicy
-from sfms_robot.servo.writer import Writer
 
 log = logging.getLogger(__name__)
 
-_TICK_S: Final = 0.1  # of `stop`, for the tick that a writer is in, and for saying torque off
+_TICK_S: Final = 0.1  # of `stop`, for the tick that a writer is in, and for sending torque off
 FAILED: Final = "bus failed"
+
+
+class Writer:
+    """A thread for one bus, from construction until `close`. `raise_failure` raises what ended it.
+
+    The newest goals win: goals that come while a write is in progress replace one another. Nothing is sent that the
+    loop did not ask for: if the loop stops, so does the wire, and the servos' watchdogs see it.
+
+    Args:
+        bus: enabled; no other thread may use it meanwhile, except for `torque_off`.
+        rate_hz: ticks of the bus, however often goals come.
+    """
+
+    def __init__(self, bus: Bus, rate_hz: float) -> None:
+        self._bus = bus
+        self._period_s = 1.0 / rate_hz
+        self._changed = threading.Condition()
+        self._goals: tuple[Doubles, float] | None = None
+        self._readings: Mapping[str, Reading] = {}
+        self._read_s = 0.0
+        self._back: set[str] = set()
+        self._failure: Exception | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"bus of {bus.joints[0]}", daemon=True)
+        self._thread.start()
+
+    def put(self, goals_rad: Doubles, now_s: float) -> None:
+        """Set the goals of the next tick of the bus. Never blocks."""
+        with self._changed:
+            self._goals = goals_rad.copy(), now_s
+            self._changed.notify()
+
+    def raise_failure(self) -> None:
+        """Raise what ended the thread, if anything did."""
+        with self._changed:
+            if self._failure is not None:
+                raise self._failure
+
+    def readings(self, now_s: float) -> Mapping[str, Reading]:
+        """Return the last readings, older by the time since; empty before the first tick of the bus."""
+        with self._changed:
+            later_s = max(0.0, now_s - self._read_s)
+            out = {
+                joint: replace(each, age_s=each.age_s + later_s, rejoined=joint in self._back)
+                for joint, each in self._readings.items()
+            }
+            self._back.clear()
+        return out
+
+    def end(self) -> None:
+        """Send nothing more, without waiting for the tick in progress. Idempotent."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    def close(self, timeout_s: float) -> bool:
+        """Call `end` and wait for the tick in progress, `timeout_s` at most; return whether it is over. Idempotent."""
+        self.end()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._goals is not None)
+                # Not before its time; goals that come meanwhile replace these.
+                self._changed.wait_for(lambda: self._closing, timeout=max(0.0, due_s - time.monotonic()))
+                if self._closing or self._goals is None:
+                    return
+                (goals, now_s), self._goals = self._goals, None
+            due_s = max(due_s + self._period_s, time.monotonic())
+            try:
+                self._bus.write(goals, now_s)
+                readings = self._bus.poll(now_s)
+            except Exception as error:  # raised again in the loop's thread, whatever it is
+                with self._changed:
+                    self._failure = error
+                return
+            with self._changed:
+                self._readings, self._read_s = readings, now_s
+                self._back |= {joint for joint, each in readings.items() if each.rejoined}
 
 
 class CompositeBus:
@@ -37,7 +120,7 @@ class CompositeBus:
     Args:
         buses: by name; together they have exactly `joints`.
         joints: the order of `goals_rad`.
-        rates_hz: of each bus, which then runs in a thread of its own from the first goal on. None: all in turn.
+        rates_hz: rate of each bus, which then runs in a thread from the first goal on. None: all in turn.
     """
 
     def __init__(
@@ -51,8 +134,8 @@ class CompositeBus:
         self._rates_hz = rates_hz
         self._writers: dict[str, Writer] = {}
         self._stops: list[threading.Thread] = []
-        self._failures: dict[str, Exception] = {}  # by bus; said once
-        self._unsaid: list[str] = []
+        self._failures: dict[str, Exception] = {}  # by bus
+        self._unreported: list[str] = []  # of them, those that `poll` has to raise
         self._last: dict[str, Mapping[str, Reading]] = {}
         place = {joint: i for i, joint in enumerate(joints)}
         self._places = {name: np.array([place[j] for j in bus.joints], np.intp) for name, bus in buses.items()}
@@ -62,9 +145,9 @@ class CompositeBus:
         return {joint: what for bus in self._buses.values() for joint, what in bus.capabilities.items()}
 
     def connect(self) -> None:
-        """Connect all; when one fails, those already open are closed again."""
+        """Connect all; if one fails, those already open are closed again."""
         self._failures.clear()
-        self._unsaid.clear()
+        self._unreported.clear()
         try:
             for bus in self._buses.values():
                 bus.connect()
@@ -73,9 +156,9 @@ class CompositeBus:
             raise
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
-        """As `ports.Bus`; one bus after the other, for supplies that dislike many at once.
+        """Enable joints as `ports.Bus`, one bus after the other, for supplies that cannot start many at once.
 
-        A bus that has a thread of its own goes on in a new one. Joints of a bus that has failed count as absent.
+        A bus that has a thread continues in a new one. Joints of a bus that has failed count as absent.
         """
         held: dict[str, float] = dict.fromkeys(joints, 0.0)
         for name, bus in self._working():
@@ -85,7 +168,7 @@ class CompositeBus:
         return np.array([held[joint] for joint in joints])
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """As a single bus, to all that work. What goes wrong in a thread is raised by `poll`."""
+        """Write to all buses that work. What fails in a thread is raised by `poll`."""
         if not np.isfinite(goals_rad).all():
             raise ValueError(f"goal of {self.joints[int(np.argmin(np.isfinite(goals_rad)))]} is not finite")
         refused: ValueError | None = None
@@ -94,17 +177,19 @@ class CompositeBus:
             try:
                 if self._rates_hz is None:
                     bus.write(goals, now_s)
-                else:
-                    self._writer(name, bus).put(goals, now_s)
-            except ValueError as error:  # the others have theirs all the same
+                    continue
+                if name not in self._writers:
+                    self._writers[name] = Writer(bus, self._rates_hz[name])
+                self._writers[name].put(goals, now_s)
+            except ValueError as error:  # the other buses still get their goals
                 refused = refused or error
-            except Exception as error:  # whatever it is, it is this bus's alone
+            except Exception as error:  # whatever it is, it concerns this bus alone
                 self._fail(name, error)
         if refused is not None:
             raise refused
 
     def poll(self, now_s: float) -> Mapping[str, Reading]:
-        """As a single bus. Raises BusError once for a bus that has failed; the next call goes on with the others."""
+        """Return all readings. Raises BusError once for a bus that has failed; the next call polls the others."""
         readings: dict[str, Reading] = {}
         for name, bus in self._buses.items():
             if name not in self._failures:
@@ -116,30 +201,31 @@ class CompositeBus:
                 readings |= {joint: Reading(None, float("inf"), FAILED) for joint in bus.joints}
             else:
                 readings |= self._last[name]
-        if self._unsaid:
-            name = self._unsaid.pop(0)
+        if self._unreported:
+            name = self._unreported.pop(0)
             raise BusError(str(self._failures[name])) from self._failures[name]
         return readings
 
     def release(self, joints: Sequence[str]) -> None:
-        """As `ports.Bus`, on every bus that works, from the caller's thread."""
+        """Release joints as `ports.Bus`, on every bus that works, from the caller's thread."""
         for _, bus in self._working():
             bus.release([joint for joint in joints if joint in bus.joints])
 
     def resume(self, joints: Sequence[str]) -> None:
-        """As `ports.Bus`, on every bus that works."""
+        """Bring joints back as `ports.Bus`, on every bus that works."""
         for _, bus in self._working():
             bus.resume([joint for joint in joints if joint in bus.joints])
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """As `ports.Bus`, on every bus, from the caller's thread."""
+        """Send torque off as `ports.Bus`, on every bus, from the caller's thread."""
         for bus in self._buses.values():
             bus.torque_off(policy)
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
-        """Torque off on all buses first, whatever their writers are doing; then each bus confirms: all at once where
-        they have threads, else one after the other, each in its share of the time. Never raises; `within_s` at most,
-        with threads for a bus that hangs in a system call too.
+        """Send torque off on all buses, whatever their writers are doing; then let each bus confirm it.
+
+        Buses with threads confirm at the same time, others one after the other, each in its share of the time. Never
+        raises; blocks `within_s` at most, with threads also for a bus that hangs in a system call.
         """
         began_s = time.monotonic()
         for writer in self._writers.values():
@@ -152,14 +238,18 @@ class CompositeBus:
             for bus in free.values():
                 bus.stop(policy, (within_s - _TICK_S) / len(free))
             return
-        self._stops = [_begin(bus.stop, policy) for bus in free.values()]
+        self._stops = []
+        for bus in free.values():
+            thread = threading.Thread(target=bus.stop, args=(policy,), daemon=True)
+            thread.start()
+            self._stops.append(thread)
         for name, thread in zip(free, self._stops, strict=True):
             thread.join(max(0.0, began_s + within_s - time.monotonic()))
             if thread.is_alive():
                 log.warning("bus %r: does not confirm in time that its torque is off", name)
 
     def _ended(self, name: str, until_s: float) -> bool:
-        """Whether nobody else uses the bus any more."""
+        """Return whether no thread uses the bus any more."""
         writer = self._writers.get(name)
         if writer is None or writer.close(max(0.0, until_s - time.monotonic())):
             self._writers.pop(name, None)
@@ -168,7 +258,7 @@ class CompositeBus:
         return False
 
     def close(self) -> None:
-        """Give all ports back. Blocks for the tick that a writer is in, `STOP_S` at most."""
+        """Close all ports. Blocks for the tick that a writer is in, `STOP_S` at most."""
         until_s = time.monotonic() + STOP_S
         for writer in self._writers.values():
             writer.end()
@@ -177,7 +267,7 @@ class CompositeBus:
             bus.close()
 
     def statistics(self) -> Mapping[str, Any]:
-        """Return totals, and each bus's own under `buses`."""
+        """Return totals, and the statistics of each bus under `buses`."""
         each = {name: dict(bus.statistics()) for name, bus in self._buses.items()}
         total: dict[str, Any] = {"torque_unconfirmed": []}
         for counts in each.values():
@@ -188,11 +278,6 @@ class CompositeBus:
     def _working(self) -> list[tuple[str, Bus]]:
         return [(name, bus) for name, bus in self._buses.items() if name not in self._failures]
 
-    def _writer(self, name: str, bus: Bus) -> Writer:
-        if name not in self._writers:
-            self._writers[name] = Writer(bus, (self._rates_hz or {})[name])
-        return self._writers[name]
-
     def _read(self, name: str, bus: Bus, now_s: float) -> Mapping[str, Reading]:
         writer = self._writers.get(name)
         if writer is None:
@@ -201,12 +286,6 @@ class CompositeBus:
         return writer.readings(now_s) or {joint: Reading(None, float("inf")) for joint in bus.joints}
 
     def _fail(self, name: str, error: Exception) -> None:
-        log.error("bus %r has failed, the others go on: %s", name, error)
+        log.error("bus %r has failed, the others continue: %s", name, error)
         self._failures[name] = error
-        self._unsaid.append(name)
-
-
-def _begin(stop: Callable[[StopPolicy], None], policy: StopPolicy) -> threading.Thread:
-    thread = threading.Thread(target=stop, args=(policy,), daemon=True)
-    thread.start()
-    return thread
+        self._unreported.append(name)

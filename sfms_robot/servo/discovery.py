@@ -1,32 +1,38 @@
-"""Which serial ports there are, who may and who does use them, and how long their adapters hold bytes back.
+"""Which serial ports there are, which processes hold them, how long their adapters hold bytes back; and `--port`.
 
-Nothing is opened. Which ports there are comes from pyserial's list, which knows macOS and Windows too, and from
-/dev; adapters, lasting names and holders come from /dev, /sys and /proc, whose roots are arguments, so that all of it
-can be tried on a made-up tree.
+No port is opened. The list comes from pyserial, which knows macOS and Windows too, and from /dev; adapters, stable
+names and holders come from /dev, /sys and /proc, whose roots are arguments, so that tests can use trees of their own.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import stat
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 from urllib.parse import urlsplit
 
+from sfms_robot.errors import ConfigError, PortError
+
 DEV: Final = Path("/dev")
 SYS: Final = Path("/sys")
 PROC: Final = Path("/proc")
-NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs behind which servos can be
+AUTO: Final = "auto"
+NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs that can lead to servos
 
 _PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "ttyS*", "rfcomm*", "serial[0-9]")
 _NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
+_NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # a bus and its device; addresses and paths do not begin so
+
+Probe = Callable[[str, str], bool]  # bus, device -> do servos of that bus answer there?
 
 
 @dataclass(frozen=True)
 class SerialDevice:
-    """One serial port. What the adapter does not tell is None.
+    """A serial port. None stands for what the adapter does not report.
 
     Attributes:
         path: device file, as in /dev/ttyUSB0.
@@ -40,6 +46,7 @@ class SerialDevice:
     """
 
     path: str
+    _: KW_ONLY
     by_id: str | None = None
     by_path: str | None = None
     vendor: str | None = None
@@ -60,7 +67,7 @@ class Holder:
 
 
 class ListedPort(Protocol):
-    """What of pyserial's `ListPortInfo` is used."""
+    """The attributes of pyserial's `ListPortInfo` that are read here."""
 
     device: str
     vid: int | None
@@ -70,7 +77,7 @@ class ListedPort(Protocol):
 
 
 def pyserial_ports() -> Iterable[ListedPort]:
-    """Ports by pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows."""
+    """Return pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows."""
     from serial.tools.list_ports import comports
 
     ports: Iterable[ListedPort] = comports()
@@ -80,7 +87,7 @@ def pyserial_ports() -> Iterable[ListedPort]:
 def list_ports(
     dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[ListedPort]] = pyserial_ports
 ) -> list[SerialDevice]:
-    """Serial ports that servos may hang on, by path. A built-in ttyS is left out where no hardware is behind it."""
+    """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware."""
     paths = {os.path.realpath(path) for pattern in _PATTERNS for path in dev.glob(pattern)}
     found = {path: describe(path, dev, sys) for path in paths}
     for port in listed():
@@ -88,11 +95,15 @@ def list_ports(
         path = os.path.realpath(port.device) if is_file else port.device
         known = found.get(path) or (describe(path, dev, sys) if is_file else SerialDevice(path))
         found[path] = _completed(known, port)
-    return [found[path] for path in sorted(found) if not _is_vacant(path, sys)]
+    return [
+        found[path]
+        for path in sorted(found)
+        if _line(sys / "class" / "tty" / os.path.basename(path) / "type") != _NO_UART
+    ]
 
 
 def ports_data() -> list[dict[str, Any]]:
-    """What `port list` shows: per port its facts, `name` to give to --port, `problem` and `holders`, as plain data."""
+    """Return the rows of `port list` as plain data: the facts, `name` to give to --port, `problem` and `holders`."""
     return [
         {
             "name": stable_name(port.path),
@@ -105,23 +116,23 @@ def ports_data() -> list[dict[str, Any]]:
 
 
 def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
-    """What the system tells of a port; `path` may be a link to it. Little is known where there is no /sys."""
+    """Return what the system knows of a port; `path` may be a link to it. Without /sys that is little."""
     if os.name != "posix":
         return SerialDevice(path)
     real = Path(os.path.realpath(path))
-    name = real.name
-    usb = _usb_folder(sys / "class" / "tty" / name / "device")
-    driver = sys / "class" / "tty" / name / "device" / "driver"
-    latency = sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
+    usb = _usb_folder(sys / "class" / "tty" / real.name / "device")
+    driver = sys / "class" / "tty" / real.name / "device" / "driver"
+    latency = sys / "bus" / "usb-serial" / "devices" / real.name / "latency_timer"
     text = _line(latency)
+    vendor, product, serial, description = _usb_facts(usb)
     return SerialDevice(
         path=str(real),
         by_id=_link_to(real, dev / "serial" / "by-id"),
         by_path=_link_to(real, dev / "serial" / "by-path"),
-        vendor=_line(usb / "idVendor") if usb else None,
-        product=_line(usb / "idProduct") if usb else None,
-        serial=_line(usb / "serial") if usb else None,
-        description=_line(usb / "product") if usb else None,
+        vendor=vendor,
+        product=product,
+        serial=serial,
+        description=description,
         driver=os.path.basename(os.path.realpath(driver)) if driver.exists() else None,
         latency_ms=int(text) if text is not None and text.isdigit() else None,
         latency_file=str(latency) if text is not None else None,
@@ -129,10 +140,10 @@ def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
 
 
 def stable_name(device: str, dev: Path = DEV, sys: Path = SYS) -> str:
-    """The name under which the same adapter is found again after it was unplugged, or `device` itself.
+    """Return the name under which an adapter is found again after it was unplugged, or `device` itself.
 
-    By serial number where the adapter has one of its own. Two CH340 have none, and two CP2102 both have 0001: their
-    name by-id is one and the same, and belongs to the one plugged in last. Such adapters go by their USB socket.
+    That is by serial number if the adapter has a unique one. Two CH340 have none, and two CP2102 both have 0001: their
+    by-id names are equal, and the link points to the one plugged in last. Such adapters are named by their USB socket.
     """
     if not device.startswith((str(dev / "tty"), str(dev / "serial" / "by-id"))):
         return device
@@ -142,19 +153,14 @@ def stable_name(device: str, dev: Path = DEV, sys: Path = SYS) -> str:
 
 
 def _has_double(port: SerialDevice, sys: Path) -> bool:
-    """Is another adapter with the same numbers plugged in? Several ports of one adapter have names of their own."""
+    """Return whether another adapter with the same numbers is plugged in; ports of one adapter share its folder."""
     own = _usb_folder(sys / "class" / "tty" / os.path.basename(port.path) / "device")
-    for tty in (sys / "class" / "tty").glob("*"):
-        usb = _usb_folder(tty / "device")
-        if usb is not None and usb != own:
-            numbers = tuple(_line(usb / key) for key in ("idVendor", "idProduct", "serial"))
-            if numbers == (port.vendor, port.product, port.serial):
-                return True
-    return False
+    others = {_usb_folder(tty / "device") for tty in (sys / "class" / "tty").glob("*")} - {own, None}
+    return (port.vendor, port.product, port.serial) in (_usb_facts(usb)[:3] for usb in others)
 
 
 def _completed(device: SerialDevice, port: ListedPort) -> SerialDevice:
-    """With what pyserial knows where /sys does not tell: macOS and Windows have none."""
+    """Add what pyserial knows if /sys has nothing: macOS and Windows have no /sys."""
     said = None if port.description == "n/a" else port.description or None
     return replace(
         device,
@@ -165,12 +171,8 @@ def _completed(device: SerialDevice, port: ListedPort) -> SerialDevice:
     )
 
 
-def _is_vacant(path: str, sys: Path) -> bool:
-    return _line(sys / "class" / "tty" / os.path.basename(path) / "type") == _NO_UART
-
-
 def holders(path: str, proc: Path = PROC) -> list[Holder]:
-    """Processes that have the port open, as far as this user may see; this one is left out."""
+    """Return the processes that have the port open, as far as this user may see; this one is left out."""
     real = os.path.realpath(path)
     found = []
     for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
@@ -180,16 +182,16 @@ def holders(path: str, proc: Path = PROC) -> list[Holder]:
 
 
 def is_address(device: str) -> bool:
-    """socket://, rfc2217:// and the like; everything else is a path, relative ones too."""
+    """Return whether a device is a URL, socket://, rfc2217:// and the like; all others are paths."""
     return "://" in device
 
 
 def access_problem(path: str) -> str | None:
-    """Why this user cannot use `path`, or an address, as a serial port; None when nothing speaks against it."""
+    """Return why this user cannot use a path, or an address, as a serial port; None if no reason is visible."""
     if is_address(path):
         return _address_problem(path)
     if os.name != "posix":
-        return None  # COM3 is no file that could be looked at
+        return None  # COM3 is not a file
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -206,7 +208,7 @@ def access_problem(path: str) -> str | None:
 
 
 def _address_problem(url: str) -> str | None:
-    """What an address lacks: nobody is asked whether it answers."""
+    """Return what an address lacks; no connection is tried."""
     scheme = url.partition("://")[0]
     if scheme not in NETWORKED:
         choices = ", ".join(f"{each}://HOST:PORT" for each in NETWORKED)
@@ -214,23 +216,28 @@ def _address_problem(url: str) -> str | None:
     try:
         parts = urlsplit(url)
         complete = bool(parts.hostname) and parts.port is not None
-    except ValueError:  # a port that is no number, or none that there can be
+    except ValueError:  # a port that is not a number, or out of range
         complete = False
     return None if complete else f"names no host and port to connect to ({scheme}://HOST:PORT)"
 
 
 def group_of(path: str) -> str:
-    """The group whose members may use the port. Example: dialout."""
+    """Return the group whose members may use the port. Example: dialout."""
     try:
         return Path(path).group()
-    except (OSError, KeyError, NotImplementedError):  # Windows knows no groups
+    except (OSError, KeyError, NotImplementedError):  # Windows has no groups
         return "dialout"
 
 
 def _usb_folder(device: Path) -> Path | None:
-    """The USB device that a tty belongs to: the first folder upwards that has an idVendor."""
+    """Return the USB device that a tty belongs to: the first folder upwards that has an idVendor."""
     real = Path(os.path.realpath(device))
     return next((folder for folder in (real, *real.parents) if (folder / "idVendor").is_file()), None)
+
+
+def _usb_facts(usb: Path | None) -> tuple[str | None, ...]:
+    """Return vendor, product, serial number and description of a USB device."""
+    return tuple(_line(usb / key) if usb else None for key in ("idVendor", "idProduct", "serial", "product"))
 
 
 def _link_to(real: Path, folder: Path) -> str | None:
@@ -241,7 +248,7 @@ def _open_files(folder: Path) -> Iterator[str]:
     try:
         entries = os.listdir(folder / "fd")
     except OSError:
-        return  # the process ended, or belongs to somebody else
+        return  # the process ended, or belongs to another user
     for entry in entries:
         try:
             yield os.readlink(folder / "fd" / entry)
@@ -263,3 +270,55 @@ def _line(file: Path) -> str | None:
         return file.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
         return None
+
+
+# --- the text of --port ---------------------------------------------------------------------------------------------
+
+
+def parse_ports(buses: Collection[str], text: str) -> dict[str, str]:
+    """Return the device of each bus from `DEVICE`, for a head of one bus, or `BUS=DEVICE[,BUS=DEVICE]`.
+
+    Raises ConfigError for a bus that is missing, unknown or given twice, and for a device that two buses share.
+    """
+    if text and len(buses) == 1 and "," not in text and not _NAMED.match(text):
+        return dict.fromkeys(buses, text)
+    devices: dict[str, str] = {}
+    for part in text.split(","):
+        name, equals, device = part.partition("=")
+        if not equals or not device or name not in buses:
+            raise _wrong(text, "one device per bus is needed", buses)
+        if name in devices:
+            raise _wrong(text, f"bus {name} is given twice", buses)
+        if device in devices.values():
+            raise _wrong(text, f"{device} is given to two buses", buses)
+        devices[name] = device
+    if missing := [name for name in buses if name not in devices]:
+        raise _wrong(text, f"bus {missing[0]} has no device", buses)
+    return devices
+
+
+def choose_ports(buses: Collection[str], ports: Sequence[SerialDevice], probe: Probe | None = None) -> dict[str, str]:
+    """Return for `--port auto` the one device that each bus can be on, among the USB adapters of `ports`.
+
+    With one adapter and one bus no request is made. Otherwise `probe` asks each adapter for the servos of each bus,
+    and blocks for as long as that takes. Raises PortError without an adapter, and ConfigError naming the adapters if
+    there is a choice.
+    """
+    adapters = [port.path for port in ports if port.vendor is not None]
+    if not adapters:
+        raise PortError("--port auto: no USB serial adapter is plugged in (sfms-robot port list shows every port)")
+    if len(buses) == len(adapters) == 1:
+        return dict.fromkeys(buses, adapters[0])
+    chosen: dict[str, str] = {}
+    for bus in buses:
+        answering = [device for device in adapters if probe is None or probe(bus, device)]
+        if len(answering) != 1 or answering[0] in chosen.values():
+            found = f"{len(answering)} adapters may be" if answering else "no adapter has the servos of"
+            raise ConfigError(f"--port auto: {found} bus {bus} ({', '.join(answering or adapters)}); name one")
+        chosen[bus] = answering[0]
+    return chosen
+
+
+def _wrong(text: str, problem: str, buses: Collection[str]) -> ConfigError:
+    wanted = ",".join(f"{name}=DEVICE" for name in buses) if len(buses) > 1 else f"DEVICE, {next(iter(buses))}=DEVICE"
+    return ConfigError(f"--port {text!r}: {problem} (sim, {AUTO}, {wanted})")

@@ -1,4 +1,4 @@
-"""The table of bus families: what drives each, and what the tools call it. Classes are named, and imported on use.
+"""The table of bus families: the class that drives each, and its name in the tools. Classes are imported on use.
 
 Another package adds a family by an entry point of the group `sfms_robot.buses` (`plugins`): its name is the family's,
 its value loads a `BusFamily`.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from importlib.metadata import EntryPoint
 from typing import Any, Final
@@ -22,38 +22,37 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BusFamily:
-    """Servos, or boards of servos, that are driven alike.
+    """Servos, or boards of servos, that are driven by one class.
 
     Attributes:
-        title: the word for people.
+        title: the name for people.
         bus: "module:class" of its `ports.Bus`, called with (name, servos, conversion, open_port, baud, read_deadline_s)
             and `config`; servos also with `faults`, a board with `confirmed` and `rest_rad` (see `PulseBus`).
         maps: (family, protocol) of its firmware maps; the protocol is None for a board.
-        link: "module:class" of the `RegisterLink` that its tools speak through; None for a board, whose servos have
-            no registers, and for servos that the tools do not talk to.
-        dialect: what that class is told beside port, baud and patience.
-        bauds: bits per second that its servos may be set to, those met most often first.
+        link: "module:class" of the `RegisterLink` of its tools, called with (port, baud, silence_s); None for a board,
+            whose servos have no registers, and for servos that the tools do not support.
+        bauds: bits per second that its servos may be set to, the most frequent first.
         max_id: highest id of a servo.
-        broadcast: whether one ping asks everybody.
+        broadcast: whether one ping reaches all servos.
     """
 
     title: str
     bus: str
     maps: tuple[str, int | None]
+    _: KW_ONLY
     link: str | None = None
-    dialect: tuple[str, ...] = ()
     bauds: tuple[int, ...] = ()
     max_id: int = 253
     broadcast: bool = False
 
     @property
     def board(self) -> bool:
-        """Its servos report nothing, not even where they stand."""
+        """Return whether its servos report nothing, not even their position."""
         return self.maps[1] is None
 
     @property
     def protocol(self) -> int:
-        """Raises ConfigError for a board."""
+        """Return 1 or 2. Raises ConfigError for a board."""
         if self.maps[1] is None:
             raise ConfigError(f"{self.title}: a board speaks no servo protocol")
         return self.maps[1]
@@ -63,7 +62,7 @@ class BusFamily:
         return plug_in(EntryPoint(self.title, self.bus, BUS_GROUP), *arguments, **more)
 
     def link_class(self) -> Any:
-        """Raises ConfigError for a board, and for a family without tools."""
+        """Return the class of its links. Raises ConfigError for a board, and for a family without tools."""
         if self.link is None:
             why = "a board has no registers to read or write" if self.board else "the servo tools do not speak to it"
             raise ConfigError(f"{self.title}: {why}")
@@ -71,38 +70,34 @@ class BusFamily:
 
 
 _CHAIN: Final = "sfms_robot.servo.chain"
-_BOARDS: Final = "sfms_robot.servo.boards"
+_BOARDS: Final = "sfms_robot.servo.pulse_bus"
 _OWN: Final = {
     "dynamixel2": BusFamily(
         "Dynamixel 2.0",
-        f"{_CHAIN}.dynamixel2_bus:Dynamixel2Bus",
+        f"{_CHAIN}.protocol2:Dynamixel2Bus",
         ("dynamixel", 2),
-        f"{_CHAIN}.dynamixel2_link:Dynamixel2Link",
-        (),
-        (1_000_000, 57_600, 4_000_000, 2_000_000, 3_000_000, 115_200, 9_600, 4_500_000),
-        252,
-        True,
+        link=f"{_CHAIN}.protocol2:Dynamixel2Link",
+        bauds=(1_000_000, 57_600, 4_000_000, 2_000_000, 3_000_000, 115_200, 9_600, 4_500_000),
+        max_id=252,
+        broadcast=True,
     ),
     "dynamixel1": BusFamily(
         "Dynamixel 1.0",
-        f"{_CHAIN}.dynamixel1_bus:Dynamixel1Bus",
+        f"{_CHAIN}.protocol1:Dynamixel1Bus",
         ("dynamixel", 1),
-        f"{_CHAIN}.protocol1_link:Protocol1Link",
-        ("dynamixel",),
-        (1_000_000, 57_600, 115_200, 500_000, 200_000, 250_000, 400_000, 19_200, 9_600),
+        link=f"{_CHAIN}.protocol1:Dynamixel1Link",
+        bauds=(1_000_000, 57_600, 115_200, 500_000, 200_000, 250_000, 400_000, 19_200, 9_600),
     ),
     "feetech": BusFamily(
         "Feetech",
-        f"{_CHAIN}.feetech_bus:FeetechBus",
+        f"{_CHAIN}.protocol1:FeetechBus",
         ("feetech", 1),
-        f"{_CHAIN}.protocol1_link:Protocol1Link",
-        ("feetech",),
-        (1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),
-        253,
-        True,
+        link=f"{_CHAIN}.protocol1:FeetechLink",
+        bauds=(1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),
+        broadcast=True,
     ),
-    "maestro": BusFamily("Pololu Maestro", f"{_BOARDS}.maestro_bus:MaestroBus", ("maestro", None)),
-    "ssc32": BusFamily("Lynxmotion SSC-32", f"{_BOARDS}.ssc32_bus:Ssc32Bus", ("ssc32", None)),
+    "maestro": BusFamily("Pololu Maestro", f"{_BOARDS}:MaestroBus", ("maestro", None)),
+    "ssc32": BusFamily("Lynxmotion SSC-32", f"{_BOARDS}:Ssc32Bus", ("ssc32", None)),
 }
 
 
@@ -119,7 +114,7 @@ def families() -> Mapping[str, BusFamily]:
 
 
 def _family_of(entry: EntryPoint) -> BusFamily:
-    """Return the family that a plug-in brings. Raises ConfigError."""
+    """Return the family of a plug-in. Raises ConfigError."""
     if entry.name in _OWN:
         raise plugin_error(entry, "expected a name that no family of sfms-robot has")
     family = plug_in(entry)
@@ -129,7 +124,7 @@ def _family_of(entry: EntryPoint) -> BusFamily:
 
 
 def servo_families() -> Mapping[str, BusFamily]:
-    """Those that have a link, by name: what the servo tools can talk to."""
+    """Return the families that have a link, by name: those that the servo tools support."""
     return {name: family for name, family in families().items() if family.link is not None}
 
 

@@ -1,12 +1,12 @@
-"""What a joint's servo is allowed, and what its troubles lead to: faults and loads judged without a wire.
+"""What a joint's servo may do, and which of its faults and loads are acted upon. No wire is needed to decide that.
 
-A servo reports faults as bits, told by the alert bit of every answer. Not all of them are trouble: a head that runs
-at 7.2 V has the voltage alert set for good. So a fault may be masked, or count only when what is measured lies
-outside a threshold of the head's own.
+A servo reports faults as bits. Not all of them matter: a head that runs at 7.2 V has the voltage fault set all the
+time. So the head's file may mask a fault, or let it count only outside a threshold of its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,12 +17,12 @@ PINCH_SHARE: Final = 0.6  # of the servo's own current limit
 PINCH_S: Final = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BusServo:
-    """One servo of a bus and the joint it moves; the limits are those of the joint.
+    """A servo of a bus and the joint it moves; the limits are those of the joint.
 
     Attributes:
-        doctor: command that mends what the servo stores against the head's file.
+        doctor: command that corrects what the servo stores against the head's file.
     """
 
     joint: str
@@ -33,21 +33,23 @@ class BusServo:
     safety: Safety = field(default_factory=Safety)
     doctor: str = "sfms-robot doctor --port PORT --head HEAD --fix"
 
+    def __str__(self) -> str:
+        return f"{self.joint} (id {self.id})"
 
-@dataclass(frozen=True)
-class Measured:
-    """What is known of one servo beside its fault bits; None where it was not read yet."""
-
-    voltage_V: float | None = None
-    temperature_C: float | None = None
+    @property
+    def nearest_to_zero_rad(self) -> float:
+        """Return 0 rad, or the end of the range nearest to it."""
+        return min(max(0.0, self.min_rad), self.max_rad)
 
 
-def counts(name: str, faults: Faults, seen: Measured) -> bool:
-    """Whether fault `name` is acted upon. A threshold whose quantity is not known yet does not excuse it."""
+def counts(name: str, faults: Faults, measured: Mapping[str, float]) -> bool:
+    """Return whether fault `name` is acted upon.
+
+    `measured`: by fault, the value that its threshold is compared with. A fault whose value is not known yet counts.
+    """
+    threshold, value = faults.thresholds.get(name), measured.get(name)
     if name in faults.mask:
         return False
-    threshold = faults.thresholds.get(name)
-    value = {"input voltage": seen.voltage_V, "overheating": seen.temperature_C}.get(name)
     if threshold is None or value is None:
         return True
     low = threshold.min is not None and value < threshold.min
@@ -56,19 +58,19 @@ def counts(name: str, faults: Faults, seen: Measured) -> bool:
 
 
 def register_of(table: FirmwareMap, role: Role) -> str | None:
-    """Name of the register that plays a role; None where the model has none."""
+    """Return the name of the register that plays a role; None if the model has none."""
     name = table.roles.get(role, role)
     return name if name in table.registers else None
 
 
 def tells_current(table: FirmwareMap) -> bool:
-    """Whether the model tells its present current in mA."""
+    """Return whether the model reports its present current in mA."""
     name = register_of(table, "present_current")
     return name is not None and table.registers[name].unit == "mA"
 
 
 def torque_register(table: FirmwareMap) -> str | None:
-    """Name of the register, in percent, that bounds the torque; the PWM where the model has no other.
+    """Return the name of the register, in percent, that bounds the torque; the PWM if the model has no other.
 
     Both bound the voltage at the motor, so the torque of a stalled servo falls in proportion.
     """
@@ -79,7 +81,7 @@ def torque_register(table: FirmwareMap) -> str | None:
 
 
 def torque_limit(servo: BusServo) -> dict[str, int]:
-    """Register and raw value that keep `torque_limit_percent`; empty where the joint has no such limit."""
+    """Return the register and the raw value that keep `torque_limit_percent`; empty for a joint without that limit."""
     percent, name = servo.safety.torque_limit_percent, torque_register(servo.map)
     if percent is None or name is None:
         return {}
@@ -88,7 +90,7 @@ def torque_limit(servo: BusServo) -> dict[str, int]:
 
 
 def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
-    """The rules of a joint, named; none where its servo cannot tell its current."""
+    """Return the named load rules of a joint; none if its servo does not report its current."""
     if not tells_current(servo.map):
         return []
     rules = [("pinched", servo.safety.pinch), ("under load too long", servo.safety.strain)]

@@ -1,14 +1,16 @@
 """Serial ports: what a bus reads from and writes to.
 
-`SerialPort` is a real port: reads block until bytes come or a deadline passes. It is ours alone: two programs on one
-wire take each other's answers, so a port that somebody holds is refused, to root as well. Any baud rate the adapter can
-do will do, and where the driver offers it, bytes are handed over without the usual 16 ms wait. What differs between
-operating systems is in `serial_io`.
+`SerialPort` is a real port: a read blocks until bytes come or a deadline passes. It belongs to one program: two on one
+wire take each other's answers, so a port that another process holds is refused, to root too. Every baud rate that the
+adapter can do is allowed. If the driver offers it, bytes are handed over without the usual 16 ms wait.
 
-`VirtualTimePort` is the same port when the servos are emulated and time is virtual. Bytes go over the same pseudo
-terminal, but before a read the port tells the emulator, on a control socket, how many bytes it has written so far
-and what time it is. The emulator takes exactly those bytes, moves its servos on to that time, says how long its
-reply is and writes it. So nothing depends on scheduling, and a silence costs no time at all.
+What differs between operating systems about an open device (waiting, exclusive use, rates, RS-485 direction) is at the
+end of this file. `fcntl` and `termios` are imported if the system has them, so that the package imports everywhere.
+
+`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same pseudo terminal, but
+before a read the port sends the emulator, on a control socket, the number of bytes written so far and the time. The
+emulator takes exactly those bytes, moves its servos to that time, sends the length of its reply and writes it. So the
+result does not depend on scheduling, and a silence takes no real time.
 """
 
 from __future__ import annotations
@@ -18,61 +20,77 @@ import logging
 import os
 import select
 import socket
+import sys
+import time
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import Holder, access_problem, holders, is_address
-from sfms_robot.servo.serial_io import (
-    DEVICE_ERRORS,
-    WRITE_TIMEOUT_S,
-    Rs485,
-    actual_baud,
-    make_exclusive,
-    serial_io,
-)
 
 if TYPE_CHECKING:
     import serial
 
 log = logging.getLogger(__name__)
 
-_REPLY_TIMEOUT_S = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
+Rs485 = Literal["rts", "kernel"]
+
+WRITE_TIMEOUT_S: Final = 0.5  # a device that takes no bytes for so long counts as gone, and stopping must not wait
+_REPLY_TIMEOUT_S: Final = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
 _TERMINALS: Final = "/dev/pts/"
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
+_POLL_S: Final = 0.0005
+_TCGETS2: Final = 0x802C542A  # Linux, asm-generic; with another number the ioctl fails and the rate is not checked
+_OUTPUT_SPEED: Final = 10  # c_ospeed of struct termios2, in words
+
+
+def _optional(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError:  # Windows has neither fcntl nor termios
+        return None
+
+
+_fcntl: Final = _optional("fcntl")
+_termios: Final = _optional("termios")
+DEVICE_ERRORS: Final[tuple[type[Exception], ...]] = (OSError,) if _termios is None else (OSError, _termios.error)
 
 
 class Port(Protocol):
-    """What a bus needs of a port."""
+    """A byte stream to servos, with a clock."""
 
     @property
     def name(self) -> str: ...
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises BusError when the device is gone; reading does too."""
+        """Send all of `data`. Raises BusError if the device is gone; reading does too."""
 
     def read(self, n: int, deadline_s: float) -> bytes:
-        """1 to `n` bytes as soon as there are any; empty when none came by `deadline_s` of `now_s`."""
+        """Return 1 to `n` bytes as soon as there are any; empty if none came by `deadline_s` of `now_s`."""
 
     def discard_input(self) -> None:
-        """Forget what came and was not read."""
+        """Drop bytes that came and were not read."""
 
-    def now_s(self) -> float: ...
+    def now_s(self) -> float:
+        """Return the time of the port's clock."""
 
     def wait_until(self, time_s: float) -> None:
-        """Let time go by until `time_s` of `now_s`."""
+        """Let time pass until `time_s` of `now_s`."""
 
-    def set_baud(self, baud: int) -> None: ...
+    def set_baud(self, baud: int) -> None:
+        """Change the rate. Raises PortError if the adapter cannot do it."""
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the device. Idempotent."""
 
 
 @dataclass
 class WrappedPort:
-    """A port that hands everything on to `inner`; subclasses change what they are about."""
+    """A port that forwards every call to `inner`; subclasses change some of them."""
 
     inner: Port
 
@@ -105,11 +123,14 @@ class WrappedPort:
 class SerialPort:
     """A serial device: a path, a name such as COM3, socket://HOST:PORT or rfc2217://HOST:PORT.
 
-    `rs485` says who switches the direction of a half-duplex RS-485 driver; None: nobody has to.
+    Args:
+        rs485: what switches the direction of a half-duplex RS-485 driver: this program by the RTS line, or the kernel;
+            None if the adapter does it.
+
+    The constructor opens the device. Raises PortError of one line; the device is closed then.
     """
 
     def __init__(self, device: str, baud: int, clock: Clock, rs485: Rs485 | None = None) -> None:
-        """Opens it. Raises PortError of one line; nothing stays open then."""
         self.name = device
         self._clock = clock
         self._serial = _open(device, baud)
@@ -122,10 +143,16 @@ class SerialPort:
             raise
 
     def write(self, data: bytes) -> None:
-        self._io.write(data)
+        try:
+            self._io.write(data)
+        except DEVICE_ERRORS as error:
+            raise BusError(f"{self.name}: cannot be written any more: {error}") from error
 
     def read(self, n: int, deadline_s: float) -> bytes:
-        return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
+        try:
+            return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
+        except DEVICE_ERRORS as error:
+            raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 
     def discard_input(self) -> None:
         try:
@@ -154,13 +181,13 @@ class SerialPort:
 class VirtualTimePort:
     """The pseudo terminal of an emulated chain, in virtual time."""
 
-    _WINDOW = 2048  # bytes on their way at most: more than the terminal holds would block for good
+    _WINDOW = 2048  # bytes under way at most: more than the terminal holds would block for ever
 
     def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
         self.name = device
         self._clock = clock
         self._written = 0
-        self._told = 0
+        self._announced = 0  # of them, those that the emulator has taken
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
@@ -180,11 +207,11 @@ class VirtualTimePort:
 
     def write(self, data: bytes) -> None:
         now_s = self._clock.now_s()
-        if self._told < self._written and self._written_at_s < now_s:
+        if self._announced < self._written and self._written_at_s < now_s:
             self._exchange(self._written_at_s)
         for start in range(0, len(data), self._WINDOW):
             chunk = data[start : start + self._WINDOW]
-            if self._written + len(chunk) - self._told > self._WINDOW:
+            if self._written + len(chunk) - self._announced > self._WINDOW:
                 self._exchange(now_s)
             try:
                 self._serial.write(chunk)
@@ -202,7 +229,7 @@ class VirtualTimePort:
 
     def discard_input(self) -> None:
         self._inbox.clear()
-        self._wanted_from = self._written  # answers to what was written before need not even be sent
+        self._wanted_from = self._written  # answers to earlier bytes need not even be sent
 
     def now_s(self) -> float:
         return self._clock.now_s()
@@ -211,26 +238,31 @@ class VirtualTimePort:
         self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
-        if self._told < self._written:
+        if self._announced < self._written:
             self._exchange(self._written_at_s)
         self._serial.baudrate = baud
 
     def close(self) -> None:
-        if self._serial.is_open and self._told < self._written:
+        if self._serial.is_open and self._announced < self._written:
             try:
                 self._exchange(self._written_at_s)
             except BusError:
-                self._inbox.clear()  # the emulator is gone: nobody is left to tell
+                self._inbox.clear()  # the emulator is gone
         self._serial.close()
         self._control.close()
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
-        """Let the emulator take what was written, at `now_s`, and fetch the whole of what it sends by `until_s`."""
+        """Let the emulator take the bytes written, at `now_s`, and read all that it sends by `until_s`."""
         until_s = now_s if until_s is None else until_s
         try:
             self._control.sendall(b"sync %d %d %r %r\n" % (self._written, self._wanted_from, now_s, until_s))
-            answer = self._line()
-            missing = int(answer.removeprefix(b"ack "))
+            line = b""
+            while not line.endswith(b"\n"):
+                part = self._control.recv(64)
+                if not part:
+                    raise OSError("it closed its control socket")
+                line += part
+            missing = int(line.removeprefix(b"ack "))
             fd = self._serial.fileno()
             while missing > 0:
                 if not select.select([fd], [], [], _REPLY_TIMEOUT_S)[0]:
@@ -242,20 +274,14 @@ class VirtualTimePort:
                 missing -= len(data)
         except (OSError, ValueError) as error:
             raise BusError(f"{self.name}: the emulator is gone: {error}") from error
-        self._told = self._written
+        self._announced = self._written
 
-    def _line(self) -> bytes:
-        line = b""
-        while not line.endswith(b"\n"):
-            part = self._control.recv(64)
-            if not part:
-                raise OSError("it closed its control socket")
-            line += part
-        return line
+
+# --- opening --------------------------------------------------------------------------------------------------------
 
 
 def _open(device: str, baud: int) -> serial.Serial:
-    """Raises PortError of one line: missing, not permitted, held by somebody else, not a serial device."""
+    """Open a device. Raises PortError of one line: missing, not permitted, held by another program, not serial."""
     scheme = device.partition("://")[0] if is_address(device) else ""
     if scheme and (problem := access_problem(device)):
         raise PortError(f"{device}: {problem}")
@@ -266,8 +292,9 @@ def _open(device: str, baud: int) -> serial.Serial:
     except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
     try:
-        if scheme == "socket":
-            _without_delay(port)
+        if scheme == "socket":  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
+            with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         elif not scheme:
             _claim(port, device)
             _check_baud(port, device)
@@ -277,26 +304,32 @@ def _open(device: str, baud: int) -> serial.Serial:
     return port
 
 
-def _without_delay(port: serial.Serial) -> None:
-    """TCP_NODELAY. With Nagle's algorithm the goals of a tick wait until the last answer is acknowledged: 40 ms."""
-    with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-
 def _claim(port: serial.Serial, device: str) -> None:
-    """Nobody else may open it from now on; nobody else may have it open already. pyserial's lock is only advice."""
+    """Refuse a device that another process has open, and keep others from opening it; pyserial's lock is advice.
+
+    An emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host: those pass.
+    Windows gives out a device once only; elsewhere root can still open it.
+    """
     if os.path.realpath(device).startswith(_TERMINALS):
-        return  # an emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host
-    make_exclusive(port)
+        return
+    if _fcntl is not None:
+        _fcntl.ioctl(port.fileno(), _termios.TIOCEXCL)
     others = holders(device)
     if others:
         raise PortError(f"{device}: {_held(others)}")
 
 
 def _check_baud(port: serial.Serial, device: str) -> None:
-    """Drivers take the nearest rate they can do, and say which one only when asked."""
-    actual = actual_baud(port)
-    if actual is not None and abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
+    """Raise PortError if the driver set another rate; drivers take the nearest they can do, and only Linux says it."""
+    if _fcntl is None or sys.platform != "linux":
+        return
+    settings = array("I", [0] * 64)
+    try:
+        _fcntl.ioctl(port.fileno(), _TCGETS2, settings, True)
+    except OSError:
+        return
+    actual = settings[_OUTPUT_SPEED] or port.baudrate
+    if abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
         raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
 
 
@@ -308,18 +341,113 @@ def _low_latency(port: serial.Serial) -> None:
 
 
 def _reason(device: str, error: Exception) -> str:
-    if not is_address(device) and os.name == "posix":
-        if not os.path.exists(device):
-            return "no such device"
-        if os.path.isdir(device):
-            return "is a directory, not a serial port"
-        if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
-            return _held(holders(device))
-        if not os.access(device, os.R_OK | os.W_OK):
-            return "no permission to open it (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
-    return f"cannot be opened as a serial port: {error}"
+    if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
+        return _held(holders(device))
+    problem = access_problem(device) or f"cannot be opened as a serial port: {error}"
+    fix = " (on Debian and Ubuntu: sudo usermod -aG dialout $USER, then log in again)"
+    return problem + fix * problem.startswith("no permission")
 
 
 def _held(others: Sequence[Holder]) -> str:
     named = ", ".join(f"pid {each.pid}: {each.command}" for each in others)
     return "is held by another program" + (f" ({named})" if named else "") + "; stop that first"
+
+
+# --- input and output of an open device -----------------------------------------------------------------------------
+
+
+class SerialIO(Protocol):
+    """Bytes in and out of one open device. Raises one of `DEVICE_ERRORS` if the device is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
+
+    def read(self, n: int, timeout_s: float) -> bytes:
+        """Return 1 to `n` bytes as soon as there are any; empty if none came in `timeout_s`."""
+
+
+class DescriptorIO:
+    """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._fd = port.fileno()
+
+    def write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        while rest:
+            try:
+                rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:
+                if not select.select([], [self._fd], [], WRITE_TIMEOUT_S)[1]:
+                    raise OSError("it takes no more bytes") from None
+
+    def read(self, n: int, timeout_s: float) -> bytes:
+        ready, _, _ = select.select([self._fd], [], [], timeout_s)
+        data = os.read(self._fd, n) if ready else b""
+        if ready and not data:
+            raise OSError("the device is gone")
+        return data
+
+
+class PolledIO:
+    """By pyserial's own calls, twice a millisecond, for devices without a descriptor (Windows, rfc2217://).
+
+    `port` was opened with timeout 0 and `WRITE_TIMEOUT_S`.
+    """
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
+
+    def write(self, data: bytes) -> None:
+        self._port.write(data)
+
+    def read(self, n: int, timeout_s: float) -> bytes:
+        until_s = time.monotonic() + timeout_s
+        while not (waiting := self._port.in_waiting):
+            if (left_s := until_s - time.monotonic()) <= 0:
+                return b""
+            time.sleep(min(_POLL_S, left_s))
+        return bytes(self._port.read(min(n, waiting)))
+
+
+class RtsDirection:
+    """A half-duplex RS-485 driver that transmits while RTS is on: on before the first bit, off after the last.
+
+    `flush` returns when the bytes have left (tcdrain). With an adapter that buffers behind its driver it returns too
+    early: most of those switch the direction themselves and need no `rs485`.
+    """
+
+    def __init__(self, inner: SerialIO, port: serial.Serial, name: str) -> None:
+        self._port = port
+        self._write = inner.write
+        self.read = inner.read
+        try:
+            port.rts = False
+        except DEVICE_ERRORS as error:
+            raise PortError(f"{name}: rs485 = 'rts': this device has no RTS line: {error}") from error
+
+    def write(self, data: bytes) -> None:
+        self._port.rts = True
+        try:
+            self._write(data)
+            self._port.flush()
+        finally:
+            self._port.rts = False
+
+
+def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> SerialIO:
+    """Return the kind of this system and device. Raises PortError if it cannot switch the direction as `rs485` says."""
+    if rs485 == "kernel":  # TIOCSRS485: the driver switches the direction between the last bit and the first answer
+        from serial.rs485 import RS485Settings
+
+        try:
+            port.rs485_mode = RS485Settings()
+        except (OSError, ValueError, NotImplementedError, AttributeError) as error:
+            problem = "the driver of this device does not switch the direction (rts: this program does, by RTS)"
+            raise PortError(f"{name}: rs485 = 'kernel': {problem}") from error
+    try:
+        has_descriptor = _termios is not None and port.fileno() >= 0
+    except OSError:  # io.UnsupportedOperation
+        has_descriptor = False
+    io: SerialIO = DescriptorIO(port) if has_descriptor else PolledIO(port)
+    return RtsDirection(io, port, name) if rs485 == "rts" else io

@@ -1,10 +1,11 @@
-"""A firmware map made ready for use: registers by name or by role, values to bytes and back.
+"""A firmware map ready for use: registers by name or by role, values to bytes and back.
 
 `Table` is plain data, so that an emulated servo in another process needs neither the loader nor its libraries.
 
-A register's *value* is what the control loop reckons with; its *raw* form is what travels. Four rules lead from one to
-the other: unsigned, two's complement, a sign bit above the magnitude, and an offset (2048 stands for zero). Registers
-of two and four bytes travel in the byte order of the model: low byte first, but high byte first in the Feetech SCS.
+The *value* of a register is the number that the control loop uses; its *raw* form is what is sent. Four rules lead from
+one to the other: unsigned, two's complement, a sign bit above the magnitude, and an offset (2048 stands for zero).
+Registers of two and four bytes are sent in the byte order of the model: low byte first, but high byte first in the
+Feetech SCS.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 if TYPE_CHECKING:
     from sfms_robot.config import FirmwareMap
 
-ASSUMED_SPEED_DEG_S = 300.0  # no-load speed of a model whose maker states none: only an emulated motor needs one
+ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
 ByteOrder = Literal["little", "big"]
 
 _EMPTY: Mapping[Any, Any] = MappingProxyType({})
 
 
 class Field(NamedTuple):
-    """One register. `low`..`high` are the values it takes when written; `sign` is its rule, as in the map."""
+    """A register. `low`..`high` are the values that may be written; `sign` is its rule, as in the map."""
 
     name: str
     address: int
@@ -41,11 +42,19 @@ class Field(NamedTuple):
     byte_order: ByteOrder = "little"
 
     def to_bytes(self, value: int) -> bytes:
-        """Raises OverflowError when `value` does not fit the register's size and sign rule."""
-        return self._raw(value).to_bytes(self.size, self.byte_order, signed=self.sign == "twos_complement")
+        """Return the raw form. Raises OverflowError if `value` does not fit the size and sign rule of the register."""
+        raw = value
+        if self.sign == "offset_2048":
+            raw = value + 2048
+        elif self.sign.startswith("sign_bit_"):
+            bit = 1 << int(self.sign[9:])
+            if abs(value) >= bit:
+                raise OverflowError(f"{self.name} = {value} does not fit below its sign bit ({1 - bit}..{bit - 1})")
+            raw = bit - value if value < 0 else value
+        return raw.to_bytes(self.size, self.byte_order, signed=self.sign == "twos_complement")
 
     def from_bytes(self, data: bytes | bytearray) -> int:
-        """Value of the first `size` bytes."""
+        """Return the value of the first `size` bytes."""
         raw = int.from_bytes(data[: self.size], self.byte_order, signed=self.sign == "twos_complement")
         if self.sign == "offset_2048":
             return raw - 2048
@@ -55,35 +64,25 @@ class Field(NamedTuple):
         return raw
 
     def to_unit(self, value: int) -> float:
-        """Value -> the unit of the firmware map."""
+        """Return a value in the unit of the firmware map."""
         return value * self.scale
 
-    def _raw(self, value: int) -> int:
-        if self.sign == "offset_2048":
-            return value + 2048
-        if self.sign.startswith("sign_bit_"):
-            bit = 1 << int(self.sign[9:])
-            if abs(value) >= bit:
-                raise OverflowError(f"{self.name} = {value} does not fit below its sign bit ({1 - bit}..{bit - 1})")
-            return bit - value if value < 0 else value
-        return value
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Table:
-    """A servo model's control table, or the channels of a servo board (which has no fields).
+    """The control table of a servo model, or the channels of a servo board (which has no fields).
 
     Attributes:
-        model_number: None where it is not known.
+        model_number: None if it is not known.
         fields: registers by name.
         ticks_per_revolution: position ticks of one turn.
-        top_speed_ticks_s: no-load speed; at `ASSUMED_SPEED_DEG_S` where the maker states none.
-        baud_codes: code in role `baud_rate` -> bits per second; empty where the rate is no register.
-        faults: bit of role `error_status` (of the error word, on a board) -> what it means.
+        top_speed_ticks_s: no-load speed; at `ASSUMED_SPEED_DEG_S` if the maker states none.
+        baud_codes: code in role `baud_rate` -> bits per second; empty if the rate is not a register.
+        faults: bit of role `error_status` (of the error word, on a board) -> its meaning.
         family: dynamixel, feetech, maestro or ssc32.
         protocol: 1, 2, or None for a board.
-        status_faults: bit of the error byte of a status packet -> what is wrong with the servo (protocol 1, Feetech).
-        roles: role -> register name, where they differ; None where the model has no such register.
+        status_faults: bit of the error byte of a status packet -> fault of the servo (protocol 1, Feetech).
+        roles: role -> register name, if they differ; None if the model has no such register.
         watchdog: what the servo does when its host falls silent: stops, flags_only or none.
         position_mode: value of role `operating_mode` for position control.
         firmware: first and last firmware number that the table holds for.
@@ -112,68 +111,63 @@ class Table:
 
     @classmethod
     def of(cls, firmware_map: FirmwareMap) -> Table:
+        """Return the table of a firmware map."""
         return cls.from_plain(firmware_map.model_dump(mode="json"))
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Table:
-        """From a validated firmware map dumped to plain data, also by way of JSON (which makes keys text)."""
-        per_degree = plain["ticks_per_revolution"] / 360.0
-        pulse = plain["pulse_us"]
-        return cls(
-            model=plain["model"],
-            model_number=plain["model_number"],
-            fields={name: _field(name, row, plain["byte_order"]) for name, row in plain["registers"].items()},
-            ticks_per_revolution=plain["ticks_per_revolution"],
-            center_ticks=plain["center_ticks"],
-            top_speed_ticks_s=(plain["no_load_speed_deg_s"] or ASSUMED_SPEED_DEG_S) * per_degree,
-            baud_codes={int(code): baud for code, baud in plain["baud_codes"].items()},
-            faults={int(bit): text for bit, text in plain["faults"].items()},
-            family=plain["family"],
-            protocol=plain["protocol"],
-            byte_order=plain["byte_order"],
-            status_faults={int(bit): text for bit, text in plain["status_faults"].items()},
-            roles=dict(plain["roles"]),
-            watchdog=plain["watchdog"],
-            position_mode=plain["position_mode"],
-            firmware=(plain["firmware"]["min"], plain["firmware"]["max"]),
-            channels=plain["channels"],
-            pulse_us=(pulse["min"], pulse["max"]) if pulse else None,
-            tick_us=plain["tick_us"],
-        )
+        """Return the table of a validated firmware map as plain data, perhaps from JSON (which makes keys text)."""
+        speed, pulse = plain["no_load_speed_deg_s"] or ASSUMED_SPEED_DEG_S, plain["pulse_us"]
+        unchanged = {name: plain[name] for name in cls.__dataclass_fields__ if name in plain}
+        converted = {
+            "fields": {name: _field(name, row, plain["byte_order"]) for name, row in plain["registers"].items()},
+            "top_speed_ticks_s": speed * (plain["ticks_per_revolution"] / 360.0),
+            "firmware": (plain["firmware"]["min"], plain["firmware"]["max"]),
+            "pulse_us": (pulse["min"], pulse["max"]) if pulse else None,
+        }
+        by_number = {
+            name: {int(key): value for key, value in plain[name].items()}
+            for name in ("baud_codes", "faults", "status_faults")
+        }
+        return cls(**(unchanged | converted | by_number))
 
     def __getitem__(self, name: str) -> Field:
         return self.fields[name]
 
     def role(self, role: str) -> Field | None:
-        """The register that plays `role` in this family; None when the model has none."""
+        """Return the register that plays `role` in this family; None if the model has none."""
         name = self.roles.get(role, role)
         return self.fields.get(name) if name is not None else None
 
     @property
     def size(self) -> int:
-        """Bytes of the whole table."""
+        """Return the number of bytes of the whole table."""
         return max((each.address + each.size for each in self.fields.values()), default=0)
 
     @property
     def default_baud(self) -> int | None:
-        """Bits per second as it leaves the factory; None where that is not known."""
+        """Return the factory rate in bits per second; None if it is not known."""
         code = self.role("baud_rate")
         return self.baud_codes.get(code.initial) if code else None
 
     def span(self, names: Sequence[str]) -> tuple[int, int]:
-        """(address, length) of the block that holds all of `names`."""
-        fields = [self.fields[name] for name in names]
-        first = min(each.address for each in fields)
-        return first, max(each.address + each.size for each in fields) - first
+        """Return (address, length) of the block that holds all of `names`."""
+        return span_of([self.fields[name] for name in names])
 
     def fault_names(self, status: int) -> str:
-        """Value of role `error_status` in words; empty when it is 0."""
+        """Return the faults in a value of role `error_status`, in words; empty for 0."""
         bits = [bit for bit in range(16) if status >> bit & 1]
         return ", ".join(self.faults.get(bit, f"hardware error bit {bit}") for bit in bits)
 
     def status_fault_names(self, error: int) -> str:
-        """What the error byte of a status packet says about the servo, in words; bits about the packet are left out."""
+        """Return the servo's faults in the error byte of a status packet, in words, without bits about the packet."""
         return ", ".join(text for bit, text in sorted(self.status_faults.items()) if error >> bit & 1)
+
+
+def span_of(fields: Sequence[Field]) -> tuple[int, int]:
+    """Return (address, length) of the block that holds all of `fields`."""
+    first = min(each.address for each in fields)
+    return first, max(each.address + each.size for each in fields) - first
 
 
 def _field(name: str, row: Mapping[str, Any], byte_order: ByteOrder) -> Field:

@@ -1,7 +1,7 @@
 """Compare what a servo stores with what the head's file says of its joint: values in, contradictions out, no I/O.
 
-Startup compares before torque comes on, `sfms-robot doctor` whenever it is run; both see the same. Registers that a
-model does not have, or that were not read, are not judged.
+Startup compares before torque comes on, `sfms-robot doctor` whenever it is run; both use these rules. Registers that a
+model does not have, or that were not read, are skipped.
 
 Sources: ROBOTIS e-manual, control tables of the X and MX series (operating mode 11, homing offset 20, position limits
 48 and 52, startup configuration 60, shutdown 63) and of Protocol 1.0 (angle limits 6 and 8, shutdown 18); Feetech STS
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Final, Literal
 
 from sfms_robot.servo.registers import Table
@@ -20,7 +20,7 @@ from sfms_robot.servo.registers import Table
 Then = Literal["refused", "set", "told"]
 
 REVERSE: Final = 0x01  # drive mode bit 0: ticks run the other way
-_SLAVE: Final = 0x02  # drive mode bit 1: follows another motor over a cable of its own (X540, MX-106)
+_SLAVE: Final = 0x02  # drive mode bit 1: follows another motor over a separate cable (X540, MX-106)
 _TORQUE_AT_POWER_UP: Final = 0x01  # startup configuration bit 0
 _EXTENDED_MODE: Final = 4  # Protocol 2.0: extended position
 _CURRENT_POSITION_MODE: Final = 5  # Protocol 2.0: position with bounded current, also over many turns
@@ -28,23 +28,24 @@ _PROTECTIONS: Final = ("overheating", "overload", "electrical shock")
 _LIMITS: Final = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _OFFSETS: Final = ("homing_offset", "multi_turn_offset")
 _DIRECTION: Final = {"drive_mode": REVERSE | _SLAVE, "phase": 0x81}  # Feetech: of the motor (bit 0), of the encoder (7)
-_SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: a tick is more than a tick
+_SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: one of its ticks is several
 
 
 @dataclass(frozen=True)
 class JointNeeds:
-    """What a joint asks of the servo that moves it.
+    """What a joint requires of the servo that moves it.
 
     Attributes:
-        low_ticks, high_ticks: first and last goal it will be given.
-        stored: EEPROM values that zero and direction in the head's file were written for.
+        low_ticks, high_ticks: first and last goal of the joint.
+        stored: EEPROM values that zero and direction in the head's file were measured with.
         other_ids: the other servos of its bus.
-        bounded_current: its current is to be limited, where the servo can.
-        allowed_faults: those the head's file says to live with.
+        bounded_current: its current is to be limited, if the servo can.
+        allowed_faults: faults that the head's file ignores.
     """
 
     low_ticks: int
     high_ticks: int
+    _: KW_ONLY
     stored: Mapping[str, int] = field(default_factory=dict)
     other_ids: frozenset[int] = frozenset()
     bounded_current: bool = False
@@ -53,19 +54,20 @@ class JointNeeds:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A stored value that is not what the head's file reckons with.
+    """A stored value that contradicts the head's file.
 
     Attributes:
-        wanted: the value that would do, as close to the stored one as can be.
-        then: `refused` at startup, `set` by startup itself, or `told`: a warning, since it only weakens protection.
-        fixable: whether it can be mended without harm; else it is for a person to look at.
-        in_file: the head's file is what has to change: zero and direction belong together with it. Else the servo.
+        wanted: the value that fits, as close to the stored one as possible.
+        then: `refused` at startup, `set` by startup, or `told`: a warning, since it only weakens protection.
+        fixable: it can be corrected without harm; else a person has to look at it.
+        in_file: the head's file has to change, since zero and direction belong together with it; else the servo.
     """
 
     register: str
     value: int
     wanted: int
     why: str
+    _: KW_ONLY
     then: Then
     fixable: bool = True
     in_file: bool = False
@@ -75,7 +77,7 @@ class Contradiction:
 
 
 def multi_turn(table: Table, needs: JointNeeds) -> bool:
-    """Whether the goals of a joint leave the one turn of position mode, and the model can follow."""
+    """Return whether the goals of a joint leave the one turn of position mode, and the model can follow."""
     goal = table.role("goal_position")
     if goal is None or goal.low <= needs.low_ticks and goal.high < table.ticks_per_revolution:
         return False
@@ -83,9 +85,9 @@ def multi_turn(table: Table, needs: JointNeeds) -> bool:
 
 
 def operating_mode(table: Table, needs: JointNeeds) -> int | None:
-    """Value of role `operating_mode` for a joint; None where limits say it (Protocol 1.0), or nothing does.
+    """Return the value of role `operating_mode` for a joint; None if limits decide it (Protocol 1.0), or nothing does.
 
-    Many turns are mode 4 with Protocol 2.0; a Feetech STS stays in mode 0 and is told by its limits.
+    Many turns are mode 4 with Protocol 2.0; a Feetech STS stays in mode 0, and its limits decide.
     """
     if table.protocol == 2 and needs.bounded_current and "goal_current" in table.fields:
         return _CURRENT_POSITION_MODE
@@ -95,19 +97,19 @@ def operating_mode(table: Table, needs: JointNeeds) -> int | None:
 
 
 def limit_names(table: Table) -> tuple[str, str] | None:
-    """Names of the lower and the upper position limit; None for a model without."""
+    """Return the names of the lower and the upper position limit; None for a model without."""
     return next((names for names in _LIMITS if names[0] in table.fields), None)
 
 
 def limits_count(table: Table, needs: JointNeeds) -> bool:
-    """Whether the servo holds goals against its own position limits: not in modes 4 and 5, nor over many turns."""
+    """Return whether the servo compares goals with its position limits: not in modes 4 and 5, nor over many turns."""
     if table.protocol == 2:
         return operating_mode(table, needs) in (None, table.position_mode)
     return not multi_turn(table, needs)
 
 
 def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -> list[Contradiction]:
-    """Everything stored in one servo that is not as its joint needs it, in the order of importance.
+    """Return every stored value of one servo that is not as its joint needs it, in the order of importance.
 
     Args:
         values: registers by name, as read.
@@ -116,7 +118,6 @@ def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -
         *_mode(values, table, needs),
         *_limits(values, table, needs),
         *_zero_and_direction(values, table, needs),
-        *_named_in_the_file(values, needs),
         *_secondary_id(values, needs),
         *_startup(values),
         *_shutdown(values, table, needs),
@@ -130,50 +131,49 @@ def _mode(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterato
     if mode is not None and wanted is not None and (now := values.get(mode.name, wanted)) != wanted:
         kinds = {_EXTENDED_MODE: "extended position", _CURRENT_POSITION_MODE: "current-based position"}
         kind = kinds.get(wanted, "position") if table.protocol == 2 else "position"
-        yield Contradiction(mode.name, now, wanted, f"the joint is moved in {kind} control", "set")
+        yield Contradiction(mode.name, now, wanted, f"the joint is moved in {kind} control", then="set")
 
 
 def _limits(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Goals beyond the servo's own limits are refused by Protocol 2.0, and silently clipped by the others."""
+    """Yield each limit inside the joint's range: Protocol 2.0 refuses goals beyond it, the others clip them silently.
+
+    Many turns need both at 4095 (MX 1.0), or both at 0 (STS).
+    """
     names = limit_names(table)
     if names is None or not values.keys() >= set(names):
         return
     low, high = (values[name] for name in names)
     if multi_turn(table, needs) and table.protocol == 1:
-        yield from _unlimited(names, low, high, table)
+        both = 0 if table.family == "feetech" else table[names[1]].high
+        for name, now in zip(names, (low, high), strict=True):
+            if now != both:
+                yield Contradiction(name, now, both, "the joint's range is more than one turn", then="set")
+    elif not limits_count(table, needs):
         return
-    if not limits_count(table, needs):
-        return
-    if low >= high:
+    elif low >= high:
         if table.family == "dynamixel" and names[0] == "cw_angle_limit":  # both 0: wheel mode, both 4095: multi-turn
-            whole = table[names[1]].high
-            yield Contradiction(names[0], low, 0, "equal angle limits are no position mode", "set")
-            yield Contradiction(names[1], high, whole, "equal angle limits are no position mode", "set")
-        return
-    goals = f"the joint's range is {needs.low_ticks}..{needs.high_ticks} ticks"
-    if low > needs.low_ticks:
-        yield Contradiction(names[0], low, needs.low_ticks, goals, "refused")
-    if high < needs.high_ticks:
-        yield Contradiction(names[1], high, needs.high_ticks, goals, "refused")
-
-
-def _unlimited(names: tuple[str, str], low: int, high: int, table: Table) -> Iterator[Contradiction]:
-    """What the limits have to be for many turns: both 4095 (MX 1.0), both 0 (STS)."""
-    both = 0 if table.family == "feetech" else table[names[1]].high
-    for name, now in zip(names, (low, high), strict=True):
-        if now != both:
-            yield Contradiction(name, now, both, "the joint's range is more than one turn", "set")
+            why = "equal angle limits are not a position mode"
+            yield Contradiction(names[0], low, 0, why, then="set")
+            yield Contradiction(names[1], high, table[names[1]].high, why, then="set")
+    else:
+        goals = f"the joint's range is {needs.low_ticks}..{needs.high_ticks} ticks"
+        if low > needs.low_ticks:
+            yield Contradiction(names[0], low, needs.low_ticks, goals, then="refused")
+        if high < needs.high_ticks:
+            yield Contradiction(names[1], high, needs.high_ticks, goals, then="refused")
 
 
 def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or the wrong way."""
+    """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or the wrong way.
+
+    Then each other register that does not hold what the head's file declares.
+    """
     for name in _OFFSETS:
         now, wanted = values.get(name, 0), needs.stored.get(name, 0)
         if name in values and now != wanted:
             degrees = offset_ticks(table, now - wanted) * 360.0 / table.ticks_per_revolution
-            yield Contradiction(
-                name, now, wanted, f"every angle would be {degrees:+.1f} deg off", "refused", in_file=True
-            )
+            why = f"every angle would be {degrees:+.1f} deg off"
+            yield Contradiction(name, now, wanted, why, then="refused", in_file=True)
     for name, bits in _DIRECTION.items():
         now, declared = values.get(name, 0), needs.stored.get(name, 0)
         wanted = now & ~bits | declared & bits
@@ -181,10 +181,14 @@ def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNee
             continue
         slave = name == "drive_mode" and (now ^ wanted) & _SLAVE
         why = "it follows another motor, not its goals" if slave else "the joint would move the other way"
-        yield Contradiction(name, now, wanted, why, "refused", in_file=not slave)
+        yield Contradiction(name, now, wanted, why, then="refused", in_file=not slave)
     for name in _SCALES:
         if values.get(name, 1) > 1:
-            yield Contradiction(name, values[name], 1, "one of its ticks is several", "refused")
+            yield Contradiction(name, values[name], 1, "one of its ticks is several", then="refused")
+    for name, wanted in needs.stored.items():
+        if name not in (*_OFFSETS, *_DIRECTION) and values.get(name, wanted) != wanted:
+            why = "the head's file reckons with it"
+            yield Contradiction(name, values[name], wanted, why, then="refused", in_file=True)
 
 
 def offset_ticks(table: Table, stored: int) -> int:
@@ -195,33 +199,26 @@ def offset_ticks(table: Table, stored: int) -> int:
     return -stored if table.family == "feetech" else stored
 
 
-def _named_in_the_file(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield each other register that does not hold what the head's file declares."""
-    for name, wanted in needs.stored.items():
-        if name not in (*_OFFSETS, *_DIRECTION) and values.get(name, wanted) != wanted:
-            yield Contradiction(name, values[name], wanted, "the head's file reckons with it", "refused", in_file=True)
-
-
 def _secondary_id(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """0..252 is active: it obeys writes to that id too, and never answers them."""
+    """Yield an active secondary id (0..252): the servo obeys writes to that id too, and never answers them."""
     now = values.get("secondary_id", 255)
     if now in needs.other_ids:
-        yield Contradiction("secondary_id", now, 255, f"it would follow the goals of id {now} too", "refused")
+        yield Contradiction("secondary_id", now, 255, f"it would follow the goals of id {now} too", then="refused")
     elif now <= 252:
-        yield Contradiction("secondary_id", now, 255, f"it obeys id {now} too", "told", fixable=False)
+        yield Contradiction("secondary_id", now, 255, f"it obeys id {now} too", then="told", fixable=False)
 
 
 def _startup(values: Mapping[str, int]) -> Iterator[Contradiction]:
     now = values.get("startup_configuration", 0)
     if now & _TORQUE_AT_POWER_UP:
         why = "its torque comes on at power-up, wherever it stands"
-        yield Contradiction("startup_configuration", now, now & ~_TORQUE_AT_POWER_UP, why, "refused")
+        yield Contradiction("startup_configuration", now, now & ~_TORQUE_AT_POWER_UP, why, then="refused")
     elif now:
-        yield Contradiction("startup_configuration", now, 0, "it restores RAM values of an earlier time", "told")
+        yield Contradiction("startup_configuration", now, 0, "it restores RAM values of an earlier time", then="told")
 
 
 def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Faults that take the torque away: those that protect the motor should, those the head lives with must not."""
+    """Yield faults that should take the torque away and do not, or that the head ignores and do."""
     name = "unloading_condition" if table.family == "feetech" else "shutdown"
     if name not in values:
         return
@@ -230,12 +227,15 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
     protecting = sum(1 << bit for bit, text in faults.items() if text in _PROTECTIONS and factory >> bit & 1)
     allowed = sum(1 << bit for bit, text in faults.items() if text in needs.allowed_faults and factory >> bit & 1)
     wanted = (now | protecting) & ~(allowed & ~protecting)
+
+    def named(bits: int) -> str:
+        return ", ".join(text for bit, text in sorted(faults.items()) if bits >> bit & 1)
+
     if missing := wanted & ~now:
-        why = f"it goes on under {_named(faults, missing)}"
-        yield Contradiction(name, now, wanted, why, "told")
+        yield Contradiction(name, now, wanted, f"it goes on under {named(missing)}", then="told")
     elif extra := now & ~wanted:
-        why = f"it gives way under {_named(faults, extra)}, which the head's file says to live with"
-        yield Contradiction(name, now, wanted, why, "told")
+        why = f"it gives way under {named(extra)}, which the head's file says to live with"
+        yield Contradiction(name, now, wanted, why, then="told")
 
 
 def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
@@ -247,24 +247,24 @@ def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterat
     torque = table.role("torque_enable")
     if multi_turn(table, needs):
         if torque is not None and values.get(torque.name):
-            return  # it has had power since its place was known
+            return  # it has had power since its position was known
         if not unique_turn(now, turn, needs):
             low, high = home_ticks(turn, needs)
             why = (
                 "the count of turns is lost at power-off, and this may be one of several places; switch its supply "
                 f"off, turn it by hand to where it will read {low}..{high}, and switch it on"
             )
-            yield Contradiction(present.name, now, (low + high) // 2, why, "refused", fixable=False)
+            yield Contradiction(present.name, now, (low + high) // 2, why, then="refused", fixable=False)
     elif not min(0, offset) <= now < turn + max(0, offset):  # a homing offset shifts the one turn that there is
         inside = (now - offset) % math.ceil(turn) + offset
         cure = "it was turned past one turn"
         if not can_clear_turns(table):
             cure += ": turn it back by hand, or switch its supply off and on"
-        yield Contradiction(present.name, now, inside, cure, "refused", fixable=can_clear_turns(table))
+        yield Contradiction(present.name, now, inside, cure, then="refused", fixable=can_clear_turns(table))
 
 
 def unique_turn(present: int, turn: float, needs: JointNeeds) -> bool:
-    """Whether a servo that may have lost its count can only stand where it says, as far as its joint's range goes."""
+    """Return whether a servo that may have lost its count of turns can only stand where it reports."""
     whole = round(turn)
     last = math.ceil((needs.high_ticks - needs.low_ticks) / whole) + 1
     others = (present + count * whole for count in range(-last, last + 1) if count)
@@ -274,8 +274,9 @@ def unique_turn(present: int, turn: float, needs: JointNeeds) -> bool:
 
 
 def home_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
-    """First and last tick of the turn at power-up that belong to one position of the joint only; first > last where
-    there are none.
+    """Return the first and last tick of the turn at power-up that belong to one position of the joint only.
+
+    first > last if there are none.
     """
     whole = round(turn)
     low = max(needs.low_ticks, needs.high_ticks - whole + 1, 0)
@@ -283,9 +284,5 @@ def home_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
 
 
 def can_clear_turns(table: Table) -> bool:
-    """Whether the model knows CLEAR (Protocol 2.0, X and MX; not the XL-320)."""
+    """Return whether the model has the instruction CLEAR (Protocol 2.0, X and MX; not the XL-320)."""
     return table.protocol == 2 and "homing_offset" in table.fields
-
-
-def _named(faults: Mapping[int, str], bits: int) -> str:
-    return ", ".join(text for bit, text in sorted(faults.items()) if bits >> bit & 1)

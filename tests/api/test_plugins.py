@@ -42,7 +42,7 @@ class Hum(sr.Source):
 """
 
 FAMILY = """
-from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Bus
 from sfms_robot.servo.families import BusFamily
 
 FAMILY = BusFamily("Somebody's servos", "somebodys_servos:Bus", ("dynamixel", 2))

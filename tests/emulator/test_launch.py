@@ -10,7 +10,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch, wait
 from sfms_robot.errors import BusError
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.chain.protocol1_link import Protocol1Link
+from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
 
@@ -54,7 +54,7 @@ def test_what_somebody_stored_is_there_in_the_older_families_too(model, name, va
     servo = EmulatedServo(1, model, start_ticks=table.center_ticks, registers={name: value}, supply_v=20.0)
     with launch([servo], virtual=True) as chain:
         port = VirtualTimePort(chain.device, chain.control, servo.baud, VirtualClock())
-        link = Protocol1Link(port, servo.baud, 0.003, table.family)
+        link = {"dynamixel": Dynamixel1Link, "feetech": FeetechLink}[table.family](port, servo.baud, 0.003)
         answer = link.read(1, table[name].address, table[name].size)
         link.port.close()
         assert table[name].from_bytes(answer.data) == value

@@ -3,7 +3,7 @@ from emulated_devices import chain_of, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.servo.codecs import dxl1, feetech, protocol1
+from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, Frame, encode, maybe_frame
 
 MODELS = [
@@ -81,12 +81,12 @@ def test_only_servos_at_the_hosts_baud_hear_it_give_or_take_three_percent():
 def test_dynamixel_says_what_it_refuses_and_changes_nothing():
     device = chain_of("ax-12a")
     put(device, 1, "cw_angle_limit", 200)
-    assert put(device, 1, "goal_position", 100) == dxl1.ANGLE_LIMIT
-    assert ask(device, 1, protocol1.WRITE, bytes([36, 0, 0]))[0].code == dxl1.RANGE  # read-only
-    assert ask(device, 1, protocol1.WRITE, bytes([24, 7]))[0].code == dxl1.RANGE
-    assert ask(device, 1, protocol1.READ, bytes([48, 20]))[0] == Frame(1, dxl1.RANGE, b"")
-    assert ask(device, 1, 0x77)[0].code == dxl1.INSTRUCTION
-    assert ask(device, 1, protocol1.ACTION)[0].code == dxl1.INSTRUCTION  # nothing was registered
+    assert put(device, 1, "goal_position", 100) == protocol1.ANGLE_LIMIT
+    assert ask(device, 1, protocol1.WRITE, bytes([36, 0, 0]))[0].code == protocol1.RANGE  # read-only
+    assert ask(device, 1, protocol1.WRITE, bytes([24, 7]))[0].code == protocol1.RANGE
+    assert ask(device, 1, protocol1.READ, bytes([48, 20]))[0] == Frame(1, protocol1.RANGE, b"")
+    assert ask(device, 1, 0x77)[0].code == protocol1.INSTRUCTION
+    assert ask(device, 1, protocol1.ACTION)[0].code == protocol1.INSTRUCTION  # nothing was registered
     assert (get(device, 1, "goal_position"), get(device, 1, "torque_enable")) == (512, 0)
 
 
@@ -127,19 +127,19 @@ def test_status_level_decides_who_is_answered():
 
 def test_sync_read_is_answered_in_order_up_to_the_first_that_is_silent():
     device = chain_of("sts3215", "sts3215", "sts3215")
-    params = feetech.sync_read_params(56, 2, [3, 1, 2])
-    assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3, 1, 2]
+    params = protocol1.sync_read_params(56, 2, [3, 1, 2])
+    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3, 1, 2]
     device.servo(1).dead = True
-    assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3]
+    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3]
     device.chain_break = False
-    assert [frame.servo for frame in ask(device, BROADCAST, feetech.SYNC_READ, params)] == [3, 2]
+    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3, 2]
 
 
 def test_scs_knows_no_sync_read_and_ax_no_bulk_read():
     device = chain_of("scs0009", "ax-12a", "mx-28-1.0")
-    assert ask(device, BROADCAST, feetech.SYNC_READ, feetech.sync_read_params(56, 2, [1])) == []
-    assert ask(device, BROADCAST, dxl1.BULK_READ, dxl1.bulk_read_params([(2, 36, 2)])) == []
-    (answer,) = ask(device, BROADCAST, dxl1.BULK_READ, dxl1.bulk_read_params([(3, 36, 2)]))
+    assert ask(device, BROADCAST, protocol1.SYNC_READ, protocol1.sync_read_params(56, 2, [1])) == []
+    assert ask(device, BROADCAST, protocol1.BULK_READ, protocol1.bulk_read_params([(2, 36, 2)])) == []
+    (answer,) = ask(device, BROADCAST, protocol1.BULK_READ, protocol1.bulk_read_params([(3, 36, 2)]))
     assert answer == Frame(3, 0, b"\x00\x08")
 
 
@@ -162,7 +162,7 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
     device.servo(1).plant.stuck = True
     put(device, 1, "goal_position", 900)
     (answer,) = ask(device, 1, protocol1.PING, now_s=3.0)
-    assert answer.code == dxl1.OVERLOAD
+    assert answer.code == protocol1.OVERLOAD
     assert (get(device, 1, "torque_enable", 3.0), get(device, 1, "torque_limit", 3.0)) == (0, 0)
     device.servo(1).plant.stuck = False
     put(device, 1, "torque_limit", 1023, 3.0)
@@ -173,7 +173,7 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
 def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
     device = chain_of("sts3215")
     device.servo(1).set_supply(9.5, 0.0)
-    assert ask(device, 1, protocol1.PING)[0].code == feetech.VOLTAGE
+    assert ask(device, 1, protocol1.PING)[0].code == protocol1.VOLTAGE
     assert get(device, 1, "present_voltage") == 95
     device.servo(1).set_supply(7.4, 0.0)
     assert ask(device, 1, protocol1.PING)[0].code == 0
@@ -192,9 +192,9 @@ def test_brown_out_is_silence_and_then_a_start_without_torque():
 def test_sts_is_calibrated_where_it_stands(how):
     device = chain_of("sts3215", start_ticks=3000)
     if how.startswith("torque"):
-        put(device, 1, "torque_enable", feetech.CALIBRATE_HERE)
+        put(device, 1, "torque_enable", protocol1.CALIBRATE_HERE)
     else:
-        ask(device, 1, feetech.CALIBRATE_OFFSET)
+        ask(device, 1, protocol1.CALIBRATE_OFFSET)
     assert (get(device, 1, "present_position"), get(device, 1, "homing_offset")) == (2048, 952)
     put(device, 1, "goal_position", 2148)
     assert get(device, 1, "present_position", 2.0) == 2148

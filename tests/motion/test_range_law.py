@@ -13,7 +13,7 @@ from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
-from sfms_robot.servo.goals import Goals
+from sfms_robot.servo.bus import Goals
 from sfms_robot.servo.policy import BusServo
 
 DT_S = 0.01
@@ -39,7 +39,10 @@ class Law:
     def __init__(self, head: Head, chase) -> None:
         joints = head.joints
         maps, calibration = firmware_maps(joints), calibration_of(joints)
-        servos = [BusServo(name, j.id, maps[j.model], j.min_rad, j.max_rad) for name, j in joints.items()]
+        servos = [
+            BusServo(joint=name, id=j.id, map=maps[j.model], min_rad=j.min_rad, max_rad=j.max_rad)
+            for name, j in joints.items()
+        ]
         self.limits = JointLimits.of(head)
         self.count = len(servos)
         self.limiter = JerkLimiter(self.limits, DT_S, chase)

@@ -94,8 +94,8 @@ FAULTS = (
         "servo/codecs/protocol1.py", "if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:", "if False:", WIRE
     ),
     Fault("servo/codecs/protocol1.py", "if servo == 0xFF or length < 2:", "if length < 2:", WIRE),
-    Fault("servo/codecs/dxl1.py", "bytes([length, servo, address])", "bytes([servo, length, address])", WIRE),
-    Fault("servo/codecs/feetech.py", "bytes([address, length, *servos])", "bytes([length, address, *servos])", WIRE),
+    Fault("servo/codecs/protocol1.py", "bytes([length, servo, address])", "bytes([servo, length, address])", WIRE),
+    Fault("servo/codecs/protocol1.py", "bytes([address, length, *servos])", "bytes([length, address, *servos])", WIRE),
     Fault("servo/codecs/maestro.py", "bytes([value & 0x7F, value >> 7])", "bytes([value >> 7, value & 0x7F])", WIRE),
     Fault("servo/codecs/maestro.py", "if not 0 <= value <= MAX_WORD:", "if not 0 <= value:", WIRE),
     Fault("servo/codecs/ssc32.py", "if not MIN_PULSE_US <= move.pulse_us <= MAX_PULSE_US:", "if False:", WIRE),

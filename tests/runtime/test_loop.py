@@ -17,7 +17,7 @@ from sfms_robot.ports import Source, Tick
 from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive, turned_by_hand
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.paired import PairedSource
 
@@ -126,8 +126,8 @@ def chain_state(chain: Chain, clock: VirtualClock) -> dict[int, dict[str, int]]:
     link = Dynamixel2Link(VirtualTimePort(chain.device, chain.control, 4_000_000, clock), 4_000_000, 0.05)
     try:
         ids = [joint.id for joint in HEAD.joints.values()]
-        torque = link.sync_read(64, 1, ids)
-        present = link.sync_read(132, 4, ids)
+        torque = link.read_many(64, 1, ids)
+        present = link.read_many(132, 4, ids)
     finally:
         link.port.close()
     return {

@@ -2,12 +2,11 @@
 
 import numpy as np
 from emulated_devices import device_of, servos_of
-from emulated_port import EmulatedPort, Straight
+from emulated_port import EmulatedPort, Straight, bus_servo
 from virtual_time import Time
 
 from sfms_robot.config import BusConfig, Safety, load_firmware_map
 from sfms_robot.servo.families import family_named
-from sfms_robot.servo.policy import BusServo
 
 LIMIT_RAD = 0.7
 
@@ -32,7 +31,7 @@ class Bench:
         self.clock, self.ports = Time(), []
         self.board = device_of(*servos_of(model, *channels, baud=baud, registers={"crc": 1} if crc[1] else {}))
         safety = {True: Safety(stop="hold"), False: Safety()}
-        servos = [BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety[i in stiff]) for i in channels]
+        servos = [bus_servo(f"joint{i}", i, firmware_map, limit_rad, safety=safety[i in stiff]) for i in channels]
 
         def open_port():
             self.ports.append(self.new_port(self.board, baud, self.clock))

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 from emulated_devices import device_of, servos_of
-from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight
+from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight, bus_servo
 
 from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmware_map
 from sfms_robot.servo.chain.chain_bus import ChainBus
+from sfms_robot.config import Bus, Faults, FirmwareMap, Safety, load_firmware_map
+from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.families import families
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 
 LIMIT_RAD = 1.0
@@ -31,8 +32,7 @@ def bus_of(
 ) -> Any:
     """A bus of the joints joint1, ... as a head names them; `config` as in a head's file."""
     servos = [
-        BusServo(f"joint{i}", i, each, -limit_rad, limit_rad, safety or Safety())
-        for i, each in zip(ids, maps, strict=True)
+        bus_servo(f"joint{i}", i, each, limit_rad, safety=safety or Safety()) for i, each in zip(ids, maps, strict=True)
     ]
     of = maps[0].family, maps[0].protocol
     name, family = next((name, each) for name, each in families().items() if each.maps == of)

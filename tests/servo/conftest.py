@@ -12,8 +12,7 @@ from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.servo.chain.dynamixel2_bus import Dynamixel2Bus
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Bus, Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 
 

@@ -7,13 +7,38 @@ from dataclasses import dataclass, field
 import numpy as np
 from virtual_time import Time
 
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
-from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.protocol1_link import Protocol1Link
+from sfms_robot.servo.chain.link import TRIES, RegisterLink, finish
+from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink, Protocol1Startup
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Link, Dynamixel2Startup
+from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of, start_up
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
 
 BAUD = 1_000_000
 SILENCE_S = 0.003
+
+
+def bus_servo(joint, servo_id, firmware_map, limit_rad=1.0, **more):
+    """A servo whose joint moves as far to both sides."""
+    limits = {"min_rad": -limit_rad, "max_rad": limit_rad}
+    return BusServo(joint=joint, id=servo_id, map=firmware_map, **limits, **more)
+
+
+def startups_on(port, servos, conversion):
+    """The startups of these servos over `port`, and what runs them all through."""
+    table = Table.of(servos[0].map)
+    link, kind = link_on(port, table), Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
+    pairs = zip(servos, needs_of(servos, conversion), strict=True)
+    startups = [kind(servo, Table.of(servo.map), needs, {}) for servo, needs in pairs]
+    for each in startups:
+        each.attach(link)
+    return startups, lambda: start_up("face", link, startups, port.baud)
+
+
+def switched_on(startup):
+    """Torque on, as `enable` does it; the position held."""
+    with startup._link.patient(PATIENCE_S, TRIES):
+        return finish(startup.torque_on(), startup._link.wait)
 
 
 class Straight:
@@ -150,9 +175,8 @@ class ScriptedPort(EmulatedPort):
 
 
 def link_on(port: EmulatedPort, table: Table) -> RegisterLink:
-    if table.protocol == 2:
-        return Dynamixel2Link(port, port.baud, SILENCE_S)
-    return Protocol1Link(port, port.baud, SILENCE_S, table.family)
+    kinds = {("dynamixel", 2): Dynamixel2Link, ("dynamixel", 1): Dynamixel1Link, ("feetech", 1): FeetechLink}
+    return kinds[table.family, table.protocol](port, port.baud, SILENCE_S)
 
 
 class Says:

@@ -3,7 +3,7 @@
 import pytest
 from emulated_port import ScriptedPort
 
-from sfms_robot.servo.chain.duplicate_ids import ping_replies
+from sfms_robot.servo.chain.link import ping_replies
 from sfms_robot.servo.codecs import dxl2, protocol1
 
 ONE = dxl2.encode_status(3, 0, bytes([0xB0, 0x04, 53]))

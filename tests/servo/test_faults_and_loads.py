@@ -4,15 +4,17 @@ import logging
 
 import numpy as np
 import pytest
+from emulated_port import bus_servo
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.fault_reporter import FaultReporter
 from sfms_robot.servo.chain.member import Member, State
-from sfms_robot.servo.policy import BusServo, Measured, counts, load_rules
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
+from sfms_robot.servo.policy import counts, load_rules
 from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import JointNeeds
 
 RAD_PER_TICK = 2 * np.pi / 4096
 OVERLOAD, VOLTAGE = 1 << 5, 1 << 0
@@ -23,7 +25,7 @@ def three(make_rig, **more):
 
 
 def register(rig, servo, name):
-    field = rig.bus._tables[0][name]
+    field = rig.bus._startups[0].table[name]
     return field.from_bytes(rig.bus._link.read(servo, field.address, field.size).data)
 
 
@@ -94,8 +96,8 @@ def test_masked_fault_does_not_hide_another(make_rig):
 @given(st.floats(0.0, 30.0))
 def test_threshold_decides_by_what_is_measured(voltage_V):
     faults = Faults(thresholds={"input voltage": Threshold(min=4.5, max=7.8)})
-    assert counts("input voltage", faults, Measured(voltage_V=voltage_V)) == (not 4.5 <= voltage_V <= 7.8)
-    assert counts("input voltage", faults, Measured()) and counts("overload", faults, Measured(voltage_V=voltage_V))
+    assert counts("input voltage", faults, {"input voltage": voltage_V}) == (not 4.5 <= voltage_V <= 7.8)
+    assert counts("input voltage", faults, {}) and counts("overload", faults, {"input voltage": voltage_V})
 
 
 def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_rig):
@@ -110,8 +112,9 @@ def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_ri
 
 
 def jaw(**safety):
-    servo = BusServo("jaw", 1, load_firmware_map("xl330-m288"), -1.0, 1.0, Safety(**safety))
-    return servo, Member(0, servo, Table.of(servo.map), Faults(), FaultReporter())
+    servo = bus_servo("jaw", 1, load_firmware_map("xl330-m288"), safety=Safety(**safety))
+    startup = Dynamixel2Startup(servo, Table.of(servo.map), JointNeeds(0, 4095), {})
+    return servo, Member(0, startup, Faults(), {})
 
 
 @given(st.lists(st.floats(0, 99), min_size=1, max_size=30))

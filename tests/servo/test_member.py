@@ -1,15 +1,13 @@
 """One servo's states: a test per arrow of the diagram in docs/safety.md. Without a wire, times are given."""
 
 import pytest
+from emulated_port import bus_servo
 
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain import member as rules
-from sfms_robot.servo.chain.fault_reporter import FaultReporter
-from sfms_robot.servo.chain.liveness import LONGEST_PAUSE_S
-from sfms_robot.servo.chain.member import Member, State
+from sfms_robot.servo.chain.member import LONGEST_PAUSE_S, Member, State
 from sfms_robot.servo.chain.startup import Silent
-from sfms_robot.servo.policy import BusServo, Measured
 from sfms_robot.servo.registers import Table
 
 OVERLOAD = 1 << 5
@@ -21,11 +19,13 @@ class Way:
 
     can_reboot = True
 
-    def __init__(self):
+    def __init__(self, **safety):
+        self.servo = bus_servo("jaw", 4, load_firmware_map("xl330-m288"), safety=Safety(**safety))
+        self.table = Table.of(self.servo.map)
         self.failure = None
         self.asked = []
 
-    def bring_back(self, index, reboot):
+    def bring_back(self, reboot):
         self.asked.append(reboot)
         yield 0.5 if reboot else 0.0
         if self.failure is not None:
@@ -45,10 +45,9 @@ def member(way):
 
 def made(way, **safety):
     """An enabled servo."""
-    servo = BusServo("jaw", 4, load_firmware_map("xl330-m288"), -1.0, 1.0, Safety(**safety))
-    member = Member(0, servo, Table.of(servo.map), Faults(), FaultReporter())
-    member.attach(way)
-    member.connected()
+    way.servo = Way(**safety).servo
+    member = Member(0, way, Faults(), {})
+    member.connected(True)
     member.enabled()
     return member
 
@@ -65,7 +64,7 @@ def silent(member, now_s=0.0):
 
 
 def fails(member, now_s=0.0):
-    member.take_bits(OVERLOAD, Measured(), now_s)
+    member.take_bits(OVERLOAD, {}, now_s)
 
 
 def test_off_to_online_by_enable(way):
@@ -75,21 +74,23 @@ def test_off_to_online_by_enable(way):
 
 def test_online_to_silent_when_a_probe_is_in_vain_and_not_before(member):
     member.suspect(0.0)
-    assert member.state is State.ONLINE and not member.liveness.listed
+    assert member.state is State.ONLINE and not member.listed
     member.probe_failed(0.05)
     assert member.state is State.SILENT and not member.gets_goals and member.fault == "no answer"
 
 
 def test_one_lost_answer_is_forgiven_and_the_second_is_not(member):
-    assert not member.unanswered(0.0)
-    member.answered()
-    assert not member.unanswered(0.1)
-    assert member.unanswered(0.2)
+    for now_s, answers in ((0.0, True), (0.1, False), (0.2, True)):
+        member.unanswered(now_s)
+        assert member.listed is (now_s < 0.2)
+        if answers:
+            member.answered()
 
 
 def test_silent_to_returning_to_rejoining_to_online(member):
     silent(member)
-    assert member.answered()
+    assert not member.listed
+    member.answered()
     member.back(1.0)
     assert member.state is State.RETURNING and not member.gets_goals
     run(member, 1.0)
@@ -101,7 +102,7 @@ def test_silent_to_returning_to_rejoining_to_online(member):
 
 def test_off_to_silent_by_enable_of_one_that_is_absent(way):
     member = made(way)
-    member.absent()
+    member.connected(False)
     member.awaited()
     assert member.state is State.SILENT and member.fault == "no answer"
     member.answered()
@@ -337,7 +338,7 @@ def test_loose_contact_is_said_once_in_ten_seconds_with_a_count(member, caplog):
     assert said == [
         "jaw (id 4) is silent",
         "jaw (id 4) answers again",
-        "jaw (id 4) is silent (99 times since the last word)",
+        "jaw (id 4) is silent (99 times since the last message)",
         "jaw (id 4) answers again",
     ]
 
@@ -346,7 +347,7 @@ def test_probes_of_a_dead_servo_become_rare_and_never_stop(member):
     member.suspect(0.0)
     probes = []
     for k in range(2000):
-        if member.liveness.probe_s <= 0.01 * k:
+        if member.probe_s <= 0.01 * k:
             probes.append(0.01 * k)
             member.probe_failed(0.01 * k)
     gaps = [b - a for a, b in zip(probes, probes[1:], strict=False)]

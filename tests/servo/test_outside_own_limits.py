@@ -6,18 +6,15 @@ import math
 import pytest
 from chain_rig import ServoRig
 from emulated_devices import device_of, servos_of
-from emulated_port import BAUD, LossyPort, Straight, link_on
+from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_on
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
-from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
-from sfms_robot.servo.chain.slow_profile import SPEED_DEG_S, way_inside
-from sfms_robot.servo.chain.verified_write import Silent, finish
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.chain.link import Silent, finish
+from sfms_robot.servo.chain.startup import SPEED_DEG_S, way_inside
 from sfms_robot.servo.registers import Table
 
 MODELS = ("xl330-m288", "mx-28-2.0", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
@@ -28,7 +25,7 @@ BY_TIME = 0x04  # drive mode
 class Rig(ServoRig):
     """One servo that stands `outside_deg` beyond an end of what it has stored (below 0: the lower one)."""
 
-    def __init__(self, model, outside_deg, registers=None, tries=3):
+    def __init__(self, model, outside_deg, registers=None):
         firmware_map = load_firmware_map(model)
         self.table = table = Table.of(firmware_map)
         self.deg = 360.0 / table.ticks_per_revolution
@@ -44,10 +41,8 @@ class Rig(ServoRig):
         self.leg = self.servo(1)
         self.fastest_deg_s, self.goals = 0.0, []
         self.port.write = self._watched(self.port.write)
-        limit_rad = LIMIT_DEG * 6.283185307179586 / 360.0
-        servos = [BusServo("leg", 1, firmware_map, -limit_rad, limit_rad, Safety())]
-        kind = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
-        self.startup = kind("neck", link_on(self.port, table), servos, [table], Straight(table), BAUD, tries)
+        servos = [bus_servo("leg", 1, firmware_map, LIMIT_DEG * 6.283185307179586 / 360.0)]
+        self.startups, self.start_up = startups_on(self.port, servos, Straight(table))
 
     def _watched(self, write):
         def watched(data):
@@ -64,8 +59,8 @@ class Rig(ServoRig):
 
     def on_the_way(self):
         """The steps of a startup that has its servo moving by now."""
-        self.startup.run()
-        steps = self.startup.torque_on(0)
+        self.start_up()
+        steps = self.startups[0].torque_on()
         while not (self.state()["torque"] and self.state()["speed"]):
             self.clock.t += next(steps)
         return steps
@@ -77,7 +72,7 @@ class Rig(ServoRig):
         return self.limits[0] <= round(ticks) <= self.limits[1]
 
     def usual_profile(self):
-        wanted = self.startup.wanted(0)
+        wanted = self.startups[0].wanted()
         return {name: self.held(name) for name in wanted} == dict(wanted)
 
 
@@ -85,8 +80,8 @@ class Rig(ServoRig):
 @pytest.mark.parametrize("model", MODELS)
 def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, outside_deg):
     rig = Rig(model, outside_deg)
-    rig.startup.run()
-    held = rig.startup.switch_on(0)
+    rig.start_up()
+    held = switched_on(rig.startups[0])
     assert rig.inside(held) and rig.held("torque_enable") == 1 and rig.held("goal_position") == held
     assert rig.usual_profile()
     assert all(rig.inside(goal) for goal in rig.goals)
@@ -99,8 +94,8 @@ def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, 
 @pytest.mark.parametrize("model", ["xl330-m288", "mx-28-2.0"])
 def test_a_profile_that_is_told_in_time_is_as_slow(model):
     rig = Rig(model, -12.0, {"drive_mode": BY_TIME})
-    rig.startup.run()
-    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    rig.start_up()
+    assert rig.inside(switched_on(rig.startups[0])) and rig.usual_profile()
     assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
@@ -110,28 +105,28 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
     rig = Rig(model, -5.0)
     rig.port.fate = iter(fate)
     try:
-        rig.startup.run()
-        held = rig.startup.switch_on(0)
+        rig.start_up()
+        held = switched_on(rig.startups[0])
         assert rig.inside(held) and rig.usual_profile()
     except (BusError, ServoError):
         assert set(fate) - {""}
     assert all(rig.inside(goal) for goal in rig.goals)
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
     rig.port.fate, rig.clock.t = iter(()), rig.clock.t + 0.3
-    rig.startup.run()  # by now perhaps inside, perhaps lost half way
-    assert rig.inside(rig.startup.switch_on(0)) and rig.usual_profile()
+    rig.start_up()  # by now perhaps inside, perhaps lost half way
+    assert rig.inside(switched_on(rig.startups[0])) and rig.usual_profile()
     assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_one_that_does_not_come_is_let_go_and_named(model):
     rig = Rig(model, 12.0)
-    rig.startup.run()
+    rig.start_up()
     rig.leg.plant.stuck = True
     low, high = rig.limits
     expected = rf"leg \(id 1\) stands at {rig.start}, outside its own limits {low}\.\.{high}.*torque is off"
     with pytest.raises(ServoError, match=expected):
-        rig.startup.switch_on(0)
+        switched_on(rig.startups[0])
     assert not rig.state()["torque"] and rig.clock.t < 5.0 and rig.usual_profile()
 
 
@@ -162,9 +157,9 @@ def test_one_that_was_lost_sight_of_half_way_is_let_go_before_its_profile_is_mad
         finish(steps)
     rig.port.fate = iter(())
     assert rig.state()["torque"]  # nobody could tell it
-    rig.startup.run()
+    rig.start_up()
     assert not rig.state()["torque"] and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
-    assert rig.inside(rig.startup.switch_on(0)) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert rig.inside(switched_on(rig.startups[0])) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
 @given(low=st.integers(0, 4000), width=st.integers(1, 4095), present=st.integers(0, 4095))
@@ -189,8 +184,8 @@ def test_one_that_would_go_round_the_other_side_is_refused():
     rig.limits = (20, 3000)
     assert table.center_ticks == 2048
     with pytest.raises(ServoError, match=r"stands at 4060, outside its own limits 20\.\.3000.*turn it in by hand"):
-        rig.startup.run()
-        rig.startup.switch_on(0)
+        rig.start_up()
+        switched_on(rig.startups[0])
     assert not rig.state()["torque"]
 
 

@@ -12,10 +12,9 @@ from virtual_time import Time
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.port import SerialPort, VirtualTimePort
-from sfms_robot.servo.serial_io import WRITE_TIMEOUT_S
+from sfms_robot.servo.port import WRITE_TIMEOUT_S, SerialPort, VirtualTimePort
 
 
 @contextmanager

@@ -1,8 +1,7 @@
 import pytest
 
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.servo.discovery import SerialDevice
-from sfms_robot.servo.port_choice import choose_ports, parse_ports
+from sfms_robot.servo.discovery import SerialDevice, choose_ports, parse_ports
 
 USB0, USB1 = SerialDevice("/dev/ttyUSB0", vendor="0403"), SerialDevice("/dev/ttyUSB1", vendor="1a86")
 BUILT_IN = SerialDevice("/dev/ttyS0")

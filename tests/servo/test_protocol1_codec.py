@@ -8,7 +8,7 @@ from published import byte_by_byte, rows
 from vendor_port import VendorPort
 
 from sfms_robot.errors import PacketError
-from sfms_robot.servo.codecs import dxl1, feetech, protocol1
+from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import Frame, encode, salvage
 from sfms_robot.servo.codecs.protocol1 import maybe_frame as take
 
@@ -42,12 +42,12 @@ def frame_of(name: str) -> Frame:
 
 def test_known_requests_mean_what_their_names_say():
     goals = frame_of("AX sync write goal+speed ids 0 1 2 3")
-    address, parts = dxl1.sync_write_parts(goals.params)
+    address, parts = protocol1.sync_write_parts(goals.params)
     assert (address, dict(parts)[1].hex()) == (0x1E, "20026003")
     sync = frame_of("sync read pos+speed (56,4) ids 1 2")
-    assert (sync.code, feetech.sync_read_parts(sync.params)) == (feetech.SYNC_READ, (56, 4, b"\x01\x02"))
-    assert feetech.sync_read_params(56, 4, [1, 2]) == sync.params
-    assert frame_of("clear turns id1").code == feetech.RESET_TURNS
+    assert (sync.code, protocol1.sync_read_parts(sync.params)) == (protocol1.SYNC_READ, (56, 4, b"\x01\x02"))
+    assert protocol1.sync_read_params(56, 4, [1, 2]) == sync.params
+    assert frame_of("clear turns id1").code == protocol1.RESET_TURNS
 
 
 @given(ids, codes, params)
@@ -57,13 +57,13 @@ def test_round_trip(servo, code, data):
 
 @given(st.dictionaries(st.integers(0, 253), st.binary(min_size=3, max_size=3), min_size=1, max_size=40))
 def test_sync_write_round_trip(values):
-    address, parts = dxl1.sync_write_parts(dxl1.sync_write_params(30, values))
+    address, parts = protocol1.sync_write_parts(protocol1.sync_write_params(30, values))
     assert (address, dict(parts)) == (30, values)
 
 
 @given(st.lists(st.tuples(st.integers(0, 253), st.integers(0, 255), st.integers(1, 255)), max_size=40))
 def test_bulk_read_round_trip(requests):
-    assert list(dxl1.bulk_read_parts(dxl1.bulk_read_params(requests))) == requests
+    assert list(protocol1.bulk_read_parts(protocol1.bulk_read_params(requests))) == requests
 
 
 def test_frame_too_long_for_its_length_byte_is_refused():
@@ -136,8 +136,8 @@ def test_changed_length_passes_where_a_parameter_happens_to_be_the_right_sum():
 
 
 def test_error_bits_about_the_request_are_told_from_those_about_the_servo():
-    assert dxl1.refusal_text(dxl1.RANGE | dxl1.OVERLOAD) == "range error"
-    assert dxl1.refusal_text(dxl1.OVERLOAD | dxl1.VOLTAGE | dxl1.OVERHEATING) == ""
+    assert protocol1.refusal_text(protocol1.RANGE | protocol1.OVERLOAD) == "range error"
+    assert protocol1.refusal_text(protocol1.OVERLOAD | protocol1.VOLTAGE | protocol1.OVERHEATING) == ""
 
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=200))
@@ -152,7 +152,7 @@ def test_sync_writes_are_those_of_the_vendor_sdk(values):
     port = VendorPort()
     flat = [byte for servo, data in values.items() for byte in (servo, *data)]
     Protocol1PacketHandler().syncWriteTxOnly(port, 30, 2, flat, len(flat))
-    assert port.written == encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, dxl1.sync_write_params(30, values))
+    assert port.written == encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(30, values))
 
 
 @given(st.integers(0, 252), st.integers(0, 127), st.binary(min_size=1, max_size=100))

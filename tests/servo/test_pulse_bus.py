@@ -4,14 +4,13 @@ import math
 import numpy as np
 import pytest
 from board_rig import LIMIT_RAD, Bench
-from emulated_port import EmulatedPort, Says, Straight
+from emulated_port import EmulatedPort, Says, Straight, bus_servo
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.servo.boards.maestro_bus import MaestroBus
 from sfms_robot.servo.codecs import maestro, ssc32
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.pulse_bus import MaestroBus
 
 KINDS = ("maestro-24", "maestro-6", "ssc-32")
 
@@ -219,7 +218,7 @@ def test_absent_board_is_named(bench):
 
 
 def test_channel_that_the_board_does_not_have_is_refused():
-    with pytest.raises(ConfigError, match=r"joints.joint9.id = 9 is no channel of a maestro-6 \(0..5\)"):
+    with pytest.raises(ConfigError, match=r"joints.joint9.id: expected a channel of a maestro-6 \(0..5\), got 9"):
         Bench("maestro-6", channels=[0, 9])
 
 
@@ -236,7 +235,7 @@ def test_range_beyond_the_factory_limits_of_a_maestro_is_said(caplog):
 
 def test_two_boards_on_one_bus_are_refused():
     six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
-    servos = [BusServo("a", 0, six, -0.1, 0.1), BusServo("b", 1, all_, -0.1, 0.1)]
+    servos = [bus_servo("a", 0, six, 0.1), bus_servo("b", 1, all_, 0.1)]
     with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
         MaestroBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200)
 

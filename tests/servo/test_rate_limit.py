@@ -1,6 +1,6 @@
 from emulated_port import EmulatedPort, Says
 
-from sfms_robot.servo.boards.rate_limit import RateLimitedPort
+from sfms_robot.servo.boards import RateLimitedPort
 
 
 def wire_of(baud=9600, patience_s=0.02):

@@ -3,18 +3,15 @@
 import pytest
 from chain_rig import ServoRig
 from emulated_devices import device_of
-from emulated_port import BAUD, LossyPort, Straight, link_on
+from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_on
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Safety, load_firmware_map
 from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
-from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
-from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
+from sfms_robot.servo.chain.link import Silent, finish
 from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of
-from sfms_robot.servo.chain.verified_write import Silent, finish
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, contradictions, offset_ticks
 
@@ -26,21 +23,19 @@ WITH_TURNS = ("xl330-m288", "mx-28-2.0")
 class Rig(ServoRig):
     """A few servos of one model, and the startup of a bus that wants ids 1, 2, ..."""
 
-    def __init__(self, model, *rows, limit_rad=LIMIT_RAD, ratio=1.0, wanted=None, stored=None, safety=None, tries=3):
+    def __init__(self, model, *rows, limit_rad=LIMIT_RAD, ratio=1.0, wanted=None, stored=None, safety=None):
         firmware_map = load_firmware_map(model)
         self.table = Table.of(firmware_map)
         usual = {"model": model, "start_ticks": self.table.center_ticks}
         there = [EmulatedServo(**{"id": i, **usual, **row}) for i, row in enumerate(rows or ({},), 1)]
         self.port = LossyPort(device_of(*there))
         servos = [
-            BusServo(f"joint{i}", i, firmware_map, -limit_rad, limit_rad, safety or Safety(stored=stored or {}))
+            bus_servo(f"joint{i}", i, firmware_map, limit_rad, safety=safety or Safety(stored=stored or {}))
             for i in wanted or range(1, 1 + len(there))
         ]
-        kind = Dynamixel2Startup if self.table.protocol == 2 else Protocol1Startup
         conversion = Straight(self.table, ratio=ratio)
         self.needs = needs_of(servos, conversion)
-        link = link_on(self.port, self.table)
-        self.startup = kind("face", link, servos, [self.table] * len(servos), conversion, BAUD, tries)
+        self.startups, self.start_up = startups_on(self.port, servos, conversion)
 
     def held(self, name, servo=1):
         return self.register(servo, name)
@@ -64,8 +59,8 @@ def limits_of(table):
 @pytest.mark.parametrize("model", MODELS)
 def test_absent_servos_do_not_stop_the_others(model):
     rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
-    assert rig.startup.run() == {0: 0, 2: 0}
-    assert rig.startup.switch_on(2) == rig.table.center_ticks
+    assert rig.start_up() == {0: 0, 2: 0}
+    assert switched_on(rig.startups[2]) == rig.table.center_ticks
     assert [rig.held("torque_enable", i) for i in (1, 3)] == [0, 1]
     assert rig.clock.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
 
@@ -76,7 +71,7 @@ def test_nobody_at_all_is_a_failed_bus(model):
     with pytest.raises(
         BusError, match=r"no answer from id 1 \(joint1\), 2 \(joint2\); look for them: sfms-robot servo"
     ):
-        rig.startup.run()
+        rig.start_up()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -85,8 +80,8 @@ def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
     rig = Rig(model, {"id": 1, "start_ticks": 500})
     rig.port.fate = iter(fate)
     try:
-        rig.startup.run()
-        assert rig.startup.switch_on(0) == 500
+        rig.start_up()
+        assert switched_on(rig.startups[0]) == 500
     except (BusError, ServoError):
         assert set(fate) - {""}
     if rig.held("torque_enable"):
@@ -96,9 +91,9 @@ def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
 
 def test_a_servo_that_was_away_and_is_mute_is_silent_and_not_refused():
     rig = Rig("xl330-m288", {"id": 2}, wanted=[1, 2])
-    rig.startup.run()
+    rig.start_up()
     with pytest.raises(Silent):
-        finish(rig.startup.bring_back(0, reboot=False))
+        finish(rig.startups[0].bring_back(reboot=False))
 
 
 # --- position limits --------------------------------------------------------------------------------------------
@@ -116,7 +111,7 @@ def test_limits_narrower_than_the_joint_are_refused_with_what_to_type(model):
         match=rf"^lossy: servo 1 \(joint1\): {low} is {stored[low]}, wanted {rig.needs[0].low_ticks}"
         r".*; sfms-robot doctor --port PORT --head HEAD --fix$",
     ):
-        rig.startup.run()
+        rig.start_up()
     assert {low, high} <= rig.found().keys()
     assert rig.held("torque_enable") == 0
 
@@ -130,10 +125,10 @@ def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_lim
     rig = Rig(model, {"registers": dict(zip(names, ends, strict=True))})
     reached = ends[0] <= rig.needs[0].low_ticks and rig.needs[0].high_ticks <= ends[1]
     if reached:
-        rig.startup.run()
+        rig.start_up()
     else:
         with pytest.raises(ServoError, match="position_limit|angle_limit"):
-            rig.startup.run()
+            rig.start_up()
     for each in rig.found().values():  # what is proposed mends it
         rig = Rig(model, {"registers": rig.values() | {each.register: each.wanted}})
         assert each.register not in rig.found()
@@ -142,7 +137,7 @@ def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_lim
 @pytest.mark.parametrize("model", ["ax-12a", "mx-28-1.0", "xl-320"])
 def test_wheel_mode_is_ended(model):
     rig = Rig(model, {"registers": {"cw_angle_limit": 0, "ccw_angle_limit": 0}})
-    rig.startup.run()
+    rig.start_up()
     assert (rig.held("cw_angle_limit"), rig.held("ccw_angle_limit")) == (0, rig.table["ccw_angle_limit"].high)
 
 
@@ -168,10 +163,10 @@ def test_what_would_move_a_joint_wrongly_is_refused_until_the_file_declares_it(m
     declared = {} if said is None else {name: said}
     rig = Rig(model, {"registers": {name: now}}, stored=declared)
     with pytest.raises(ServoError, match=rf"servo 1 \(joint1\): {name} is {now}, wanted .* doctor --port") as refused:
-        rig.startup.run()
+        rig.start_up()
     assert why in str(refused.value)
     assert rig.found()[name].in_file and rig.held("torque_enable") == 0 and rig.held(name) == now
-    Rig(model, {"registers": {name: now}}, stored={name: now}).startup.run()
+    Rig(model, {"registers": {name: now}}, stored={name: now}).start_up()
 
 
 def test_an_sts_offset_counts_with_its_own_sign():
@@ -194,7 +189,7 @@ def test_an_sts_offset_counts_with_its_own_sign():
 def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_its_own_sign(shaft, offset):
     table = Table.of(load_firmware_map("sts3215"))
     values = {"present_position": shaft - offset, "homing_offset": offset, "phase": 28}
-    needs = JointNeeds(1462, 2634, {"homing_offset": offset})
+    needs = JointNeeds(1462, 2634, stored={"homing_offset": offset})
     assert contradictions(values, table, needs) == []
 
 
@@ -204,15 +199,15 @@ def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_
 def test_torque_at_power_up_is_refused():
     rig = Rig("xl330-m288", {"registers": {"startup_configuration": 3}})
     with pytest.raises(ServoError, match="startup_configuration is 3, wanted 2: its torque comes on at power-up"):
-        rig.startup.run()
+        rig.start_up()
 
 
 def test_a_secondary_id_that_is_another_servo_of_the_head_is_refused():
     rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 2}}, {"id": 2})
     with pytest.raises(ServoError, match="secondary_id is 2, wanted 255: it would follow the goals of id 2 too"):
-        rig.startup.run()
+        rig.start_up()
     rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 77}})
-    rig.startup.run()
+    rig.start_up()
     assert rig.found()["secondary_id"].then == "told"
 
 
@@ -220,7 +215,7 @@ def test_a_secondary_id_that_is_another_servo_of_the_head_is_refused():
 def test_a_shutdown_mask_without_its_protections_is_told(model):
     name = "unloading_condition" if model == "sts3215" else "shutdown"
     rig = Rig(model, {"registers": {name: 0}})
-    rig.startup.run()
+    rig.start_up()
     assert rig.held(name) == 0
     told = rig.found()[name]
     assert told.then == "told" and "overload" in told.why and "overheating" in told.why
@@ -231,7 +226,7 @@ def test_a_shutdown_mask_without_its_protections_is_told(model):
 def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
     rig = Rig(model)
     assert [each for each in rig.found().values() if each.then != "set"] == []
-    rig.startup.run()
+    rig.start_up()
     assert rig.found() == {}
 
 
@@ -242,8 +237,8 @@ def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
 @pytest.mark.parametrize("found", [4150, -100, 9000])
 def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
     rig = Rig(model, {"start_ticks": found})
-    rig.startup.run()
-    assert rig.startup.switch_on(0) == found % 4096
+    rig.start_up()
+    assert switched_on(rig.startups[0]) == found % 4096
     assert rig.held("torque_enable") == 1
     assert rig.servo(1).state(rig.clock.t + 1.0)["position"] == found % 4096
 
@@ -254,7 +249,7 @@ def test_turns_are_not_cleared_under_torque():
     for name, value in (("goal_position", 4150), ("torque_enable", 1)):
         servo.write(rig.table[name].address, rig.table[name].to_bytes(value), 0.0)
     with pytest.raises(ServoError, match="present_position is 4150, wanted 54: it was turned past one turn"):
-        rig.startup.run()
+        rig.start_up()
     assert servo.state(rig.clock.t)["torque"]
 
 
@@ -268,7 +263,7 @@ def test_a_servo_that_cannot_forget_its_turns_is_refused_with_the_way_out():
 def test_an_offset_shifts_the_one_turn_that_there_is():
     """Of a servo with a homing offset of a quarter turn, readings up to 5119 are no turn too many."""
     rig = Rig("xl330-m288", {"start_ticks": 5000, "registers": {"homing_offset": 1024}}, stored={"homing_offset": 1024})
-    rig.startup.run()
+    rig.start_up()
     assert rig.servo(1).state(rig.clock.t)["position"] == 5000
 
 
@@ -280,9 +275,9 @@ GEARED = {"ratio": 4.0, "limit_rad": 1.2}  # 2048 +- 3129 ticks
 @pytest.mark.parametrize("model", WITH_TURNS)
 def test_a_geared_joint_works_in_extended_position_control(model):
     rig = Rig(model, **GEARED)
-    rig.startup.run()
-    assert rig.held("operating_mode") == 4 and rig.startup.wanted(0)["operating_mode"] == 4
-    rig.startup.switch_on(0)
+    rig.start_up()
+    assert rig.held("operating_mode") == 4 and rig.startups[0].wanted()["operating_mode"] == 4
+    switched_on(rig.startups[0])
     servo, goal = rig.servo(1), rig.table["goal_position"]
     assert servo.write(goal.address, goal.to_bytes(5000), rig.clock.t) == 0
     assert servo.state(rig.clock.t + 60.0)["position"] == pytest.approx(5000, abs=2)
@@ -295,35 +290,35 @@ def test_torque_comes_on_only_where_the_lost_count_of_turns_leaves_one_place(tic
     rig = Rig("xl330-m288", {"start_ticks": read}, **GEARED)
     places = [read + turn * 4096 for turn in (-2, -1, 0, 1, 2)]
     if [each for each in places if -1081 <= each <= 5177] == [read] == [ticks]:
-        rig.startup.run()
-        assert rig.startup.switch_on(0) == ticks
+        rig.start_up()
+        assert switched_on(rig.startups[0]) == ticks
     else:
         with pytest.raises(ServoError, match="turns is lost.*by hand to where it will read 1082..3014"):
-            rig.startup.run()
+            rig.start_up()
         assert not rig.servo(1).state(rig.clock.t)["torque"]
 
 
 def test_a_geared_joint_that_kept_its_torque_kept_its_count():
     rig = Rig("xl330-m288", **GEARED)
-    rig.startup.run()
-    rig.startup.switch_on(0)
+    rig.start_up()
+    switched_on(rig.startups[0])
     servo, goal = rig.servo(1), rig.table["goal_position"]
     servo.write(goal.address, goal.to_bytes(5000), rig.clock.t)
     servo.advance(60.0)
     rig.clock.t = 60.0
-    assert rig.startup.run() == {0: 0}
-    assert finish(rig.startup.bring_back(0, reboot=False)) == pytest.approx(5000, abs=2)
+    assert rig.start_up() == {0: 0}
+    assert finish(rig.startups[0].bring_back(reboot=False)) == pytest.approx(5000, abs=2)
 
 
 def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
     rig = Rig("xl330-m288", {"start_ticks": 2000}, **GEARED)
-    rig.startup.run()
+    rig.start_up()
     servo = rig.servo(1)
     servo.turn(5150, rig.clock.t)
     servo.reboot(rig.clock.t)
     rig.clock.t += 1.0
     with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
-        finish(rig.startup.bring_back(0, reboot=False))
+        finish(rig.startups[0].bring_back(reboot=False))
 
 
 # --- settings ---------------------------------------------------------------------------------------------------
@@ -332,7 +327,7 @@ def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
 def test_a_register_above_those_that_are_polled_is_written_too():
     """XL-320: punch lies behind everything that tells the present."""
     rig = Rig("xl-320", safety=Safety(registers={"punch": 40}))
-    rig.startup.run()
+    rig.start_up()
     assert rig.held("punch") == 40
 
 
@@ -340,14 +335,14 @@ def test_a_register_above_those_that_are_polled_is_written_too():
 def test_a_register_that_the_model_does_not_have_is_named(model):
     rig = Rig(model, safety=Safety(registers={"no_such_register": 1}))
     with pytest.raises(ServoError, match=rf"is a {model}, which has no register no_such_register"):
-        rig.startup.run()
+        rig.start_up()
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_what_is_wanted_is_in_force_after_startup(model):
     rig = Rig(model, safety=Safety(torque_limit_percent=50))
-    rig.startup.run()
-    rig.startup.switch_on(0)
-    wanted = rig.startup.wanted(0)
+    rig.start_up()
+    switched_on(rig.startups[0])
+    wanted = rig.startups[0].wanted()
     assert wanted
     assert {name: rig.held(name) for name in wanted} == dict(wanted)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
-from sfms_robot.servo.chain.protocol1_link import Protocol1Link
-from sfms_robot.servo.chain.status_poll import Rotation, blocks_per_tick
+from sfms_robot.servo.chain.poll import Rotation, blocks_per_tick
+from sfms_robot.servo.chain.protocol1 import FeetechLink
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.protocol1 import encode
 from sfms_robot.servo.port import WrappedPort
@@ -92,13 +92,13 @@ def test_fast_answer_of_another_length_is_none():
 
 
 @pytest.mark.parametrize(
-    ("kind", "more", "answer", "held"),
+    ("kind", "answer", "held"),
     [
-        (Dynamixel2Link, (), dxl2.encode_status(1, 0, bytes(4)), "15.7 ms, so a silent servo costs 19.6 ms"),
-        (Protocol1Link, ("feetech",), encode(1, 0, bytes(4)), "15.8 ms, so a silent servo costs 19.8 ms"),
+        (Dynamixel2Link, dxl2.encode_status(1, 0, bytes(4)), "15.7 ms, so a silent servo costs 19.6 ms"),
+        (FeetechLink, encode(1, 0, bytes(4)), "15.8 ms, so a silent servo costs 19.8 ms"),
     ],
 )
-def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, held, caplog):
+def test_adapter_that_holds_answers_back_is_waited_for(kind, answer, held, caplog):
     class Slow(EmulatedPort):
         """An FTDI adapter as it comes: answers lie in it for 16 ms."""
 
@@ -114,8 +114,8 @@ def test_adapter_that_holds_answers_back_is_waited_for(kind, more, answer, held,
     def slow():
         return Slow(Says(answer), name="slow")
 
-    assert kind(slow(), 1_000_000, 0.003, *more).read(1, 132, 4) is None
-    link = kind(slow(), 1_000_000, 0.003, *more)
+    assert kind(slow(), 1_000_000, 0.003).read(1, 132, 4) is None
+    link = kind(slow(), 1_000_000, 0.003)
     with caplog.at_level(logging.WARNING):
         assert link.adapt(1, 132, 4) == pytest.approx(0.02, abs=0.001)
     assert f"slow: an answer is held back for {held}" in caplog.text

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.errors import ServoError
-from sfms_robot.servo.chain.verified_write import Silent, finish, verified_write
+from sfms_robot.servo.chain.link import Silent, finish, verified_write
 
 MODELS = ("xl330-m288", "xl-320", "ax-12a", "mx-28-1.0", "sts3215", "scs0009")
 FATES = st.lists(st.sampled_from(["", "", "request", "answer"]), max_size=24)

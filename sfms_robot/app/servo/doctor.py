@@ -39,8 +39,8 @@ from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_s
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.boards.rate_limit import RateLimitedPort
-from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.boards import RateLimitedPort
+from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import family_named, servo_families
@@ -190,7 +190,13 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     for name, low, high in zip(joints, ranges.low_ticks, ranges.high_ticks, strict=True):
         joint = joints[name]
         bounded = head.safety_of(name).current_limit_mA is not None
-        needs = JointNeeds(int(low), int(high), head.safety_of(name).stored, ids - {joint.id}, bounded)
+        needs = JointNeeds(
+            int(low),
+            int(high),
+            stored=head.safety_of(name).stored,
+            other_ids=ids - {joint.id},
+            bounded_current=bounded,
+        )
         found[joint.id] = Wanted(name, joint.model, maps[joint.model].model_number, masked, thresholds, needs)
     return found
 
@@ -361,8 +367,8 @@ def _fast_read_works(wire: Wire, members: Sequence[State]) -> bool | None:
     alike = [state.seen.id for state in members if field is not None and _table(state).role(field.name) == field]
     if field is None:
         return None
-    link = cast(Dynamixel2Link, wire.link)
-    return any(set(link.fast_sync_read(field.address, field.size, alike)) == set(alike) for _ in range(2))
+    where = field.address, field.size
+    return any(set(wire.link.read_many(*where, alike, fast=True)) == set(alike) for _ in range(2))
 
 
 def _budget(line: Line, baud: int, members: Sequence[State], adapter: SerialDevice) -> Budget | None:

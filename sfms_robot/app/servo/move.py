@@ -17,7 +17,7 @@ from sfms_robot.config import Head, Joint, load_firmware_map
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError, ConfigError, PortError, RobotError, ServoError, TorqueError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.chain.slow_profile import WayInside, slow_profile, way_inside
+from sfms_robot.servo.chain.startup import WayInside, slow_profile, way_inside
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.registers import Field, Table
 from sfms_robot.servo.stored_settings import limit_names

@@ -138,7 +138,7 @@ class Wire:
             raise ConfigError.at("servo", what, servo, "is not a servo id", [f"0..{self.kind.max_id}"])
 
     def _link(self, baud: int) -> RegisterLink:
-        link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S, *self.kind.dialect)
+        link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S)
         return link
 
 

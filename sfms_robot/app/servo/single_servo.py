@@ -14,8 +14,7 @@ from typing import Any, Final
 from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, FoundServo, Wire
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.ports import Clock
-from sfms_robot.servo.chain.duplicate_ids import ping_replies
-from sfms_robot.servo.chain.verified_write import finish, verified_write
+from sfms_robot.servo.chain.link import finish, ping_replies, verified_write
 from sfms_robot.servo.registers import Field, Table
 
 Confirm = Callable[[str], bool]

@@ -208,7 +208,7 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
 @contextmanager
 def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
     """The two requests of a tick that `where` stands for, as the bus makes them: goals, and one fast sync read."""
-    from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+    from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
     from sfms_robot.servo.port import SerialPort
 
     config = next(iter(head.buses.values()))
@@ -222,7 +222,7 @@ def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
 
     def tick() -> None:
         write()
-        link.fast_sync_read(*where, ids)
+        link.read_many(*where, ids, fast=True)
 
     try:
         yield Host(write, tick)

@@ -220,7 +220,10 @@ def plugged_in(
 def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
     [(name, config)] = head.buses.items()
     maps = firmware_maps(head.joints)
-    servos = [BusServo(key, j.id, maps[j.model], j.min_rad, j.max_rad) for key, j in head.joints.items()]
+    servos = [
+        BusServo(joint=key, id=j.id, map=maps[j.model], min_rad=j.min_rad, max_rad=j.max_rad)
+        for key, j in head.joints.items()
+    ]
     open_port, family = port_of(chains[name], config, clock), family_named(config.family)
     more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
     bus: Bus = family.build(

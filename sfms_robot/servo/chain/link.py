@@ -1,9 +1,9 @@
-"""Registers over a wire, whatever the protocol: what buses, tools and startup need of a link.
+"""Registers over a wire, for every protocol: requests within a time budget, verified writes, servos with one id.
 
-A request to one servo gives None where nobody answered; the error byte of an answer is the protocol's own. A request
+A request to one servo returns None if there was no answer; the error byte of an answer is the protocol's. A request
 blocks until all answers are there, or no byte came for `silence_s` beyond the time that the bytes take on the wire.
-Inside `within` all requests share one allowance of silence, so that a poll costs one silence whoever is dead.
-Whatever is asked for with `grants` is asked in the end, also on a wire that is too slow for its budget.
+Inside `within` all requests share one allowance of silence, so that a poll takes one silence however many servos are
+dead. A request that `grants` refuses is allowed in the end, also on a wire that is too slow for its budget.
 """
 
 from __future__ import annotations
@@ -11,59 +11,71 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from typing import Final, NamedTuple
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from typing import ClassVar, Final, NamedTuple, TypeVar
 
 from sfms_robot.config.wire_time import BITS, Framing
+from sfms_robot.errors import ServoError
+from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
 
-CHUNK: Final = 4096
-NO_PATIENCE: Final = 10  # read deadlines that rubbish on the wire may cost before a request is given up
-LATE_S: Final = 0.25  # that a purpose waits for room in a budget before it gets a request of its own
-AWAY_LATE_S: Final = 0.05  # the same for who is away
-_SPENT_LATE_S: Final = 1.0  # the same where the time is there, and others' silence has used it up
+T = TypeVar("T")
+Steps = Generator[float, None, T]  # work in steps: between two exchanges it yields the seconds it should wait
+
+TRIES: Final = 3
+NO_PATIENCE: Final = 10  # read deadlines that noise on the wire may take before a request is given up
+LATE_S: Final = 0.25  # how long a purpose waits for room in a budget before it gets a request beside it
+AWAY_LATE_S: Final = 0.05  # the same for servos that are away
+_CHUNK: Final = 4096
+_SPENT_LATE_S: Final = 1.0  # the same if the time is there, but other servos' silence has used up the allowance
 _SLACK_S: Final = 0.001  # of a request that is granted, for a busy computer
 _ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
 _SAMPLES: Final = 3
 _MARGIN: Final = 1.25
+_MOST_READS: Final = 64  # after which a wire that never falls silent is given up
 
 
 class Found(NamedTuple):
-    """Who answered a ping. None where the protocol's ping does not tell."""
+    """The servo that answered a ping. None if the protocol's ping does not report it."""
 
     model_number: int | None
     firmware: int | None
 
 
 class Answer(NamedTuple):
-    """One servo's answer: the error byte as it came, and the data read (empty for a write)."""
+    """The answer of one servo: the error byte as received, and the data read (empty for a write)."""
 
     error: int
     data: bytes
 
 
 class RegisterLink(ABC):
-    """One wire of servos that have registers. Raises BusError when the port is gone, never for a silent servo.
+    """A wire of servos that have registers. Raises BusError if the port is gone, never for a silent servo.
 
     Args:
         port: owned by the link from now on.
-        baud: bits per second, to tell how long bytes take.
-        silence_s: how long to wait for the next byte before the servo counts as silent.
+        baud: bits per second, from which the time of bytes follows.
+        silence_s: time without a byte after which the servo counts as silent.
 
     Attributes:
         framing: bytes of its packets.
-        judged: whether the last request waited that long. Inside `within` it may not have, and then who did not answer
-            may still be there.
+        has_fast_read: whether servos can answer in one packet.
+        tries: how often a startup asks before a servo counts as silent; 1 while the bus is running.
+        judged: whether the last request waited for the full silence. Inside `within` it may not have, and then a servo
+            that did not answer may still be there.
     """
 
-    framing: Framing
+    framing: ClassVar[Framing]
+    has_fast_read: ClassVar[bool] = False
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         self.port = port
         self.silence_s = silence_s
+        self.tries = 1
         self.judged = True
         self._byte_s = BITS / baud
         self._end_s = math.inf
@@ -71,51 +83,74 @@ class RegisterLink(ABC):
         self._refused_s: dict[str, float] = {}  # since when a purpose has found no room
 
     @abstractmethod
-    def ping(self, servo: int) -> Found | None: ...
+    def ping(self, servo: int) -> Found | None:
+        """Return the servo at an id; None if it does not answer."""
 
     @abstractmethod
     def broadcast_ping(self) -> dict[int, Found]:
-        """Everybody who answers at this baud, by id; waits the whole window that 253 answers may take."""
+        """Return all servos that answer at this baud, by id; waits the whole time that 253 answers may take."""
 
     @abstractmethod
-    def read(self, servo: int, address: int, length: int) -> Answer | None: ...
+    def read(self, servo: int, address: int, length: int) -> Answer | None:
+        """Read `length` bytes of one servo."""
+
+    @abstractmethod
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+        """Read `length` bytes of several servos by one request; return the answers by id, of those that answered.
+
+        `fast`: all answer in one packet, which ends at the first silent servo (`has_fast_read`).
+        """
 
     @abstractmethod
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
-        """The acknowledgement, or None when there was none: the servo may have taken it all the same."""
+        """Write to one servo; return the acknowledgement. Without one the servo may still have taken the data."""
+
+    @abstractmethod
+    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
+        """Write `length` bytes to each of `servos`, `data` in their order, in one packet. Nothing answers."""
+
+    @staticmethod
+    @abstractmethod
+    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
+        """Return the packet of `sync_write`, to be written from any thread."""
 
     @abstractmethod
     def refusal(self, answer: Answer) -> str:
-        """Why a request was refused, in words; empty when it was done, whatever else the servo complains of."""
+        """Return why a request was refused, in words; empty if it was done, whatever fault the servo reports."""
 
     @abstractmethod
-    def reboot(self, servo: int) -> Answer | None: ...
+    def reboot(self, servo: int) -> Answer | None:
+        """Restart a servo."""
 
     @abstractmethod
     def factory_reset(self, servo: int, option: int) -> Answer | None:
-        """0xFF everything; Protocol 2.0 also 1 all but the id, 2 all but id and baud."""
+        """Reset everything (0xFF); Protocol 2.0 also all but the id (1), all but id and baud (2)."""
 
-    @abstractmethod
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """One packet for all; values have one length. Nothing answers."""
+        """Write to several servos in one packet; all values have one length. Nothing answers."""
+        length = len(next(iter(values.values())))
+        self.sync_write_block(address, tuple(values), length, b"".join(values.values()))
+
+    # --- time ---------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def patient(self, silence_s: float) -> Iterator[None]:
-        """Wait at least `silence_s` for answers inside the block."""
-        usual, self.silence_s = self.silence_s, max(self.silence_s, silence_s)
+    def patient(self, silence_s: float, tries: int = 1) -> Iterator[None]:
+        """Wait at least `silence_s` for answers inside the block, and let a startup ask `tries` times."""
+        usual = self.silence_s, self.tries
+        self.silence_s, self.tries = max(self.silence_s, silence_s), tries
         try:
             yield
         finally:
-            self.silence_s = usual
+            self.silence_s, self.tries = usual
 
     @contextmanager
     def within(self, budget_s: float, silence_s: float) -> Iterator[None]:
-        """A time budget for the requests inside the block, which those who make them ask `affords` about.
+        """Set a time budget for the requests inside the block; whether one fits is for its caller to ask (`affords`).
 
         Args:
             budget_s: until then all requests are over.
-            silence_s: waiting for answers that do not come, all requests together; a request whose turn comes when
-                that is used up waits for nothing beyond what its bytes take.
+            silence_s: time spent waiting for answers that do not come, all requests together; once it is used up, a
+                request waits for no more than the time of its bytes.
         """
         self._end_s, self._left_s = self.port.now_s() + budget_s, silence_s
         try:
@@ -125,9 +160,9 @@ class RegisterLink(ABC):
             self.judged = True
 
     def affords(self, bytes_on_wire: int, alone: bool = False) -> bool:
-        """Whether a request that takes so many bytes, answer included, is over in time even when nobody answers.
+        """Return whether a request of so many bytes, answer included, is over in time even without an answer.
 
-        `alone`: it asks for somebody who may well be silent, so it is of use only if that can be found out.
+        `alone`: it is for one servo that may be silent, so it is of use only with a full silence left.
         """
         if alone and self._left_s < self.silence_s:
             return False
@@ -135,10 +170,10 @@ class RegisterLink(ABC):
         return self.port.now_s() + bytes_on_wire * self._byte_s + allowance_s <= self._end_s
 
     def grants(self, purpose: str, bytes_on_wire: int, alone: bool = False, late_s: float = LATE_S) -> bool:
-        """As `affords`; and what a purpose has been refused for `late_s` it gets once, whatever is left.
+        """Return `affords`; a purpose that was refused for `late_s` gets one request, whatever is left.
 
-        At 57600 baud, or with an adapter that holds every answer back for 16 ms, the first read uses a budget up, in
-        every poll: nobody who was away would ever be found, and no fault be heard of.
+        At 57600 baud, or with an adapter that holds every answer back for 16 ms, the first read uses up the budget of
+        every poll: without this no servo that was away would be found, and no fault would be read.
         """
         if self.affords(bytes_on_wire, alone):
             self._refused_s.pop(purpose, None)
@@ -152,35 +187,21 @@ class RegisterLink(ABC):
         self._end_s = max(self._end_s, now_s + bytes_on_wire * self._byte_s + self.silence_s + _SLACK_S)
         return True
 
-    def _allowance_s(self) -> float:
-        """Silence that the next request may wait for."""
-        allowance_s = min(self.silence_s, self._left_s)
-        self.judged = allowance_s >= self.silence_s
-        return allowance_s
-
-    def _rubbish_s(self) -> float:
-        """What bytes that are no answer may cost a request."""
-        return NO_PATIENCE * self.silence_s if self._left_s == math.inf else 0.0
-
-    def _waited(self, in_vain_s: float) -> None:
-        """A request was not answered by everybody."""
-        self._left_s = max(0.0, self._left_s - in_vain_s)
-
     def wait(self, duration_s: float) -> None:
-        """Let so long go by on the port's clock, in virtual time too."""
+        """Let time pass on the port's clock, in virtual time too."""
         if duration_s > 0.0:
             self.port.wait_until(self.port.now_s() + duration_s)
 
     def rest(self, duration_s: float) -> None:
-        """Leave the wire alone for so long; in virtual time that is no time. What comes meanwhile is dropped."""
+        """Leave the wire alone; in virtual time this takes no time. What comes meanwhile is dropped."""
         end_s = self.port.now_s() + duration_s
-        while self.port.read(CHUNK, end_s):
+        while self.port.read(_CHUNK, end_s):
             pass
 
     def adapt(self, servo: int, address: int, length: int) -> float:
-        """Wait longer from now on where the adapter holds answers back: it would make every servo silent.
+        """Measure how long the adapter holds answers back, and wait for longer than that from now on.
 
-        Seconds of silence that are waited for now.
+        Returns `silence_s` in force from now on.
         """
         held_s = 0.0
         with self.patient(_ADAPTER_S):
@@ -197,3 +218,160 @@ class RegisterLink(ABC):
                 self.port.name, held_s * 1e3, self.silence_s * 1e3,
             )  # fmt: skip
         return self.silence_s
+
+    def _incoming(self, first: int, rest: int = 0) -> Iterator[bytes]:
+        """Yield bytes as they come, until none came for the silence left; the consumer stops once it has all.
+
+        Args:
+            first: bytes of the request and of the first answer, whose time is waited for besides.
+            rest: bytes of the other answers. Noise on the wire may add `NO_PATIENCE` silences, but not in a budget.
+        """
+        port, allowance_s = self.port, min(self.silence_s, self._left_s)
+        self.judged = allowance_s >= self.silence_s
+        asked_s = port.now_s()
+        deadline_s = asked_s + first * self._byte_s + allowance_s
+        noise_s = NO_PATIENCE * self.silence_s if self._left_s == math.inf else 0.0
+        last_s = deadline_s + rest * self._byte_s + noise_s
+        while port.now_s() < last_s and (data := port.read(_CHUNK, min(deadline_s, last_s))):
+            deadline_s = port.now_s() + allowance_s
+            yield data
+        self._left_s = max(0.0, self._left_s - min(allowance_s, port.now_s() - asked_s))
+
+
+# --- verified writes ------------------------------------------------------------------------------------------------
+
+
+class Silent(ServoError):
+    """A servo did not answer, as opposed to one that refuses."""
+
+
+def verified_write(
+    link: RegisterLink,
+    servo_id: int,
+    field: Field,
+    value: int,
+    *,
+    lock: Field | None = None,
+    tries: int = TRIES,
+    about: str | None = None,
+) -> Steps[None]:
+    """Write one register, read it back, and repeat until it holds `value`: the one retry rule of startup and tools.
+
+    Neither a missing acknowledgement proves anything (it may have been lost, the status return level may forbid it),
+    nor a received one (a locked EEPROM of Dynamixel 1.0 or Feetech acknowledges and takes nothing). Only the value read
+    back counts.
+
+    Args:
+        lock: the register that opens the EEPROM (0) and closes it (1), for a field behind one. It is closed again
+            whatever happens.
+        tries: writes before it is given up; a refusal, a silence and another value read back all count, since a
+            corrupted request can look like any of them.
+        about: name of the servo in messages; `id 5` by default.
+
+    Yields between exchanges: 0.0, or after a silence the seconds that it took, so that a running bus ends its tick
+    there. One exchange blocks at most `link.silence_s` beyond the time its bytes take.
+
+    Raises Silent if no read back was answered, ServoError for a value that does not fit, is refused or not taken,
+    BusError if the port is gone.
+    """
+    name = about or f"id {servo_id}"
+    if lock is None or not field.eeprom:
+        yield from _write(link, servo_id, field, value, tries, name)
+        return
+    yield from _write(link, servo_id, lock, 0, tries, name)
+    try:
+        yield from _write(link, servo_id, field, value, tries, name)
+    except BaseException:  # also if the caller closes this half way
+        link.write(servo_id, lock.address, lock.to_bytes(1))
+        raise
+    yield from _write(link, servo_id, lock, 1, tries, name)
+
+
+def _write(link: RegisterLink, servo_id: int, field: Field, value: int, tries: int, name: str) -> Steps[None]:
+    try:
+        data = field.to_bytes(value)
+    except OverflowError:
+        raise ServoError(f"{name}: {field.name} = {value} does not fit the register") from None
+    failure: ServoError = Silent(f"{name} does not answer to {field.name} := {value}")
+    for _ in range(tries):
+        answer = link.write(servo_id, field.address, data)
+        if answer is not None and (refusal := link.refusal(answer)):
+            failure = ServoError(f"{name} refuses {field.name} := {value}: {refusal}")
+            yield 0.0
+            continue
+        yield 0.0 if answer is not None else link.silence_s
+        seen = link.read(servo_id, field.address, field.size)
+        if seen is None or len(seen.data) != field.size:
+            yield link.silence_s
+        elif (now := field.from_bytes(seen.data)) == value:
+            yield 0.0
+            return
+        else:
+            failure = ServoError(f"{name}: {field.name} was set to {value} and reads {now}")
+            yield 0.0
+    raise failure
+
+
+def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: None) -> T:
+    """Run work in steps to its end; return its result.
+
+    Args:
+        wait: called between two exchanges with the seconds to wait. What it raises ends the work.
+    """
+    with closing(steps):
+        while True:
+            try:
+                pause_s = next(steps)
+            except StopIteration as end:
+                result: T = end.value
+                return result
+            wait(pause_s)
+
+
+# --- two servos with one id -----------------------------------------------------------------------------------------
+
+
+class PingReplies(NamedTuple):
+    """The bytes that one ping brought: whole answers of that id, and bytes that belong to no answer."""
+
+    answers: int
+    stray: int
+
+    @property
+    def duplicate(self) -> bool:
+        """Return whether this looks like two servos."""
+        return self.answers > 1 or self.stray > 0
+
+
+def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> PingReplies:
+    """Ping one id and count what comes until there was no byte for `silence_s`; `protocol` is 2, or 1 (Feetech too).
+
+    Two servos with one id answer together, so the ping brings two answers, or bytes that are no answer, which a link
+    drops. Two servos of one model that answer in the very same instant look like one: only a wire with a single servo
+    on it is certain.
+    """
+    if protocol == 2:
+        sent = dxl2.encode_instruction(servo, dxl2.PING)
+    else:
+        sent = protocol1.encode(servo, protocol1.PING)
+    port.discard_input()
+    port.write(sent)
+    data = bytearray()
+    for _ in range(_MOST_READS):
+        part = port.read(_CHUNK, port.now_s() + silence_s)
+        if not part:
+            break
+        data += part
+    if data.startswith(sent):  # an adapter that receives its own bytes
+        del data[: len(sent)]
+    total, answers, known = len(data), 0, 0
+    if protocol == 2:
+        while (packet := dxl2.maybe_packet(data)) is not None:
+            if packet.instruction == dxl2.STATUS:
+                known += dxl2.STATUS_OVERHEAD + len(packet.params)
+                answers += packet.servo == servo
+    else:
+        for frame in protocol1.salvage(data):
+            known += protocol1.OVERHEAD + len(frame.params)
+            answers += frame.servo == servo
+    return PingReplies(answers, total - known)

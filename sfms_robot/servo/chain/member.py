@@ -4,13 +4,13 @@
     online     has torque and gets goals
     reduced    the same, with half the force: a fault or a load rule said so
     faulty     keeps its torque where it stands and gets no goals: policy "hold"
-    limp       torque off is wanted; written in every poll until the servo says that it is off
+    limp       torque off is wanted; written in every poll until the servo reports that it is off
     silent     does not answer; gets no goals
     returning  is started up again: identity, settings, goal := present, torque
     rebooting  the same after a reboot
     rejoining  holds where it stands, and waits for goals that begin there
     given up   failed too often: as limp, until it is enabled or called back
-    released   the same because it was asked for: no fault
+    released   as limp, because it was asked for: not a fault
 
 The diagram and a table of all arrows are in docs/safety.md. A goal is sent to members that are online or reduced and
 have been seen with torque, and to no others. So a servo that was away moves only from where it stands.
@@ -21,25 +21,26 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import Enum
-from typing import Any, Final, Protocol
+from typing import Final
 
 from sfms_robot.config import Faults
 from sfms_robot.errors import ServoError
-from sfms_robot.servo.chain.fault_reporter import FaultReporter, about
-from sfms_robot.servo.chain.liveness import FIRST_PAUSE_S, LONGEST_PAUSE_S, Liveness
-from sfms_robot.servo.chain.startup import Silent, Steps
-from sfms_robot.servo.policy import BusServo, Measured, counts, load_rules
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.chain.link import Silent, Steps
+from sfms_robot.servo.chain.startup import Startup
+from sfms_robot.servo.policy import counts, load_rules
 
 log = logging.getLogger(__name__)
 
 TORQUE_LOST: Final = "torque lost"  # it restarted, or something switched it off
-TORQUE_ON: Final = "torque is not off"  # though it was asked to be
+TORQUE_ON: Final = "torque is not off"  # though that was written
 NO_ANSWER: Final = "no answer"
 GIVEN_UP: Final = "left alone"
 MISSES: Final = 2  # single lost answers in a row before a servo counts as silent
+FIRST_PAUSE_S: Final = 0.05  # between two probes of a silent servo
+LONGEST_PAUSE_S: Final = 1.0
+LOGGED_EVERY_S: Final = 10.0  # that a servo is silent: a loose contact comes and goes many times a second
 RETRY_S: Final = 0.2  # after a silence on the way back
 REFUSED_S: Final = 2.0  # after a refusal on the way back
 LIMP_S: Final = 3.0  # a joint that was pinched stays limp so long
@@ -49,7 +50,9 @@ NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands co
 
 
 class State(Enum):
-    __hash__ = object.__hash__  # members are single objects; Enum's own hash is Python, a hundred times a tick
+    """The states of a member; see the module."""
+
+    __hash__ = object.__hash__  # each is one object; Enum's own hash is Python code, run a hundred times a tick
 
     OFF = "off"
     ONLINE = "online"
@@ -64,7 +67,7 @@ class State(Enum):
     RELEASED = "released"
 
 
-ONLINE: Final = State.ONLINE  # by way of the class each is a call, for every servo in every tick
+ONLINE: Final = State.ONLINE  # through the class each is a call, for every servo in every tick
 REDUCED: Final = State.REDUCED
 REJOINING: Final = State.REJOINING
 _DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
@@ -73,44 +76,34 @@ _LIMP: Final = frozenset({State.LIMP, State.GIVEN_UP, State.RELEASED})  # torque
 _COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
 
 
-class Restart(Protocol):
-    """The part of `Startup` that a member needs."""
-
-    @property
-    def can_reboot(self) -> bool: ...
-
-    def bring_back(self, index: int, reboot: bool) -> Steps[int]: ...
-
-
 class Member:
-    """One servo. Events come in by methods; what it wants is read from its attributes.
+    """One servo. Events come in by methods; its wishes are read from its attributes.
 
     Args:
         index: place in the bus.
-        servo: joint, id, limits and safety.
-        table: its control table.
+        startup: starts it up; has its joint, id, limits, safety and control table.
         faults: which of its faults count.
-        reporter: of the bus.
+        reported: faults of the bus, `joint: fault` in the order of appearance, for the report; each is logged once.
 
     Attributes:
         state: see the module.
-        liveness: whether it answers.
+        listed: it is asked in every poll; otherwise it is probed alone, with growing pauses.
+        probe_s: when a servo that is not listed is asked next.
         identified: it has been checked against the head's file.
-        torque_seen: what it last said; None where it is not known.
-        job: its way back, in steps of one exchange, and when the next is due.
+        torque_seen: what it last reported; None if that is not known.
+        job: its way back, in steps of one exchange; `job_due_s` is when the next is due.
         rejoined: it came to hold a position in this poll.
         recalled: it was called back and had not been away.
-        stands_ticks: where, while it is rejoining; told at some time since `stands_s`.
+        stands_ticks: position while it is rejoining, reported at some time since `stands_s`.
         off_written: torque off has been sent since it was wanted.
-        mismatch: registers that do not hold what was asked of them, in words.
+        mismatch: registers that do not hold what was written, in words.
     """
 
-    def __init__(self, index: int, servo: BusServo, table: Table, faults: Faults, reporter: FaultReporter) -> None:
+    def __init__(self, index: int, startup: Startup, faults: Faults, reported: dict[str, None]) -> None:
         self.index = index
-        self.id = servo.id
-        self.servo = servo
-        self.table = table
-        self.liveness = Liveness()
+        self.startup = startup
+        self.servo = startup.servo
+        self.id = self.servo.id
         self.identified = False
         self.state = State.OFF
         self.torque_seen: bool | None = None
@@ -122,84 +115,87 @@ class Member:
         self.off_written = False
         self.mismatch: str | None = None
         self._faults = faults
-        self._reporter = reporter
-        self._restart: Restart | None = None
+        self._reported = reported
+        self._ignored: set[str] = set()  # faults that do not count, each logged once
         self._bits = 0
-        self._named: list[str] = []  # its own faults, those that count
-        self._trouble: str | None = None  # what else is wrong
+        self._named: list[str] = []  # faults it reports, those that count
+        self._trouble: str | None = None  # any other fault
         self._back_s = math.inf  # when a limp one may come back
         self._attempts_s: list[float] = []
-        self._rules = [(name, rule) for name, rule in load_rules(servo)]
+        self._rules = load_rules(self.servo)
         self._over_s: dict[str, float] = {}  # since when a rule is broken
         self.lowest_mA = min((rule.current_mA for _, rule in self._rules), default=math.inf)
+        self._forget_silence(True)
+
+    def _forget_silence(self, listed: bool) -> None:
+        self.listed = listed
+        self.probe_s = -math.inf
+        self._misses = 0
+        self._pause_s = FIRST_PAUSE_S
+        self._logged_s = -math.inf  # when its silence was last logged
+        self._unlogged = 0  # silences since
+        self._logged_silent = False
 
     # --- what it wants ------------------------------------------------------------------------------------------
 
     @property
     def gets_goals(self) -> bool:
+        """Return whether goals are sent to it."""
         return self.state in _DRIVEN and self.torque_seen is True
 
     @property
     def torque_wanted(self) -> bool | None:
-        """None where it is not for the poll to say: before `enable`, or on its way back."""
+        """Return whether it should have torque; None before `enable` and on its way back."""
         if self.state in _POWERED:
             return True
         return False if self.state in _LIMP else None
 
     @property
     def to_release(self) -> bool:
-        """Torque off has to be written: nobody has seen that it is."""
+        """Return whether torque off has to be written: it is wanted and was not seen."""
         return self.state in _LIMP and self.torque_seen is not False
 
     @property
     def over_load(self) -> bool:
-        """A load rule is broken just now, not yet for long enough."""
+        """Return whether a load rule is broken, not yet for long enough."""
         return bool(self._over_s)
 
     @property
     def fault(self) -> str | None:
-        """For `Reading.fault`."""
+        """Return the text of `Reading.fault`."""
         if not self._named and self._trouble is None and self.mismatch is None:
             return None
-        own = [", ".join(self._named)] if self._named else [self._trouble] if self._trouble else []
-        return "; ".join(own + ([self.mismatch] if self.mismatch else [])) or None
+        return "; ".join(filter(None, (", ".join(self._named) or self._trouble, self.mismatch))) or None
 
     # --- start and stop -----------------------------------------------------------------------------------------
 
-    def attach(self, restart: Restart) -> None:
-        """The wire in use from now on."""
-        self._restart = restart
-
-    def connected(self) -> None:
-        """Identified and prepared by `connect`; torque as found."""
+    def connected(self, there: bool) -> None:
+        """Note that `connect` has identified and prepared it, or (not `there`) that it did not answer."""
         self._reset(State.OFF)
-        self.liveness, self.identified, self.torque_seen = Liveness(), True, None
-
-    def absent(self) -> None:
-        """It did not answer to `connect`."""
-        self._reset(State.OFF)
-        self.liveness, self.identified, self.torque_seen = Liveness(listed=False), False, None
-        self._say(NO_ANSWER)
+        self._forget_silence(there)
+        self.identified, self.torque_seen = there, None if there else False
+        if not there:
+            self._blame(NO_ANSWER)
 
     def enabled(self) -> None:
-        """Torque came on by `enable`, and was seen. Faults it had before are told, and not acted upon again."""
+        """Note that `enable` switched torque on, and saw it. Faults it had before are not acted upon again."""
         self._drop_job()
         self.state, self._trouble, self.mismatch = State.ONLINE, None, None
         self.identified = self.torque_seen = True
         self._attempts_s.clear()
 
     def awaited(self) -> None:
-        """`enable` wants it, and it is not there: brought in when it appears."""
+        """Note that `enable` wants it, and it is absent: it is brought in when it appears."""
         self._reset(State.SILENT)
         self._trouble = NO_ANSWER
 
     def stopped(self) -> None:
-        """No torque is wanted any more; `stop` sees to it."""
+        """Note that no torque is wanted any more; `stop` switches it off."""
         self._drop_job()
         self.state = State.OFF
 
     def released(self) -> None:
-        """Torque off is wanted until `enable`; the poll sees to it."""
+        """Ask for torque off until `enable`; the poll writes it."""
         if self.state is not State.OFF:
             self._release(math.inf)
             self.state = State.RELEASED
@@ -209,7 +205,7 @@ class Member:
         if self.state in _DRIVEN | _COMING | {State.REJOINING, State.SILENT}:
             return
         self._attempts_s.clear()
-        if self.liveness.listed:
+        if self.listed:
             self._return(now_s)
             self.recalled = True
         else:
@@ -221,118 +217,129 @@ class Member:
         self._bits, self._named, self._trouble, self.mismatch = 0, [], None, None
         self._over_s.clear()
 
-    # --- liveness -----------------------------------------------------------------------------------------------
+    # --- whether it answers -------------------------------------------------------------------------------------
 
-    def answered(self) -> bool:
-        """It has answered a request; whether it was away."""
-        liveness = self.liveness
-        back = not liveness.listed
-        liveness.misses, liveness.listed = 0, True
-        return back
+    def answered(self) -> None:
+        """Note that it has answered a request."""
+        self._misses, self.listed = 0, True
 
-    def unanswered(self, now_s: float) -> bool:
-        """One answer was lost; whether that makes it suspect."""
-        self.liveness.misses += 1
-        if self.liveness.misses >= MISSES:
+    def unanswered(self, now_s: float) -> None:
+        """Note that one answer was lost; the second in a row makes it suspect."""
+        self._misses += 1
+        if self._misses >= MISSES:
             self.suspect(now_s)
-        return not self.liveness.listed
 
     def suspect(self, now_s: float, pause_s: float = FIRST_PAUSE_S) -> None:
-        """Off the list, and probed alone. Its goals go on until a probe is in vain: it may have been the wire."""
-        liveness = self.liveness
-        liveness.listed, liveness.pause_s, liveness.probe_s = False, FIRST_PAUSE_S, now_s + pause_s
+        """Take it off the list, to be probed alone. It gets goals until a probe fails: the wire may be the cause."""
+        self.listed, self._pause_s, self.probe_s = False, FIRST_PAUSE_S, now_s + pause_s
         if pause_s:
-            liveness.say_silent(about(self.servo), now_s, again=True)
+            self._log_silence(now_s, again=True)
 
     def probe_failed(self, now_s: float) -> None:
-        liveness = self.liveness
-        liveness.pause_s = min(2.0 * liveness.pause_s, LONGEST_PAUSE_S)
-        liveness.probe_s = now_s + liveness.pause_s
-        liveness.say_silent(about(self.servo), now_s, again=False)
+        """Note that it did not answer alone either."""
+        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self.probe_s = now_s + self._pause_s
+        self._log_silence(now_s, again=False)
         if self.state is not State.REBOOTING:  # a servo that reboots does not answer
             self.gone()
 
     def hurry(self, now_s: float) -> None:
-        """Somebody else came back: perhaps this one does, too."""
-        self.liveness.pause_s, self.liveness.probe_s = FIRST_PAUSE_S, min(self.liveness.probe_s, now_s)
+        """Probe it soon: another servo came back, and this one may, too."""
+        self._pause_s, self.probe_s = FIRST_PAUSE_S, min(self.probe_s, now_s)
 
     def gone(self) -> None:
-        """It does not answer, and not because of one lost packet; or the port is gone."""
+        """Note that it does not answer, and not because of one lost packet; or that the port is gone."""
         if self.state in _DRIVEN | _COMING | {State.REJOINING}:
             self._drop_job()
             self.state = State.SILENT
             self.torque_seen = None
             self._trouble = self._trouble or NO_ANSWER
         elif self.state in _LIMP or self.state is State.FAULTY:
-            self.torque_seen = None  # who knows what it does now
+            self.torque_seen = None  # it may have changed
 
     def back(self, now_s: float) -> None:
-        """A servo that was silent answers again."""
-        self.liveness.say_back(about(self.servo))
+        """Note that it was silent and answers again."""
+        if self._logged_silent:
+            self._logged_silent = False
+            log.warning("%s answers again", self.servo)
         if self.state is State.SILENT:
             self._return(now_s)
         elif self._trouble == NO_ANSWER:
             self._trouble = None
 
-    # --- what it says -------------------------------------------------------------------------------------------
+    def _log_silence(self, now_s: float, again: bool) -> None:
+        """Log it once in ten seconds, with a count of those not logged. `again`: it is another silence."""
+        if self._logged_silent:
+            return
+        if now_s < self._logged_s + LOGGED_EVERY_S:
+            self._unlogged += again
+            return
+        times = f" ({self._unlogged} times since the last message)" if self._unlogged else ""
+        log.warning("%s is silent%s", self.servo, times)
+        self._logged_s, self._unlogged, self._logged_silent = now_s, 0, True
 
-    def take_bits(self, bits: int, seen: Measured, now_s: float) -> None:
-        """Fault bits as told by the servo; acted upon when a fault is new, or begins to count."""
+    # --- what it reports ----------------------------------------------------------------------------------------
+
+    def take_bits(self, bits: int, measured: Mapping[str, float], now_s: float) -> None:
+        """Take fault bits; a fault that is new, or begins to count, is acted upon. `measured`: see `policy.counts`."""
         if not bits and not self._bits:
             return
         self._bits = bits
+        table = self.startup.table
+        texts = table.faults if table.protocol == 2 else table.status_faults
         names = []
-        for name in self._names(bits):
-            if counts(name, self._faults, seen):
+        for name in (texts.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1):
+            if counts(name, self._faults, measured):
                 names.append(name)
-            else:
-                self._reporter.excuse(self.servo, name)
+            elif name not in self._ignored:
+                self._ignored.add(name)
+                log.info("%s reports %s, which this head's configuration allows", self.servo, name)
         new = set(names) - set(self._named)
-        if names or self.state not in _LIMP | {State.FAULTY}:  # who stays out says why, also when it has passed
+        if names or self.state not in _LIMP | {State.FAULTY}:  # one that stays out keeps its reason, also a past one
             self._named = names
         if new:
-            self._reporter.say(self.servo, ", ".join(names))
+            self._report(", ".join(names))
             if self.state in _POWERED:
                 self._act(self.servo.safety.on_fault, now_s, LIMP_S if self._eases_in else math.inf)
 
     def take_current(self, current_mA: float, now_s: float) -> None:
-        """Judge a present current."""
+        """Compare a present current with the load rules."""
         for name, rule in self._rules:
             if abs(current_mA) <= rule.current_mA:
                 self._over_s.pop(name, None)
             elif now_s - self._over_s.setdefault(name, now_s) >= rule.for_s and self.state in _DRIVEN:
                 self._over_s.clear()
-                self._reporter.say(self.servo, f"{name} ({abs(current_mA):.0f} mA)")
+                self._report(f"{name} ({abs(current_mA):.0f} mA)")
                 self._trouble = name
                 self._act(rule.then, now_s, LIMP_S)
                 return
 
     def take_torque(self, on: bool, now_s: float) -> None:
-        """Torque enable as told by the servo, against what is wanted."""
+        """Compare torque enable, as the servo reports it, with what is wanted."""
         self.torque_seen = on
         if self.state in _LIMP:
             if on and self.off_written:
-                self._say(TORQUE_ON)
+                self._blame(TORQUE_ON)
             elif self._trouble == TORQUE_ON:
                 self._trouble = None
         elif self.state is State.SILENT and not on and self.identified:
-            self._reporter.say(self.servo, TORQUE_LOST)  # it was away because it restarted
+            self._report(TORQUE_LOST)  # it was away because it restarted
         elif self.state in _POWERED and not on:
             if self._named:
-                self._release(math.inf)  # its own protection took the torque, and said why
+                self._release(math.inf)  # its own protection took the torque, and it reports why
             else:
-                self._say(TORQUE_LOST)
+                self._blame(TORQUE_LOST)
                 self._try_again(now_s, now_s)
 
     def take_registers(self, differing: Mapping[str, tuple[int, int]]) -> None:
-        """Registers that hold another value than was asked for, by name: (seen, wanted)."""
+        """Take the registers that hold another value than was written, by name: (seen, wanted)."""
         texts = [f"{name} reads {seen}, set to {wanted}" for name, (seen, wanted) in differing.items()]
         self.mismatch = ", ".join(texts) or None
         if self.mismatch:
-            self._reporter.say(self.servo, self.mismatch)
+            self._report(self.mismatch)
 
     def distrust(self, fault: str, now_s: float) -> None:
-        """Something may have gone on behind our back: started up as if it had been away."""
+        """Start it up as if it had been away: something may have happened unseen."""
         if self.state in _DRIVEN | {State.REJOINING}:
             self._trouble = fault
             self._return(now_s)
@@ -340,7 +347,7 @@ class Member:
     # --- the way back -------------------------------------------------------------------------------------------
 
     def due(self, now_s: float) -> bool:
-        """Whether its job may take a step; a limp one whose time is over begins one."""
+        """Return whether its job may take a step; a limp one whose time is over begins one."""
         if self.state is State.LIMP and now_s >= self._back_s and self.torque_seen is False:
             self._back_s = math.inf
             self._try_again(now_s, now_s)
@@ -348,16 +355,16 @@ class Member:
 
     @property
     def waits(self) -> bool:
-        """Something is still to come: a job, or the end of being limp."""
+        """Return whether something is still to come: a job, or the end of being limp."""
         return self.job is not None or self._back_s < math.inf
 
     @property
     def comes_back(self) -> bool:
-        """True if it is away or on its way back, and was checked against the head's file earlier in this run."""
+        """Return whether it is away or on its way back, and was checked against the head's file in this run."""
         return self.identified and self.state in _COMING | {State.SILENT}
 
     def step(self, now_s: float) -> None:
-        """Take one exchange of its job. Raises BusError when the port fails."""
+        """Take one exchange of its job. Raises BusError if the port fails."""
         if self.job is None:
             return
         if self.stands_s is None:
@@ -372,12 +379,12 @@ class Member:
             self._return(now_s + RETRY_S)
         except ServoError as error:
             self.job = None
-            self._reporter.say(self.servo, str(error))
+            self._report(str(error))
             self._try_again(now_s + REFUSED_S, now_s)
 
     def accepts(self, goal_ticks: int) -> bool:
-        """A goal for a rejoining joint: whether it continues from where that stands; it is online then."""
-        if abs(goal_ticks - self.stands_ticks) > NEAR * self.table.ticks_per_revolution:
+        """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
+        if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
         self.state = State.ONLINE
         return True
@@ -390,7 +397,7 @@ class Member:
         if recalled:
             self.recalled, self._bits, self._named = True, bits, named
         else:
-            log.warning("%s is back and holds where it stands", about(self.servo))
+            log.warning("%s is back and holds where it stands", self.servo)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
@@ -399,14 +406,12 @@ class Member:
         return self.servo.safety.on_fault == "reboot_and_ease_in"
 
     def _act(self, policy: str, now_s: float, limp_s: float) -> None:
-        if policy == "limp":
-            self._release(now_s + limp_s)
-        elif policy == "hold":
+        if policy == "hold":
             self.state = State.FAULTY
         elif policy == "reduce":
             if self.state is not State.FAULTY:  # one that holds got no goals: the next may be far from where it stands
                 self.state = State.REDUCED
-        elif self._restart is not None and self._restart.can_reboot:
+        elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)
         else:
             self._release(now_s + limp_s)
@@ -418,24 +423,22 @@ class Member:
             self.torque_seen = None
 
     def _try_again(self, due_s: float, now_s: float, reboot: bool = False) -> None:
-        """The servo itself is to blame, not the wire: so many times, then no more."""
+        """Bring it back, at most `ATTEMPTS` times: the cause is the servo, not the wire."""
         recent = self._attempts_s = [t for t in self._attempts_s if now_s - t < FORGET_S]
         if len(recent) < ATTEMPTS:
             recent.append(now_s)
             self._return(due_s, reboot)
             return
-        log.warning("%s came back %d times in %g s and is left alone", about(self.servo), len(recent), FORGET_S)
+        log.warning("%s came back %d times in %g s and is left alone", self.servo, len(recent), FORGET_S)
         self._release(math.inf)
         self.state = State.GIVEN_UP
         self._trouble = GIVEN_UP
 
     def _return(self, due_s: float, reboot: bool = False) -> None:
         self._drop_job()
-        if self._restart is None:
-            raise ServoError(f"{about(self.servo)} has no wire to come back on")
         self.state = State.REBOOTING if reboot else State.RETURNING
         self.torque_seen = None
-        self.job, self.job_due_s = self._restart.bring_back(self.index, reboot), due_s
+        self.job, self.job_due_s = self.startup.bring_back(reboot), due_s
         self.stands_s = None
 
     def _drop_job(self) -> None:
@@ -444,18 +447,12 @@ class Member:
         if job is not None:
             job.close()
 
-    def _say(self, fault: str) -> None:
-        self._reporter.say(self.servo, fault)
+    def _blame(self, fault: str) -> None:
+        self._report(fault)
         self._trouble = fault
 
-    def _names(self, bits: int) -> list[str]:
-        faults = self.table.faults if self.table.protocol == 2 else self.table.status_faults
-        return [faults.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1]
-
-
-def members_of(
-    servos: Sequence[BusServo], tables: Sequence[Table], faults: Faults, reporter: FaultReporter
-) -> list[Member]:
-    """In bus order."""
-    pairs: Any = zip(servos, tables, strict=True)
-    return [Member(index, servo, table, faults, reporter) for index, (servo, table) in enumerate(pairs)]
+    def _report(self, fault: str) -> None:
+        named = f"{self.servo.joint}: {fault}"
+        if named not in self._reported:
+            log.warning("%s: %s", self.servo, fault)
+        self._reported[named] = None

@@ -1,148 +1,202 @@
-"""What the registers of each servo are to hold while the bus runs, and whether they do.
+"""The values that the registers of each servo should hold while the bus runs, and whether they do.
 
-Startup has written most of them. Two change on the way, the watchdog and the force of a servo that is reduced: they
-are written until they are confirmed. All are read back once a second, of several servos at once, as many as the rest
-of a poll has time for, and at most one request in a poll. What differs is a named fault.
+Startup has written most of them. Three change while the bus runs: torque of servos that are to be limp, the watchdog,
+and the force of a servo that is reduced. They are written in every poll until the servo reports the value: first the
+write, unprompted and to all servos in one packet; only then it is read back, as far as the poll has time. Values are
+absolute, so that writing one twice does no harm.
+
+All other registers are read back once a second, of several servos at once, as many as the rest of a poll has time for,
+and at most one request in a poll. A register that differs is a named fault.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.member import Member
-from sfms_robot.servo.chain.repeated_writes import RepeatedWrites
-from sfms_robot.servo.chain.status_poll import StatusPoll
+from sfms_robot.servo.chain.member import ONLINE, REDUCED, Member
+from sfms_robot.servo.chain.poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Block
 from sfms_robot.servo.policy import torque_register
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field, span_of
 
-_ROUND_S: Final = 1.0  # in which everybody is compared once
+BUS_WATCHDOG: Final = "bus_watchdog"
+_VERIFIED: Final = 8  # servos that are read back in one poll
+_ROUND_S: Final = 1.0  # in which all servos are compared once
 _TOGETHER: Final = 8  # servos in one request
 _BLOCK: Final = 40  # bytes of one servo in one request, at most
 
 
-class Wanted(Protocol):
-    """The part of `Startup` that matters here."""
-
-    def wanted(self, index: int) -> Mapping[str, int]: ...
-
-
 class Settings:
-    """Of the servos of one bus, by index in bus order.
+    """The settings of the servos of one bus, by id.
 
     Args:
-        members, tables: of each servo; a table may be replaced while the bus runs.
-        writes: takes what is to be written until it is confirmed.
+        members: of the bus; their tables may be replaced while it runs.
+        torque: the register of torque enable.
     """
 
-    def __init__(self, members: Sequence[Member], tables: Sequence[Table], writes: RepeatedWrites) -> None:
-        self._members = members
-        self._tables = tables
-        self._writes = writes
-        self._startup: Wanted | None = None
-        self._changed: dict[int, dict[str, int]] = {}  # what holds something else than startup wanted
+    def __init__(self, members: Sequence[Member], torque: Field) -> None:
+        self._members = {member.id: member for member in members}
+        self._torque = torque
+        self._pending: dict[str, dict[int, tuple[Field, int]]] = {}  # writes not confirmed yet, by register name
+        self._read_first: set[tuple[int, str]] = set()  # of them, those that are not written before they are read
+        self._changed: dict[int, dict[str, int]] = {}  # values other than those of startup
         self._differing: dict[int, dict[str, tuple[int, int]]] = {}  # (seen, wanted) by name
-        self._round: list[tuple[Block, list[int]]] = []  # who is still to be asked for what in this round
+        self._round: list[tuple[Block, list[int]]] = []  # reads still to be made in this round, and of which servos
         self._part_s = _ROUND_S  # of a round that one servo's block takes
         self._due_s = 0.0
 
-    def attach(self, startup: Wanted) -> None:
-        """The wire in use from now on."""
-        self._startup = startup
-
-    def wanted(self, index: int) -> Mapping[str, int]:
-        """Registers and values that are to be in force now."""
-        startup = self._startup.wanted(index) if self._startup is not None else {}
-        return {**startup, **self._changed.get(index, {})}
-
-    def change(self, index: int, name: str, value: int) -> None:
-        """From now on a register is to hold another value than startup gave it."""
-        self._changed.setdefault(index, {})[name] = value
-        self._writes.want(index, self._tables[index][name], value)
+    def wanted(self, servo: int) -> Mapping[str, int]:
+        """Return registers and values that should be in force now."""
+        return {**self._members[servo].startup.wanted(), **self._changed.get(servo, {})}
 
     def changed(self, name: str) -> list[int]:
-        """Who was told to hold something else than 0 in a register."""
-        return [index for index, values in self._changed.items() if values.get(name)]
+        """Return the servos that were given another value than 0 in a register."""
+        return [servo for servo, values in self._changed.items() if values.get(name)]
 
-    def reduce(self, index: int) -> None:
-        """Half the force that startup gave it: one value, however often this is called."""
-        member = self._members[index]
-        bounded = member.servo.safety.current_limit_mA is not None and "goal_current" in self._tables[index].fields
-        name = "goal_current" if bounded else torque_register(member.servo.map)
-        if name is None or name in self._changed.get(index, ()) or name not in self._tables[index].fields:
-            return
-        self.change(index, name, self.wanted(index).get(name, self._tables[index][name].high) // 2)
-
-    def forget(self, index: int) -> None:
-        """It was started up anew."""
-        self._writes.drop(index)
-        self._changed.pop(index, None)
-        self._differing.pop(index, None)
+    def forget(self, servo: int) -> None:
+        """Forget changes of a servo that was started up again."""
+        for requests in self._pending.values():
+            requests.pop(servo, None)
+        self._changed.pop(servo, None)
+        self._differing.pop(servo, None)
 
     def clear(self) -> None:
-        self._writes.clear()
-        self._changed.clear()
-        self._differing.clear()
+        """Forget all changes."""
+        for state in (self._pending, self._changed, self._differing, self._read_first):
+            state.clear()
+
+    # --- written until they are confirmed -----------------------------------------------------------------------
+
+    def command(self, link: RegisterLink, poll: StatusPoll, now_s: float) -> None:
+        """Write torque off and less force, then read them back; again in the next poll unless it is confirmed.
+
+        Raises BusError if the port fails.
+        """
+        troubled = [member for member in self._members.values() if member.state is not ONLINE]
+        released = [member for member in troubled if member.to_release]
+        self._pending[self._torque.name] = {member.id: (self._torque, 0) for member in released}
+        for member in troubled:
+            if member.state is REDUCED:
+                self._reduce(member)
+        for name, requests in self._pending.items():
+            self._write(link, poll, name, requests, now_s)
+        for member in released:
+            member.off_written |= member.to_release
+
+    def _write(
+        self, link: RegisterLink, poll: StatusPoll, name: str, requests: dict[int, tuple[Field, int]], now_s: float
+    ) -> None:
+        """Write all requests of one register, and read back those of listed members."""
+        # One packet has one address and one length: models with another address get another packet.
+        for field in dict.fromkeys(field for field, _ in requests.values()):
+            values = {servo: value for servo, (each, value) in requests.items() if each == field}
+            written = {s: field.to_bytes(v) for s, v in values.items() if (s, name) not in self._read_first}
+            if written:
+                link.sync_write(field.address, written)
+            ids = [servo for servo in values if self._members[servo].listed][:_VERIFIED]
+            answers = poll.read_some(link, "confirmed", (field.address, field.size), ids) if ids else {}
+            for servo, answer in answers.items():
+                if len(answer.data) == field.size:
+                    self._read_first.discard((servo, name))
+                    request = requests.pop(servo)
+                    if (value := field.from_bytes(answer.data)) != request[1]:
+                        requests[servo] = request  # to the back: the others have their turn
+                    self._seen(self._members[servo], name, value, now_s)
+
+    def _seen(self, member: Member, name: str, value: int, now_s: float) -> None:
+        """Take the value of a register that was written."""
+        if name == self._torque.name:
+            member.take_torque(bool(value), now_s)
+        elif name == BUS_WATCHDOG and value < 0:  # it has tripped
+            self._pending[BUS_WATCHDOG].pop(member.id, None)
+            member.distrust("watchdog", now_s)
+
+    def arm(self, servos: Iterable[int], watchdog: int) -> None:
+        """Set the watchdogs that stop the servo."""
+        armed = self.changed(BUS_WATCHDOG)
+        for servo in servos:
+            if servo not in armed and self._members[servo].startup.table.watchdog == "stops":
+                self._change(servo, BUS_WATCHDOG, watchdog)
+
+    def look_for_trips(self) -> None:
+        """Read all armed watchdogs: a servo whose watchdog has tripped ignores goals until it is brought back."""
+        for servo in self.changed(BUS_WATCHDOG):
+            self._change(servo, BUS_WATCHDOG, self._changed[servo][BUS_WATCHDOG])
+            self._read_first.add((servo, BUS_WATCHDOG))
+
+    def _reduce(self, member: Member) -> None:
+        """Halve the force that startup gave a servo: one value, however often this is called."""
+        fields = member.startup.table.fields
+        bounded = member.servo.safety.current_limit_mA is not None and "goal_current" in fields
+        name = "goal_current" if bounded else torque_register(member.servo.map)
+        if name is not None and name in fields and name not in self._changed.get(member.id, ()):
+            self._change(member.id, name, self.wanted(member.id).get(name, fields[name].high) // 2)
+
+    def _change(self, servo: int, name: str, value: int) -> None:
+        """Give a register another value than startup did, from now on."""
+        self._changed.setdefault(servo, {})[name] = value
+        self._pending.setdefault(name, {})[servo] = self._members[servo].startup.table[name], value
+
+    # --- compared once a second ---------------------------------------------------------------------------------
 
     def compare(self, link: RegisterLink, poll: StatusPoll, now_s: float) -> None:
-        """A poll's share of a round. Who does not answer is asked in the next round."""
+        """Read a poll's share of a round. A servo that does not answer is read in the next round."""
         if now_s < self._due_s:
             return
         if not self._round:
             self._begin_round()
         if not self._round:
             return
-        where, indices = self._round[0]
-        count = poll.fitting(link, "settings", where[1], min(_TOGETHER, len(indices)))
-        asked, self._round[0] = indices[:count], (where, indices[count:])
+        where, servos = self._round[0]
+        count = poll.fitting(link, "settings", where[1], min(_TOGETHER, len(servos)))
+        asked, self._round[0] = servos[:count], (where, servos[count:])
         self._due_s = now_s + self._part_s * count
-        if count == len(indices):
+        if count == len(servos):
             del self._round[0]
-        there = {self._members[index].id: index for index in asked if _compared(self._members[index])}
-        for servo, answer in poll.read_some(link, "settings", where, list(there)).items():
+        there = [servo for servo in asked if _compared(self._members[servo])]
+        for servo, answer in poll.read_some(link, "settings", where, there).items():
             if len(answer.data) == where[1]:
-                self._judge(there[servo], where[0], answer.data)
+                self._judge(servo, where[0], answer.data)
 
     def _begin_round(self) -> None:
         blocks: dict[Block, list[int]] = {}
-        for member in self._members:
+        for servo, member in self._members.items():
             if _compared(member):
-                fields = self._tables[member.index].fields
-                for where in _blocks(fields[name] for name in self.wanted(member.index) if name in fields):
-                    blocks.setdefault(where, []).append(member.index)
+                fields = member.startup.table.fields
+                for where in _blocks(fields[name] for name in self.wanted(servo) if name in fields):
+                    blocks.setdefault(where, []).append(servo)
         self._round = list(blocks.items())
         self._part_s = _ROUND_S / max(1, sum(map(len, blocks.values())))
 
-    def _judge(self, index: int, start: int, data: bytes) -> None:
-        """Registers of a member, compared: what was changed on the way is written once more."""
-        differing, fields = self._differing.setdefault(index, {}), self._tables[index].fields
-        for name, value in self.wanted(index).items():
-            field = fields.get(name)
+    def _judge(self, servo: int, start: int, data: bytes) -> None:
+        """Compare the registers of a member; one that was changed while the bus runs is written once more."""
+        differing, member = self._differing.setdefault(servo, {}), self._members[servo]
+        for name, value in self.wanted(servo).items():
+            field = member.startup.table.fields.get(name)
             if field is None or not start <= field.address <= start + len(data) - field.size:
                 continue
             seen = field.from_bytes(data[field.address - start :])
-            if seen == value or (index, name) in self._writes:
+            if seen == value or servo in self._pending.get(name, ()):
                 differing.pop(name, None)
                 continue
             differing[name] = seen, value
-            if name in self._changed.get(index, ()):
-                self._writes.want(index, field, value)
-        self._members[index].take_registers(differing)
+            if name in self._changed.get(servo, ()):
+                self._change(servo, name, value)
+        member.take_registers(differing)
 
 
 def _compared(member: Member) -> bool:
-    return member.gets_goals and member.liveness.listed
+    return member.gets_goals and member.listed
 
 
 def _blocks(fields: Iterable[Field]) -> list[Block]:
-    """What to read for registers of one servo: those that lie close enough together at once."""
-    blocks: list[Block] = []
+    """Return the blocks in which to read registers of one servo: those close enough together are read at once."""
+    groups: list[list[Field]] = []
     for field in sorted(fields, key=lambda each: each.address):
-        end = field.address + field.size
-        if blocks and end - blocks[-1][0] <= _BLOCK:
-            blocks[-1] = blocks[-1][0], max(blocks[-1][1], end - blocks[-1][0])
+        if groups and field.address + field.size - groups[-1][0].address <= _BLOCK:
+            groups[-1].append(field)
         else:
-            blocks.append((field.address, field.size))
-    return blocks
+            groups.append([field])
+    return [span_of(group) for group in groups]

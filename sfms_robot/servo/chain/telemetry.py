@@ -1,31 +1,31 @@
-"""What the servos of a bus last said of themselves, decoded many at a time, whatever their family.
+"""The last reports of the servos of a bus, decoded many at a time, for every family.
 
-The registers that change lie close together in every table, so one read of a block tells all. Servos of one bus may
-be of different models as long as those registers lie at the same place; what a raw value means (mA per tick, ticks per
-turn) is each model's own. Every register has its own sign rule, and the series differ in byte order.
+The registers that change are close together in every table, so one read of a block gets all of them. Servos of one bus
+may be of different models if those registers have the same addresses; the meaning of a raw value (mA per tick, ticks
+per turn) is each model's own. Every register has its own sign rule, and the series differ in byte order.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Reading
 from sfms_robot.ports import TickConversion
-from sfms_robot.servo.policy import Measured
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field, Table, span_of
 
 Block = tuple[int, int]  # address, length
 
 _NEEDED: Final = ("present_position", "goal_position", "torque_enable")
-_TOLD: Final = {"velocity": "present_speed", "voltage": "voltage", "temperature": "temperature"}
+_ROLES: Final = {"velocity": "present_speed", "voltage": "voltage", "temperature": "temperature"}
 _REACH: Final = 8  # bytes by which a block grows for the present current: fewer than a request for it takes
 _EXTRA: Final = ("current_mA", "load_percent", "velocity_rad_s", "voltage_V", "temperature_C")
+_CURRENT, _PERCENT, _VELOCITY, _VOLTAGE, _TEMPERATURE = range(5)  # rows of `Telemetry.extra`
 
 
 class Telemetry:
@@ -33,21 +33,21 @@ class Telemetry:
 
     Args:
         bus: its name, for messages.
-        family, protocol: what the servos of this bus speak, as in a firmware map.
+        family, protocol: of the servos of this bus, as in a firmware map.
         tables: of each servo.
         conversion: joint angles <-> ticks.
 
     Attributes:
         position: (address, length) of the present position alone.
-        block: that of everything that is told at once, position included.
-        health: that of torque enable, up to the hardware error status where there is one.
-        goal, torque, error: registers, alike for all servos; `error` None where faults come with every answer.
-        currents: per servo the register of its present current where that lies outside the block.
+        block: that of all registers read together, position included.
+        health: that of torque enable, up to the hardware error status if there is one.
+        goal, torque, error: registers, the same for all servos; `error` None if faults come with every answer.
+        currents: per servo the register of its present current if that is outside the block.
         ticks: (J,) last position.
         seen_s: (J,) when it came, -inf before the first.
-        current_mA, load_percent, velocity_rad_s, voltage_V, temperature_C: (J,) NaN where not known.
+        extra: (5, J) `current_mA`, `load_percent`, `velocity_rad_s`, `voltage_V`, `temperature_C`; NaN if not known.
 
-    Raises ConfigError for servos of another family, or whose registers lie at different places.
+    Raises ConfigError for servos of another family, or with other addresses of these registers.
     """
 
     def __init__(
@@ -65,104 +65,112 @@ class Telemetry:
         loads = [_load(table) for table in tables]
         if loads[0] is not None and all(_alike(load, loads[0]) for load in loads):
             self._fields["load"] = loads[0]
-        for key, role in _TOLD.items():
+        for key, role in _ROLES.items():
             first = tables[0].role(role)
             if first is not None and all(_alike(table.role(role), first) for table in tables):
                 self._fields[key] = first
         self.position: Block = (present.address, present.size)
-        self.block = _span(self._fields.values())
+        self.block = span_of([*self._fields.values()])
         self.currents = [_apart(table, self._fields.get("load")) for table in tables]
         current = self.currents[0]
         if current is not None and all(_alike(each, current) for each in self.currents):
-            wider = _span([*self._fields.values(), current])
+            wider = span_of([*self._fields.values(), current])
             if wider[1] - self.block[1] <= _REACH:
                 self._fields["current"], self.block = current, wider
                 self.currents = [None] * len(tables)
-        self.health = _span([self.torque] if self.error is None else [self.torque, self.error])
+        self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
         self._layouts = {where: self._layout(where) for where in (self.position, self.block)}
-        in_block = "load" in self._fields
-        self._mA = np.array([load.scale if load and in_block and load.unit == "mA" else math.nan for load in loads])
-        percent = [load.scale if load and in_block and load.unit == "percent" else math.nan for load in loads]
-        self._percent = np.array(percent)
         self._conversion = conversion
-        count = len(tables)
-        zero = conversion.to_rad(np.zeros(count, np.int64))
-        rad_per_tick = conversion.to_rad(np.ones(count, np.int64)) - zero
-        self._rad_s = rad_per_tick * np.array([_ticks_s(table) for table in tables])
-        self.ticks: NDArray[np.int64] = np.zeros(count, np.int64)
-        self.seen_s = np.full(count, -np.inf)
-        self.current_mA, self.load_percent = np.full(count, np.nan), np.full(count, np.nan)
-        self.velocity_rad_s = np.full(count, np.nan)
-        self.voltage_V, self.temperature_C = np.full(count, np.nan), np.full(count, np.nan)
+        self._columns = self._columns_of(tables, loads)
+        self.ticks: NDArray[np.int64] = np.zeros(len(tables), np.int64)
+        self.seen_s = np.full(len(tables), -np.inf)
+        self.extra = np.full((len(_EXTRA), len(tables)), np.nan)
+
+    def _columns_of(
+        self, tables: Sequence[Table], loads: Sequence[Field | None]
+    ) -> list[tuple[str, int, NDArray[np.float64]]]:
+        """Return what the registers of the block give: (register, row of `extra`, (J,) unit of a raw value)."""
+
+        def units(unit: str) -> NDArray[np.float64]:
+            return np.array([load.scale if load is not None and load.unit == unit else math.nan for load in loads])
+
+        zero, one = (self._conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
+        columns = {
+            _VELOCITY: ("velocity", (one - zero) * np.array([_ticks_s(table) for table in tables])),
+            _CURRENT: ("load", units("mA")),
+            _PERCENT: ("load", units("percent")),
+        }
+        plain = {_VOLTAGE: "voltage", _TEMPERATURE: "temperature"}
+        if "current" in self._fields:
+            plain[_CURRENT] = "current"
+        elif self.currents.count(None) < len(tables):
+            del columns[_CURRENT]  # read servo by servo
+        for row, key in plain.items():
+            if key in self._fields:
+                columns[row] = key, np.full(len(tables), self._fields[key].scale)
+        known = [(key, row, unit) for row, (key, unit) in columns.items() if key in self._fields]
+        return [column for column in known if np.isfinite(column[2]).any()]
 
     def forget(self) -> None:
-        """Nothing was told yet: another connection."""
+        """Forget all reports: another connection."""
         self.seen_s[:] = -np.inf
-        for values in (self.current_mA, self.load_percent, self.velocity_rad_s, self.voltage_V, self.temperature_C):
-            values[:] = np.nan
+        self.extra[:] = np.nan
 
     def capabilities(self, index: int) -> frozenset[str]:
-        told = {"position", "torque"} | (set(self._fields) & {*_TOLD, "current"})
-        current = math.isfinite(self._mA[index]) or self.currents[index] is not None
-        return frozenset(told | ({"current"} if current else set()))
+        """Return what a servo reports or does, as `ports.Bus`."""
+        known = {"position", "torque"} | (set(self._fields) & {*_ROLES, "current"})
+        in_block = any(row == _CURRENT and math.isfinite(unit[index]) for _, row, unit in self._columns)
+        current = in_block or self.currents[index] is not None
+        return frozenset(known | ({"current"} if current else set()))
 
     def take(self, where: Block, indices: Sequence[int], data: Sequence[bytes], now_s: float) -> None:
         """Decode answers to a read of `where`, `position` or `block`; `data` hold its whole length."""
         rows = np.frombuffer(b"".join(data), self._layouts[where])
         at = np.asarray(indices, np.intp)
-        values = {key: _signed(self._fields[key], rows[key]) for key in rows.dtype.names or ()}
-        self.ticks[at] = values["position"]
+        self.ticks[at] = _signed(self._fields["position"], rows["position"])
         self.seen_s[at] = now_s
-        if "velocity" in values:
-            self.velocity_rad_s[at] = values["velocity"] * self._rad_s[at]
-        if "load" in values:
-            if "current" not in values and self.currents.count(None) == len(self.currents):
-                self.current_mA[at] = values["load"] * self._mA[at]
-            self.load_percent[at] = values["load"] * self._percent[at]
-        if "current" in values:
-            self.current_mA[at] = values["current"] * self._fields["current"].scale
-        if "voltage" in values:
-            self.voltage_V[at] = values["voltage"] * self._fields["voltage"].scale
-        if "temperature" in values:
-            self.temperature_C[at] = values["temperature"] * self._fields["temperature"].scale
+        if where == self.block:
+            for key, row, unit in self._columns:
+                self.extra[row, at] = _signed(self._fields[key], rows[key]) * unit[at]
 
     def take_current(self, index: int, field: Field, data: bytes) -> None:
-        """An answer to a read of `currents[index]`."""
-        self.current_mA[index] = field.to_unit(field.from_bytes(data))
+        """Decode an answer to a read of `currents[index]`."""
+        self.extra[_CURRENT, index] = field.to_unit(field.from_bytes(data))
 
     def health_of(self, data: bytes) -> tuple[bool, int]:
-        """An answer to a read of `health`: whether torque is on, and the latched hardware errors (bits, or 0)."""
+        """Return (whether torque is on, latched hardware errors as bits) from an answer to a read of `health`."""
         start = self.health[0]
         bits = self.error.from_bytes(data[self.error.address - start :]) if self.error is not None else 0
         return bool(self.torque.from_bytes(data[self.torque.address - start :])), bits
 
-    def measured(self, index: int) -> Measured:
-        voltage, temperature = float(self.voltage_V[index]), float(self.temperature_C[index])
-        return Measured(
-            voltage if math.isfinite(voltage) else None, temperature if math.isfinite(temperature) else None
-        )
+    def measured(self, index: int) -> dict[str, float]:
+        """Return what is known of the quantities that faults have thresholds for, by fault: see `policy.counts`."""
+        values = {"input voltage": self.extra[_VOLTAGE, index], "overheating": self.extra[_TEMPERATURE, index]}
+        return {fault: float(value) for fault, value in values.items() if math.isfinite(value)}
+
+    def currents_mA(self) -> list[float]:
+        """Return the last present current of every servo, NaN if not known."""
+        currents: list[float] = self.extra[_CURRENT].tolist()
+        return currents
 
     def supply_mA(self) -> float:
-        """Sum of the motor currents that are known: an upper bound of what the servos take from the supply."""
-        currents: list[float] = self.current_mA.tolist()
-        return sum(abs(current) for current in currents if current == current)
+        """Return the sum of the known motor currents: an upper bound of what the servos take from the supply."""
+        return sum(abs(current) for current in self.currents_mA() if current == current)
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
     ) -> Mapping[str, Reading]:
+        """Return the readings of all joints; `rejoined`: indices of those that came back in this poll."""
         angles = self._conversion.to_rad(self.ticks).tolist()
         ages = (now_s - self.seen_s).tolist()
-        columns: tuple[Doubles, ...] = (
-            self.current_mA, self.load_percent, self.velocity_rad_s, self.voltage_V, self.temperature_C,
-        )  # fmt: skip
-        extras = zip(*(column.tolist() for column in columns), strict=True)
+        extras = self.extra.T.tolist()
         out: dict[str, Reading] = {}
-        for index, (joint, extra) in enumerate(zip(joints, extras, strict=True)):
+        for index, joint in enumerate(joints):
             if ages[index] == math.inf:
                 out[joint] = Reading(None, math.inf, faults[index])
                 continue
-            told = {key: value for key, value in zip(_EXTRA, extra, strict=True) if value == value}
-            out[joint] = Reading(angles[index], ages[index], faults[index], told, index in rejoined)
+            known = {key: value for key, value in zip(_EXTRA, extras[index], strict=True) if value == value}
+            out[joint] = Reading(angles[index], ages[index], faults[index], known, index in rejoined)
         return out
 
     def _layout(self, where: Block) -> np.dtype[np.void]:
@@ -183,8 +191,10 @@ class Telemetry:
 
 
 def common(bus: str, tables: Sequence[Table], role: str) -> Field | None:
-    """The register of a role: one request has one address, so all servos of a bus have it at one place, in one form,
-    or none has it. Raises ConfigError."""
+    """Return the register of a role, the same for all servos of a bus, since one request has one address.
+
+    None if none has it. Raises ConfigError if addresses or forms differ.
+    """
     first = tables[0].role(role)
     for table in tables[1:]:
         if not _alike(table.role(role), first):
@@ -203,14 +213,14 @@ def _needed(bus: str, tables: Sequence[Table], role: str) -> Field:
 
 
 def _alike(field: Field | None, other: Field | None) -> bool:
-    """At the same place, in the same form."""
+    """Return whether two registers have the same address and form."""
     return (field and (field[1:4], field.sign, field.byte_order)) == (
         other and (other[1:4], other.sign, other.byte_order)
     )
 
 
 def _load(table: Table) -> Field | None:
-    """Dynamixel 2.0 has current or load at one place of the block; the others have load, and perhaps a current."""
+    """Return current or load, which share an address in Dynamixel 2.0; the others have load, and perhaps a current."""
     return (table.role("present_current") if table.protocol == 2 else None) or table.role("present_load")
 
 
@@ -220,19 +230,13 @@ def _apart(table: Table, load: Field | None) -> Field | None:
     return current if apart and current != load else None
 
 
-def _span(fields: Iterable[Field]) -> Block:
-    each = list(fields)
-    first = min(field.address for field in each)
-    return first, max(field.address + field.size for field in each) - first
-
-
 def _format(field: Field) -> str:
     order = ">" if field.byte_order == "big" else "<"
     return f"{order}{'i' if field.sign == 'twos_complement' else 'u'}{field.size}"
 
 
 def _signed(field: Field, raw: NDArray[Any]) -> NDArray[Any]:
-    """Values of raw registers, as `Field.from_bytes` does for one."""
+    """Return the values of raw registers, as `Field.from_bytes` does for one."""
     if field.sign == "offset_2048":
         return np.asarray(raw.astype(np.int64) - 2048)
     if field.sign.startswith("sign_bit_"):
@@ -243,7 +247,7 @@ def _signed(field: Field, raw: NDArray[Any]) -> NDArray[Any]:
 
 
 def _ticks_s(table: Table) -> float:
-    """Ticks per second of one raw unit of speed: told in rpm or in degrees per second."""
+    """Return ticks per second of one raw unit of speed, which is in rpm or in degrees per second."""
     field = table.role("present_speed")
     if field is None:
         return math.nan

@@ -21,7 +21,7 @@ Parameters, by the manual's names (words low byte first):
 3. Stuffing: between instruction and crc, every FF FF FD is followed by one more FD, so the header FF FF FD 00
    never appears inside a packet. The crc is over the stuffed bytes.
 4. A reader that lost its place looks for the next header; a header inside an unfinished packet means that the
-   packet was cut off, and reading goes on at that header.
+   packet was cut off, and reading continues at that header.
 
 Source: ROBOTIS e-manual, docs/en/dxl/protocol2.md.
 """
@@ -69,8 +69,8 @@ ACCESS_ERROR: Final = 7
 
 BROADCAST: Final = 0xFE
 MAX_ID: Final = 252
-MAX_PACKET: Final = 1024  # bytes; longer claims are rubbish, and bound what a reader holds
-STATUS_OVERHEAD: Final = 11  # bytes of a status packet beside its data
+MAX_PACKET: Final = 1024  # bytes; a longer claim is noise, and this bounds what a reader holds
+STATUS_OVERHEAD: Final = 11  # bytes of a status packet without its data
 
 _HEADER: Final = b"\xff\xff\xfd\x00"
 _LOOKALIKE: Final = b"\xff\xff\xfd"
@@ -78,7 +78,7 @@ _STUFFED: Final = b"\xff\xff\xfd\xfd"
 
 
 class Packet(NamedTuple):
-    """One packet. Of a status, `params` is the data behind the error byte; of an instruction, `error` is 0."""
+    """A packet. Of a status, `params` is the data behind the error byte; of an instruction, `error` is 0."""
 
     servo: int
     instruction: int
@@ -90,17 +90,17 @@ crc16: Final = umts  # CRC-16/BUYPASS: 0x8005, start 0, not reflected. A second 
 
 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
-    """An instruction packet. Raises PacketError when it would be longer than `MAX_PACKET`."""
+    """Return an instruction packet. Raises PacketError if it would be longer than `MAX_PACKET`."""
     return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
 
 
 def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
-    """A status packet, as a servo sends it."""
+    """Return a status packet, as a servo sends it."""
     return _encode(servo, (bytes([STATUS, error]) + data).replace(_LOOKALIKE, _STUFFED))
 
 
 def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | None = None) -> bytes:
-    """The one status packet that answers a fast sync read; `replies` are (id, error, data) in list order.
+    """Return the one status packet that answers a fast sync read; `replies` are (id, error, data) in list order.
 
     Each device appends error, id, data and the crc of everything so far; the last crc closes the packet. Nothing is
     stuffed: a device cannot know what the ones before it sent. `length`: what LEN says where the packet stops short.
@@ -116,10 +116,10 @@ def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | 
 
 
 def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, int, bytes]]:
-    """(id, error, data) of each device in the answer to a fast sync read of `length` bytes.
+    """Return (id, error, data) of each device in the answer to a fast sync read of `length` bytes.
 
-    `data` begins with the header. Where a device fell silent the packet stops short: those in front of the gap are
-    given, each proved by the crc it sent, and nothing of what is behind.
+    `data` begins with the header. If a device is silent the packet stops short: the devices in front of the gap are
+    returned, each proved by the crc it sent, and none behind it.
     """
     if not data.startswith(_HEADER + bytes([BROADCAST])) or data[7:8] != bytes([STATUS]):
         return []
@@ -147,9 +147,9 @@ def _encode(servo: int, body: bytes) -> bytes:
 
 
 def maybe_packet(buffer: bytearray) -> Packet | None:
-    """Take the first whole packet off the front of `buffer`, or None: more bytes are needed.
+    """Take the first whole packet off the front of `buffer`, or return None: more bytes are needed.
 
-    Rubbish in front of it is dropped, as is a packet whose crc is wrong. What stays in the buffer after None is at
+    Noise in front of it is dropped, and so is a packet with a wrong crc. What stays in the buffer after None is at
     most one unfinished packet, so a caller that empties it after each read holds a bounded number of bytes.
     """
     while True:
@@ -187,7 +187,7 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
 
 
 def _header_begun(buffer: bytearray) -> int:
-    """Bytes at the end of `buffer` that may be the beginning of a header."""
+    """Return how many bytes at the end of `buffer` may be the beginning of a header."""
     for size in (3, 2, 1):
         if buffer.endswith(_HEADER[:size]):
             return size
@@ -195,5 +195,5 @@ def _header_begun(buffer: bytearray) -> int:
 
 
 def error_text(error: int) -> str:
-    """What the low bits of an error byte say."""
+    """Return the error number in the low bits of an error byte, in words."""
     return ERRORS.get(error & ~ALERT, f"error {error & ~ALERT}")

@@ -6,8 +6,8 @@
    without its top bit, data. A board whose setting "Enable CRC" is on expects one byte more behind either, the CRC-7
    of all bytes before it; its answers carry none.
 3. Targets and positions are in quarter microseconds of pulse; target 0 switches the pulses off.
-4. A board that detects its baud rate hears nothing before the byte AA.
-5. Only two bytes or one ever come back, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
+4. A board that detects its baud rate ignores all bytes before AA.
+5. Answers are two bytes or one, without any frame: to `GET_POSITION`, `GET_MOVING` and `GET_ERRORS`.
 
 The CRC-7 detects any change of one byte that leaves the packet its length. (A CRC of 7 bits misses one such change,
 0x91. That one flips the top bit, and rule 1 detects it.) Where a changed byte begins another command, the CRC of that
@@ -36,14 +36,14 @@ BAUD_INDICATION: Final = 0xAA
 DEFAULT_DEVICE: Final = 12
 OFF: Final = 0  # the target that switches pulses off
 MAX_WORD: Final = 0x3FFF
-FACTORY_PULSE_US: Final = (992, 2000)  # of every channel; wider is set over USB, and a board keeps to it silently
+FACTORY_PULSE_US: Final = (992, 2000)  # of every channel; a wider range is set over USB, and a board clips silently
 
 # Bits of the error register, section 4.e; bits 6 to 8 are the script's.
 SIGNAL_ERROR: Final = 1 << 0  # Serial Signal Error: a stop bit was not where it should be
 CRC_ERROR: Final = 1 << 3  # Serial CRC Error: the byte behind a command was not its CRC
-PROTOCOL_ERROR: Final = 1 << 4  # Serial Protocol Error: a command that is none, or one cut short
+PROTOCOL_ERROR: Final = 1 << 4  # Serial Protocol Error: an unknown command, or one cut short
 TIMEOUT_ERROR: Final = 1 << 5  # Serial Timeout: no command for as long as its setting says
-WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way: nothing is wrong with the board itself
+WIRE_ERRORS: Final = 0x1F  # bytes were lost or damaged on the way; the board itself is fine
 
 _POLYNOMIAL: Final = 0x91  # of the CRC, section 5.d
 _DATA_LENGTH: Final = {
@@ -59,7 +59,7 @@ _DATA_LENGTH: Final = {
 
 
 class Command(NamedTuple):
-    """One command as a board takes it. `error` is a bit of the error register when it cannot be obeyed, else 0."""
+    """A command as a board reads it. `error` is a bit of the error register if it cannot be obeyed, else 0."""
 
     code: int
     data: bytes = b""
@@ -67,39 +67,39 @@ class Command(NamedTuple):
 
 
 def word(value: int) -> bytes:
-    """14 bits as two data bytes. Raises ValueError for what does not fit."""
+    """Return 14 bits as two data bytes. Raises ValueError for a value that does not fit."""
     if not 0 <= value <= MAX_WORD:
         raise ValueError(f"{value} does not fit the 14 bits of a Maestro command")
     return bytes([value & 0x7F, value >> 7])
 
 
 def from_word(data: bytes) -> int:
-    """Inverse of `word`."""
+    """Return the value of two data bytes, the inverse of `word`."""
     return data[0] | data[1] << 7
 
 
 def set_target(channel: int, quarter_us: int) -> bytes:
-    """`quarter_us` in quarter microseconds of pulse; 0 = no pulses."""
+    """Return a command that sets a pulse, in quarter microseconds; 0 = no pulses."""
     return bytes([SET_TARGET, channel]) + word(quarter_us)
 
 
 def set_targets(first: int, quarter_us: Sequence[int]) -> bytes:
-    """Targets of consecutive channels from `first` on, in one command."""
+    """Return a command that sets the pulses of consecutive channels from `first` on."""
     return bytes([SET_TARGETS, len(quarter_us), first]) + b"".join(map(word, quarter_us))
 
 
 def get_position(channel: int) -> bytes:
-    """Answered by two bytes, low byte first: the pulse sent now, in quarter microseconds; 0 = none."""
+    """Return a request answered by two bytes, low byte first: the pulse sent now, in quarter microseconds; 0 = none."""
     return bytes([GET_POSITION, channel])
 
 
 def get_errors() -> bytes:
-    """Answered by two bytes, low byte first: the error register, which this clears."""
+    """Return a request answered by two bytes, low byte first: the error register, which this clears."""
     return bytes([GET_ERRORS])
 
 
 def crc7(packet: bytes) -> int:
-    """Return the CRC of a packet, 0..127, worked out from the lowest bit of each byte on; 0 for one with its CRC."""
+    """Return the CRC of a packet, 0..127, computed from the lowest bit of each byte on; 0 for one with its CRC."""
     crc = 0
     for byte in packet:
         crc ^= byte
@@ -109,12 +109,12 @@ def crc7(packet: bytes) -> int:
 
 
 def sealed(packet: bytes) -> bytes:
-    """Append its CRC to a command, compact or addressed."""
+    """Append the CRC to a command, compact or addressed."""
     return packet + bytes([crc7(packet)])
 
 
 def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
-    """A compact command in the Pololu protocol, for one of several boards on a wire.
+    """Return a compact command in the Pololu protocol, for one of several boards on a wire.
 
     [0] AA, [1] device number, [2] command byte with its top bit cleared, [3] on: its data.
     """
@@ -122,12 +122,12 @@ def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
 
 
 def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> Command | None:
-    """Take the next command for board `device` off the front of `buffer`, or None: more bytes are needed.
+    """Take the next command for board `device` off the front of `buffer`, or return None: more bytes are needed.
 
     `crc`: a CRC byte follows every command but Mini SSC.
 
-    What a board would call an error comes as a Command with `error` set and the offending bytes removed. Commands to
-    other boards are dropped silently. What stays in the buffer after None is at most one unfinished command.
+    An error is returned as a Command with `error` set, and its bytes are removed. Commands to other boards are dropped
+    silently. What stays in the buffer after None is at most one unfinished command.
     """
     while buffer:
         code, start = buffer[0], 1
@@ -171,7 +171,7 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
 
 
 def _end(buffer: bytearray, code: int, start: int) -> int | None:
-    """Where the data of a command end; None when that is not known yet, -1 when nobody knows the command."""
+    """Return the index behind the data of a command; None if that is not known yet, -1 for an unknown command."""
     if code != SET_TARGETS:
         return start + _DATA_LENGTH[code] if code in _DATA_LENGTH else -1
     if len(buffer) <= start:

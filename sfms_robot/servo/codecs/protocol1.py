@@ -1,45 +1,90 @@
 """The FF FF frame of Dynamixel Protocol 1.0 and of Feetech: values in, bytes out, and back. Opens no port.
 
-    byte  0  1    2    3       4                       5 ...           n-1
-          FF FF   ID   LENGTH  INSTRUCTION or ERROR    PARAMETER ...   CHECKSUM
+    byte  0  1  2    3       4                       5 ...           n-1
+          FF FF ID   LENGTH  INSTRUCTION or ERROR    PARAMETER ...   CHECKSUM
           header
 
-1. `length` counts code, parameters and sum. `sum` is the inverse of the low byte of id + length + code + parameters.
-2. `code` is the instruction in what a host sends and the error byte in what a servo answers. Nothing in the frame says
-   which of the two it is, nor what an answer answers: a reader has to know what it asked, whom, and how long the
+1. LENGTH counts code, parameters and checksum. CHECKSUM is the inverse of the low byte of the sum of bytes 2 to n-2.
+2. Byte 4 is the instruction in what a host sends and the error byte in what a servo answers. The frame does not say
+   which of the two it is, nor what an answer answers: a reader has to know what it asked, which servo, and how long the
    answer must be.
-3. Nothing is stuffed, so parameters may look like a header. A frame whose sum is wrong was none: reading goes on at
+3. Nothing is stuffed, so parameters may look like a header. After a frame with a wrong checksum, reading continues at
    the next header behind its first byte.
 
+Parameters begin at byte 5. Both families have, to id FE, which no servo answers:
+
+    SYNC WRITE (83)        start address, length L, then id and L bytes of data of each
+
+Dynamixel 1.0 sends words low byte first, and has no sync read:
+
+    BULK READ (92)         00, then length, id, start address of each: in this order, unlike everywhere else; to id FE,
+                           one status of each in the order asked, each waiting for the one before it; MX series only
+
+Feetech STS and SMS send words low byte first, SCS high byte first; the model decides (`byte_order` of its firmware
+map), as for the sign rule of each register:
+
+    SYNC READ (82)         start address, length, then ids; to id FE, one status of each in that order. SCS do not
+                           answer it reliably
+    RESET TURNS (0A)       none; STS only
+    CALIBRATE OFFSET (0B)  none; the present position becomes the middle
+
 Sources: ROBOTIS e-manual, docs/en/dxl/protocol1.md; Feetech communication protocol manual (matthieuvigne/STS_servos
-@bdff048, extras/Feetech-CommunicationProtocole.docx).
+@bdff048, extras/Feetech-CommunicationProtocole.docx); ftservo/FTServo_Arduino @64922cd, src/INST.h.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from sfms_robot.errors import PacketError
 
+# Instructions: e-manual "Instruction Packet"; Feetech manual section 1.3.
 PING: Final = 0x01
 READ: Final = 0x02
 WRITE: Final = 0x03
-REG_WRITE: Final = 0x04
+REG_WRITE: Final = 0x04  # kept in the servo until ACTION
 ACTION: Final = 0x05
 FACTORY_RESET: Final = 0x06
 SYNC_WRITE: Final = 0x83
+BULK_READ: Final = 0x92  # Dynamixel MX
+RESET_TURNS: Final = 0x0A  # Feetech STS
+CALIBRATE_OFFSET: Final = 0x0B  # Feetech
+SYNC_READ: Final = 0x82  # Feetech STS and SMS
 
 BROADCAST: Final = 0xFE
 MAX_ID: Final = 0xFD
-OVERHEAD: Final = 6  # bytes of a frame beside its parameters
+OVERHEAD: Final = 6  # bytes of a frame without its parameters
 MAX_PARAMS: Final = 0xFF - 2
 MAX_FRAME: Final = OVERHEAD + MAX_PARAMS
+
+# Error byte of Dynamixel 1.0 (e-manual "Status Packet: Error"): four bits are about the request, three about the servo.
+VOLTAGE: Final = 0x01  # bit 0, of both families
+ANGLE_LIMIT: Final = 0x02  # bit 1: the goal is outside the angle limits
+OVERHEATING: Final = 0x04  # bit 2, of both families
+RANGE: Final = 0x08  # bit 3: a parameter is out of range
+CHECKSUM: Final = 0x10  # bit 4
+OVERLOAD: Final = 0x20  # bit 5, of both families
+INSTRUCTION: Final = 0x40  # bit 6: unknown instruction, or ACTION without REG WRITE; bit 7 is always 0
+
+REFUSALS: Final[Mapping[int, str]] = {
+    ANGLE_LIMIT: "angle limit error",
+    RANGE: "range error",
+    CHECKSUM: "checksum error",
+    INSTRUCTION: "instruction error",
+}
+REFUSAL_BITS: Final = ANGLE_LIMIT | RANGE | CHECKSUM | INSTRUCTION
+
+# Status byte of Feetech: states of the servo, in every answer. No bit says that a request was refused.
+ENCODER: Final = 0x02
+CURRENT: Final = 0x08
+CALIBRATE_HERE: Final = 128  # written to `torque_enable` of an STS: the present position becomes the middle
 
 _HEADER: Final = b"\xff\xff"
 
 
 class Frame(NamedTuple):
-    """One frame. `code` is an instruction or an error byte, depending on who sent it."""
+    """A frame. `code` is an instruction or an error byte, depending on the sender."""
 
     servo: int
     code: int
@@ -47,7 +92,7 @@ class Frame(NamedTuple):
 
 
 def encode(servo: int, code: int, params: bytes = b"") -> bytes:
-    """One frame. Raises PacketError for parameters that its length byte cannot count."""
+    """Return a frame. Raises PacketError for parameters that its length byte cannot count."""
     if len(params) > MAX_PARAMS:
         raise PacketError(f"a frame of {len(params)} parameters is longer than {MAX_PARAMS}")
     body = bytes([servo, len(params) + 2, code]) + params
@@ -55,7 +100,7 @@ def encode(servo: int, code: int, params: bytes = b"") -> bytes:
 
 
 def maybe_frame(buffer: bytearray) -> Frame | None:
-    """Take the first whole frame off the front of `buffer`, or None: more bytes are needed.
+    """Take the first whole frame off the front of `buffer`, or return None: more bytes are needed.
 
     What stays in the buffer after None is at most one unfinished frame, `MAX_FRAME` - 1 bytes.
     """
@@ -70,7 +115,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
                 del buffer[0]
             return None
         servo, length = buffer[2], buffer[3]
-        if servo == 0xFF or length < 2:  # a third FF is still header; LENGTH counts code and sum at least
+        if servo == 0xFF or length < 2:  # a third FF is still header; LENGTH counts code and checksum at least
             del buffer[0]
             continue
         total = length + 4  # LENGTH counts what is behind byte 3
@@ -85,7 +130,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
 
 
 def salvage(buffer: bytearray) -> list[Frame]:
-    """Empty a buffer to which nothing will be added: the whole frames behind a beginning that was cut off."""
+    """Empty a buffer to which nothing will be added; return the whole frames behind a beginning that was cut off."""
     frames = []
     while buffer:
         frame = maybe_frame(buffer)
@@ -94,3 +139,45 @@ def salvage(buffer: bytearray) -> list[Frame]:
         else:
             del buffer[:1]
     return frames
+
+
+def refusal_text(error: int) -> str:
+    """Return what an error byte of Dynamixel 1.0 says against the request; empty if it was taken."""
+    return ", ".join(text for bit, text in REFUSALS.items() if error & bit)
+
+
+def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
+    """Return the parameters of a sync write; all data have one length."""
+    length = len(next(iter(values.values())))
+    return bytes([address, length]) + b"".join(bytes([servo]) + data for servo, data in values.items())
+
+
+def sync_write_parts(params: bytes) -> tuple[int, Iterator[tuple[int, bytes]]]:
+    """Return (address, (id, data) of each servo); bytes behind the last whole part are ignored.
+
+    Raises IndexError if address or length are missing.
+    """
+    address, length = params[0], params[1]
+    starts = range(2, len(params) - length, length + 1)
+    return address, ((params[i], params[i + 1 : i + 1 + length]) for i in starts)
+
+
+def bulk_read_params(requests: Iterable[tuple[int, int, int]]) -> bytes:
+    """Return the parameters of a bulk read of (id, address, length)."""
+    return b"\x00" + b"".join(bytes([length, servo, address]) for servo, address, length in requests)
+
+
+def bulk_read_parts(params: bytes) -> Sequence[tuple[int, int, int]]:
+    """Return (id, address, length) of each servo asked."""
+    body = params[1:]  # behind the 00
+    return [(body[i + 1], body[i + 2], body[i]) for i in range(0, len(body) - 2, 3)]
+
+
+def sync_read_params(address: int, length: int, servos: Sequence[int]) -> bytes:
+    """Return the parameters of a Feetech sync read; one answer per id comes back, in this order."""
+    return bytes([address, length, *servos])
+
+
+def sync_read_parts(params: bytes) -> tuple[int, int, bytes]:
+    """Return (address, length, ids). Raises IndexError if address or length are missing."""
+    return params[0], params[1], params[2:]

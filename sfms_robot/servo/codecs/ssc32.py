@@ -4,7 +4,7 @@ r"""Lynxmotion SSC-32 and SSC-32U text commands: values in, bytes out, and back.
     #5 L \r                             output low: no pulses, the servo goes limp
     Q \r, QP 5 7 \r, VER \r             "." or "+" (still moving); one byte per channel in 10 us; a line of text
 
-Letters of either case, spaces anywhere, a carriage return ends the command and ESC throws away what came before it.
+Letters of either case, spaces anywhere, a carriage return ends the command and ESC drops what came before it.
 
 Sources: Lynxmotion SSC-32U User Guide, "Servo Move or Group Move" and "Advanced Functions"; that `L` stops the pulses
 of a servo: community.robotshop.com/forum/t/ssc32-re-startup-condition/19731.
@@ -21,7 +21,7 @@ CHANNELS: Final = 32  # <ch> 0..31
 MIN_PULSE_US: Final = 500  # <pw>, "pulse width in microseconds, 500 - 2500"
 MAX_PULSE_US: Final = 2500
 MAX_TIME_MS: Final = 65535  # <time>, "time in milliseconds to complete the move, 65535 maximum"
-MAX_LINE: Final = 1024  # bytes; a longer line is rubbish, and bounds what a reader holds
+MAX_LINE: Final = 1024  # bytes; a longer line is noise, and this bounds what a reader holds
 DONE: Final = b"."  # answers to Q, Query Movement Status
 MOVING: Final = b"+"
 
@@ -36,7 +36,7 @@ _QUERY: Final = re.compile(r"QP\s*\d{1,2}(?:\s+\d{1,2})*")
 
 
 class Move(NamedTuple):
-    """A pulse width, and the speed with which to go there, us/s; 0 = as fast as it can."""
+    """A pulse width, and the speed towards it, us/s; 0 = as fast as the servo can."""
 
     pulse_us: int
     speed_us_s: int = 0
@@ -44,7 +44,7 @@ class Move(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """Channels that move together within `time_ms` (0 = at once), and outputs set high or low."""
+    """A group of channels that move together within `time_ms` (0 = at once), and outputs set high or low."""
 
     moves: Mapping[int, Move]
     time_ms: int = 0
@@ -53,7 +53,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Query:
-    """`kind` is Q, QP (with `channels`) or VER."""
+    """A query; `kind` is Q, QP (with `channels`) or VER."""
 
     kind: str
     channels: tuple[int, ...] = ()
@@ -61,13 +61,13 @@ class Query:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A line that is no command."""
+    """A line that is not a command."""
 
     line: bytes
 
 
 def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
-    """One command for all of `moves` (channel -> move), in its order; they start and stop together in `time_ms`.
+    """Return one command for all of `moves` (channel -> move), in its order; they start and stop together in `time_ms`.
 
     Written without spaces: at 9600 baud each costs a millisecond.
     """
@@ -84,19 +84,19 @@ def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
 
 
 def outputs_low(channels: Sequence[int]) -> bytes:
-    """No more pulses on `channels`."""
+    """Return a command that ends the pulses on `channels`."""
     return ("".join(f"#{channel}L" for channel in channels) + "\r").encode()
 
 
 def query_moving() -> bytes:
-    """Answered by `DONE` or `MOVING`."""
+    """Return a request answered by `DONE` or `MOVING`."""
     return b"Q\r"
 
 
 def maybe_command(buffer: bytearray) -> Group | Query | Unknown | None:
-    """Take the first whole command off the front of `buffer`, or None: more bytes are needed.
+    """Take the first whole command off the front of `buffer`, or return None: more bytes are needed.
 
-    An endless line is given back as Unknown in pieces of `MAX_LINE` bytes.
+    An endless line is returned as Unknown in pieces of `MAX_LINE` bytes.
     """
     end = buffer.find(_CR)
     escape = buffer.rfind(_ESC, 0, end if end >= 0 else len(buffer))

@@ -36,7 +36,7 @@ class Troubles(RuleBasedStateMachine):
     def tick(self, n, towards):
         for _ in range(n):
             self.goals += np.clip(towards - self.goals, -STEP_RAD, STEP_RAD)
-            trusted = {m.id for m in self.rig.bus.members if m.torque_wanted and m.torque_seen}
+            trusted = {m.id for m in self.rig.bus._members if m.torque_wanted and m.torque_seen}
             self.mark = len(self.rig.port.sent)
             readings = self.rig.tick(self.goals)
             self.look_at_goals(trusted)
@@ -109,7 +109,7 @@ class Troubles(RuleBasedStateMachine):
     @invariant()
     def polls_keep_their_budget(self):
         if hasattr(self, "rig") and self.rig.polls_s:
-            assert max(self.rig.polls_s) <= self.rig.bus.poll_budget_s + 0.002
+            assert max(self.rig.polls_s) <= self.rig.bus._poll.budget_s + 0.002
 
     def teardown(self):
         """What is limp is seen limp once the wire is well, and stop releases all."""
@@ -118,7 +118,7 @@ class Troubles(RuleBasedStateMachine):
         self.wire_mends()
         for _ in range(150):
             self.rig.tick(self.goals)
-        for member in self.rig.bus.members:
+        for member in self.rig.bus._members:
             if member.state in (State.LIMP, State.GIVEN_UP):
                 assert member.torque_seen is False and self.rig.torques()[member.index] == 0
         self.rig.bus.stop("release")

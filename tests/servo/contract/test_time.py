@@ -33,7 +33,7 @@ def test_any_number_of_silent_servos_costs_one_read_deadline_in_a_poll(family):
         rig.port.mute = dead
         worst_s, readings = most(rig, 120, held)
         assert worst_s <= healthy_s + READ_DEADLINE_S + 0.001 + SLACK_S
-        assert worst_s <= rig.bus.poll_budget_s + SLACK_S
+        assert worst_s <= rig.bus._poll.budget_s + SLACK_S
         assert rig.bus.statistics()["silent"] == sorted(dead)
         assert all(readings[f"joint{i}"].age_s < 0.1 for i in rig.ids if i not in dead)
 
@@ -52,7 +52,7 @@ def test_no_pattern_of_loss_makes_a_poll_longer_than_its_budget(family, data):
         rig.port.lose = lost.__contains__
         rig.port.deaf = data.draw(st.integers(0, 5), label="deaf") == 0
         rig.ticks(held, 2)
-    assert max(rig.polls_s) <= rig.bus.poll_budget_s + SLACK_S
+    assert max(rig.polls_s) <= rig.bus._poll.budget_s + SLACK_S
 
 
 @pytest.mark.parametrize("family", CHAINS)
@@ -105,7 +105,7 @@ def test_28_servos_that_return_cold_with_the_factory_return_delay_are_back_withi
         rig.set(servo.id, "return_delay", 250)
     rig.revive(*rig.ids)
     rig.ticks_for(3.0, held)
-    assert rig.torques() == [1] * 28 and all(member.gets_goals for member in rig.bus.members)
+    assert rig.torques() == [1] * 28 and all(member.gets_goals for member in rig.bus._members)
     assert {rig.register(i, "return_delay") for i in rig.ids} == {0}
 
 

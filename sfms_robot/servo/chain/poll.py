@@ -1,18 +1,33 @@
-"""One poll of a wire: who answered, who did not, and what the answers say. For every family of the chain.
+"""One poll of a wire: which servos answered, which did not, and what the answers say. For every family of the chain.
 
 On a chain each servo waits for the answer of the one before it, so where the answers to one request stop, exactly one
-servo is suspect, and those behind it are asked again in the same poll, without it. A single lost answer in the middle
-is forgiven once. A wire on which nobody answers blames nobody until it has happened a few times, and then everybody:
-the supply may be gone. Who is suspect is probed alone, with growing pauses, until it answers.
+servo is suspect, and those behind it are asked again in the same poll, without it. One lost answer in the middle is
+tolerated once. If no servo answers, none is suspect until it has happened a few times, and then all are: the supply may
+be gone. A suspect is probed alone, with growing pauses, until it answers.
+
+Servos 1 to 4, read together; "fast" is a fast sync read (one packet of all), "sync" a plain one. Requests of one poll:
+
+    case                              requests                     consequence
+    all answer                        fast 1 2 3 4                 -
+    3 is dead (wire with fast read)   fast 1 2 3 4, sync 4         3 is suspect
+    3 is dead (without)               sync 1 2 3 4, sync 4         3 is suspect
+    1 is dead, fast read works        fast 1 2 3 4, sync 2 3 4     1 has missed once; suspect the second time
+    1 is dead, without fast read      sync 1 2 3 4, sync 2 3 4     1 is suspect
+    2's answer is lost, 3, 4 answer   sync 1 2 3 4                 2 has missed once; suspect the second time
+    fast read answered by none        fast 1 2 3 4, sync 2 3 4 1   all answer the second: counted against the fast read;
+      (not yet known to work)                                      after five in a row only plain reads are used
+    wire dead, first poll             fast 1 2 3 4, sync ..., ...  none: it may be the wire; the next poll begins with
+                                                                   another servo and makes one request
+    wire dead, third poll             fast 3 4 1 2                 all are suspect, and probed alone
 
 **Time.** A poll has a budget, and its requests share one allowance of silence (`RegisterLink.within`): the first read
-is always made, everything else only when it would be over in time even if nobody answered. So any number of silent
-servos costs a poll one read deadline, once; whom a request had no time to wait for is not blamed.
+is always made, every other only if it would be over in time even without an answer (`affords`). So any number of silent
+servos costs a poll one read deadline, once; a servo for which a request had no time to wait is not suspect (`judged`).
 
     budget = the larger of  0.8 / rate - goals,  first read + read deadline + a turn of the adapter
 
-Where that never has room for something (a slow wire, an adapter that holds answers back), it gets one request a few
-times a second all the same (`RegisterLink.grants`), and the poll is so much longer.
+If that never has room for something (a slow wire, an adapter that holds answers back), it gets one request a few times
+a second nevertheless (`grants`), and the poll is that much longer.
 """
 
 from __future__ import annotations
@@ -34,45 +49,44 @@ log = logging.getLogger(__name__)
 
 USE: Final = 0.8  # of a tick; the rest is for probes, retries and a busy computer
 TURN_S: Final = 0.001  # of an adapter at every request: USB hands bytes over every millisecond
-QUIET_POLLS: Final = 3  # polls without any answer before servos are blamed rather than the wire
-_REQUESTS: Final = 3  # for the same thing in one poll at most
+QUIET_POLLS: Final = 3  # polls without any answer before servos are suspect rather than the wire
+_REQUESTS: Final = 3  # for the same data in one poll at most
 _SILENCES: Final = 2  # single reads in one poll that may stay unanswered
 _PROBES: Final = 4  # in one poll, as long as they are answered
 _FAST_FAILURES: Final = 5
-_HEALTH_POLLS: Final = 5  # between two looks at torque and error status, where several are read at once
-_HEALTH_SHARE: Final = 8  # servos in one look
+_HEALTH_POLLS: Final = 5  # between two reads of torque and error status, if several servos are read at once
+_HEALTH_SHARE: Final = 8  # servos in one such read
 _ALERTS_READ: Final = 2  # per poll
 _IN_TURN_SHARE: Final = 0.6  # of a tick that reading servos one by one may take
+_GROUP_TRIAL_S: Final = 0.05
 _TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answer
-
-GroupRead = Callable[[int, int, Sequence[int]], Mapping[int, Answer]]
 
 
 @dataclass
 class Outcome:
-    """What asking everybody brought. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
+    """Answers to a read of all servos. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
 
     answers: dict[int, Answer] = field(default_factory=dict)
     gaps: list[int] = field(default_factory=list)
     missed: list[int] = field(default_factory=list)
-    judged: bool = False  # somebody was waited for as long as it takes
+    judged: bool = False  # a request waited for the full silence
 
 
 class StatusPoll:
-    """Asks the members of one bus and tells them what they said.
+    """Reads the members of one bus and passes them the answers.
 
     Args:
         bus: its name, for messages.
         members: in bus order.
         telemetry: takes positions and the like.
         config: of the bus.
-        counts: of the bus: reads, errors and retries are counted up in place.
+        counts: of the bus: reads, errors and retries are incremented in place.
         framing: bytes of the packets on this wire.
 
     Attributes:
-        read_deadline_s: silence that makes a servo silent on this wire.
-        budget_s: time that a poll may take, waiting for answers included; what is granted beside it is not.
-        quiet_polls: polls in a row in which nobody answered.
+        read_deadline_s: time without a byte after which a servo counts as silent on this wire.
+        budget_s: time that a poll may take, waiting for answers included; what is granted besides is not.
+        quiet_polls: polls in a row in which no servo answered.
     """
 
     def __init__(
@@ -94,120 +108,133 @@ class StatusPoll:
         self._framing = framing
         self.read_deadline_s = config.read_deadline_ms / 1e3
         self._tells = {each.id for each in members if telemetry.currents[each.index] is not None}
-        self._error_bits = [ALERT if telemetry.error is not None else _status_bits(member) for member in members]
-        self._restart(None, None)
+        # Bits of an answer's error byte that are about the servo; the others are about the request.
+        status_bits = [sum(1 << bit for bit in member.startup.table.status_faults) for member in members]
+        self._error_bits = status_bits if telemetry.error is None else [ALERT] * len(members)
+        self.restart(grouped=False)
 
-    def _restart(self, group: GroupRead | None, fast: GroupRead | None) -> None:
-        self._group, self._fast = group, fast
-        self._fast_proven, self._fast_failures = fast is not None, 0
+    def restart(self, grouped: bool, fast: bool = False, proven: bool = True) -> None:
+        """Begin with another connection.
+
+        Args:
+            grouped: several servos can be read by one request; otherwise they are read one by one, in rotation.
+            fast: also in one packet of all, which is given up if it fails too often.
+            proven: the fast read is known to work here.
+        """
+        self._grouped, self._fast = grouped, fast
+        self._fast_proven, self._fast_failures = proven and fast, 0
         self.quiet_polls = 0
         self._rotation, self._looks, self._currents = Rotation(), Rotation(), Rotation()
         self._polls = 0
         self._turn = 0
-        self._flagged: set[int] = set()  # whose status says that something is wrong
-        self._missing = {member.id for member in self._members}  # who has to be told that it has answered
-        self._answered: list[int] = []  # in this poll, and may be asked for more
+        self._flagged: set[int] = set()  # ids whose status says that something is wrong
+        self._missing = set(self._ids)  # ids of members that have to be notified when they answer
+        self._answered: list[int] = []  # ids that answered in this poll, and may be asked for more
         self._plan()
 
-    def restart(self, group: GroupRead | None, fast: GroupRead | None = None, proven: bool = True) -> None:
-        """Another connection.
+    def find_reads(self, link: RegisterLink, present: list[int], group: bool) -> None:
+        """Find out how the servos that answered, `present`, can be read together, and begin with this connection.
 
-        Args:
-            group: reads several servos at once; None where they are read one by one, in rotation.
-            fast: the same in one packet of all, given up when it fails too often.
-            proven: the fast read is known to work here.
+        `group`: one request for several is worth a try. All servos with fast reads answer it.
         """
-        self._restart(group, fast)
-        self._fast_proven = proven and fast is not None
-
-    def reconnect(self, group: GroupRead | None, fast: GroupRead | None) -> None:
-        """The same wire, opened again: what was found out about it still holds."""
-        self._group = group if self._group is not None else None
-        self._fast = fast if self._fast is not None else None
+        if link.has_fast_read:
+            wanted, position = self._config.fast_read, self._telemetry.position
+            fast = wanted == "on"
+            if wanted == "auto":
+                fast = len(link.read_many(*position, present, fast=True)) == len(present)
+            self.restart(grouped=True, fast=fast, proven=wanted == "auto")
+            return
+        if group:
+            with link.patient(_GROUP_TRIAL_S):
+                group = len(link.read_many(*self._telemetry.block, present)) == len(present)
+            if not group:
+                log.info("bus %r: not every servo answers a request for several: they are read one by one", self._bus)
+        self.restart(group)
 
     def _plan(self) -> None:
-        """How many whole blocks fit into a tick, and the budget of a poll."""
+        """Compute how many whole blocks fit into a tick, and the budget of a poll."""
         telemetry, config, count = self._telemetry, self._config, len(self._ids)
         (_, position), (_, block) = telemetry.position, telemetry.block
-        byte_s, way = BITS / config.baud, "fast" if self._fast is not None else self._way
+        byte_s, way = BITS / config.baud, "fast" if self._fast else self._way
         spare_s = USE / config.rate_hz - self._framing.goals(count, telemetry.goal.size) * byte_s
 
         def read_s(servos: int, length: int) -> float:
             return self._framing.reads(servos, length, way) * byte_s + TURN_S
 
         self._blocks = count
-        if telemetry.error is not None:  # the others are always asked for the block
+        if telemetry.error is not None:  # the other families are always asked for the block
             self._blocks = blocks_per_tick(count, spare_s, read_s(count, position), partial(read_s, length=block))
         single_s = self._framing.reads(1, block, "one by one") * byte_s + _TURNAROUND_S
         self._many = max(1, int(_IN_TURN_SHARE / config.rate_hz / single_s))
-        first_s = read_s(1 if self._group is None else count, position if self._blocks < count else block)
+        first_s = read_s(count if self._grouped else 1, position if self._blocks < count else block)
         self.budget_s = max(spare_s, first_s + self.read_deadline_s + TURN_S)
 
     @property
     def _way(self) -> Way:
-        return "one by one" if self._group is None else "together"
+        return "together" if self._grouped else "one by one"
 
     def _bytes(self, servos: int, length: int) -> int:
-        """Return the bytes of reading `length` bytes of each, by one request where the wire has one."""
+        """Return the bytes of reading `length` bytes of each, by one request if the wire has one."""
         return self._framing.reads(servos, length, self._way)
 
     def measure(self, link: RegisterLink, now_s: float) -> None:
-        """Everything of everybody who is listed, once; nobody is blamed."""
+        """Read the full status block of each listed servo once, without updating miss counters."""
         where = self._telemetry.block
-        self._take(link, where, self.read_some(link, "blocks", where, self._listed()), now_s)
+        self._take(where, self.read_some(link, "blocks", where, self._listed()), now_s)
 
     def step(self, link: RegisterLink, now_s: float) -> bool:
-        """Ask; whether anybody answered. Raises BusError when the port fails."""
+        """Read all listed servos, and probe others; return whether any answered. Raises BusError if the port fails."""
         telemetry, listed = self._telemetry, self._listed()
-        whole = self._group is None or self._blocks >= len(self._ids)
+        whole = not self._grouped or self._blocks >= len(self._ids)
         where = telemetry.block if whole else telemetry.position
-        outcome = self._in_turn(link, listed) if self._group is None else self._everybody(link, where, listed)
+        outcome = self._read_all(link, where, listed) if self._grouped else self._read_in_turn(link, listed)
         answers = outcome.answers
         self._counts["errors"] += len(outcome.gaps) + len(outcome.missed)
         for servo in self._missing & answers.keys():
             self._by_id[servo].answered()
         self._missing -= answers.keys()
-        fresh = self._take(link, where, answers, now_s)
-        self._blame(outcome, now_s)
+        fresh = self._take(where, answers, now_s)
+        self._suspect(outcome, now_s)
         self._look(link, list(answers), now_s)
         self._look_at_alerts(link, fresh, now_s)
         self._answered = [] if whole else list(answers)
         return self._probe(link, now_s) or bool(answers)
 
     def blocks(self, link: RegisterLink, now_s: float) -> None:
-        """What is left of the poll, where it has no time for everything of everybody: everything of some."""
+        """Read the full block of some servos in what is left of the poll, if it has no time for all."""
         where = self._telemetry.block
         count = self.fitting(link, "blocks", where[1], self._blocks) if self._answered else 0
         if count:
             chosen = self._rotation.take(self._answered, count)
-            fresh = self._take(link, where, self.read_some(link, "blocks", where, chosen), now_s)
+            fresh = self._take(where, self.read_some(link, "blocks", where, chosen), now_s)
             self._look_at_alerts(link, fresh, now_s)
 
     # --- requests -----------------------------------------------------------------------------------------------
 
     def _listed(self) -> list[int]:
-        return [member.id for member in self._members if member.liveness.listed]
+        return [member.id for member in self._members if member.listed]
 
     def fitting(self, link: RegisterLink, purpose: str, length: int, most: int) -> int:
-        """How many servos, `most` at most, can be asked for `length` bytes in what is left of the poll; one where
-        the purpose has waited for too long."""
+        """Return how many servos can be asked for `length` bytes in what is left of the poll, `most` at most.
+
+        One if the purpose has waited for too long.
+        """
         if most <= 0:
             return 0
-        if self._group is None:
+        if not self._grouped:
             return int(link.grants(purpose, self._bytes(1, length), alone=True))
         while most > 1 and not link.affords(self._bytes(most, length)):
             most -= 1
         return most if link.grants(purpose, self._bytes(most, length)) else 0
 
     def read_some(self, link: RegisterLink, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
-        """Answers of a few, of as many as there is time for: by one request where the wire has one."""
-        if self._group is not None:
+        """Return answers of as many of `ids` as there is time for, by one request if the wire has one."""
+        if self._grouped:
             ids = ids[: self.fitting(link, purpose, where[1], len(ids))]
             if not ids:
                 return {}
             self._counts["reads"] += 1
-            fast = self._fast if len(ids) > 1 and where == self._telemetry.block else None
-            return (fast or self._group)(*where, ids)
+            return link.read_many(*where, ids, self._fast and len(ids) > 1 and where == self._telemetry.block)
         answers: dict[int, Answer] = {}
         for servo in ids:
             if not link.grants(purpose, self._bytes(1, where[1]), alone=True):
@@ -217,33 +244,33 @@ class StatusPoll:
                 answers[servo] = answer
         return answers
 
-    def _everybody(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
-        """All by one request, and those behind a silent one by a second."""
+    def _read_all(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
+        """Read all by one request, and those behind a silent one by a second: see the table of the module."""
         out = Outcome()
-        # Behind a dead servo in front everybody is silent: after a quiet poll somebody else is asked first.
+        # Behind a dead servo in front all are silent: after a quiet poll another servo is asked first.
         start = self.quiet_polls * (len(ids) // QUIET_POLLS or 1) % max(1, len(ids))
         rest = [*ids[start:], *ids[:start]]
         for attempt in range(_REQUESTS):
-            # A wire that was quiet in the last poll as well is asked once: most likely nobody is there.
+            # A wire that was quiet in the last poll too is asked once: most likely all are gone.
             if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
                 break
             if attempt > 0 and not link.affords(self._bytes(len(rest), where[1])):
                 break
             self._counts["retries"] += attempt > 0
             self._counts["reads"] += 1
-            fast = self._fast if attempt == 0 and len(rest) > 1 else None
-            got = self._request(fast or self._group, where, rest)
+            fast = self._fast and attempt == 0 and len(rest) > 1
+            got = link.read_many(*where, rest, fast)
             out.answers.update(got)
             out.judged |= link.judged
-            if fast is not None and not got:
+            if fast and not got:
                 if self._fast_proven:  # the first servo is the likely cause: one silence in a poll is enough
                     out.missed, rest = rest[:1], rest[1:]
-                else:
-                    rest = [*rest[1:], rest[0]]  # was it the first servo, or the fast read? Now the others come first
+                else:  # either the first servo or the fast read is the cause: now the others come first
+                    rest = [*rest[1:], rest[0]]
                 continue
-            if self._fast is not None and attempt == 1 and len(out.answers) == len(got):
+            if self._fast and attempt == 1 and len(out.answers) == len(got):
                 self._count_against_fast(len(got) == len(rest))
-            elif fast is not None:
+            elif fast:
                 self._fast_failures = 0
                 self._fast_proven |= len(got) == len(rest)
             last = max((i for i, servo in enumerate(rest) if servo in got), default=-1)
@@ -252,22 +279,19 @@ class StatusPoll:
                 out.gaps += rest[last + 1 : last + 2]
             rest = rest[last + 2 :]
         if not out.answers:
-            out.missed = []  # on a quiet wire nobody was passed over
+            out.missed = []  # on a quiet wire none was passed over
         return out
 
-    def _request(self, read: GroupRead | None, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
-        return read(*where, ids) if read is not None else {}
-
     def _count_against_fast(self, all_there: bool) -> None:
-        """Silence to a fast read that a plain one then breaks, everybody answering."""
+        """Count a silence to a fast read after which all answered a plain one."""
         self._fast_failures = self._fast_failures + 1 if all_there else 0
         if self._fast_failures >= _FAST_FAILURES:
-            self._fast = None
+            self._fast = False
             self._plan()
             log.warning("bus %r: fast sync read is not answered; plain sync read from now on", self._bus)
 
-    def _in_turn(self, link: RegisterLink, ids: Sequence[int]) -> Outcome:
-        """One by one, as many per poll as its share of a tick allows, going on where the last poll left off."""
+    def _read_in_turn(self, link: RegisterLink, ids: Sequence[int]) -> Outcome:
+        """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
         out, where = Outcome(), self._telemetry.block
         place = {servo: i for i, servo in enumerate(self._ids)}
         order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
@@ -283,51 +307,50 @@ class StatusPoll:
                 if len(out.gaps) >= _SILENCES:
                     break
         out.judged = bool(out.gaps)
-        if not out.answers:  # the servo, or the wire? Whoever does not answer in the next round either is suspect
+        if not out.answers:  # the servo or the wire: one that does not answer in the next round either is suspect
             out.missed, out.gaps = out.gaps, []
         return out
 
-    # --- who is there -------------------------------------------------------------------------------------------
+    # --- which servos are there ---------------------------------------------------------------------------------
 
-    def _blame(self, outcome: Outcome, now_s: float) -> None:
-        """End of asking everybody: who is suspect now."""
+    def _suspect(self, outcome: Outcome, now_s: float) -> None:
+        """Notify the members that missed an answer or are suspect after a read of all."""
         if outcome.answers:
             self.quiet_polls = 0
             found = outcome.gaps
         else:
             self.quiet_polls += outcome.judged
             found = self._listed() if self.quiet_polls >= QUIET_POLLS else []
+        self._missing |= {*outcome.missed, *found}
         for servo in outcome.missed:
-            self._missing.add(servo)
             self._by_id[servo].unanswered(now_s)
         for servo in found:
-            self._missing.add(servo)
             self._by_id[servo].suspect(now_s)
 
     def _probe(self, link: RegisterLink, now_s: float) -> bool:
         """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
-        absent = [member for member in self._members if not member.liveness.listed]
-        waiting = [member for member in absent if member.liveness.probe_s <= now_s]
+        where = self._telemetry.position if self._grouped else self._telemetry.block
+        absent = [member for member in self._members if not member.listed]
+        waiting = [member for member in absent if member.probe_s <= now_s]
         request = self._bytes(1, self._telemetry.block[1])
         for _ in range(_PROBES):
             if not waiting or not link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
                 return answered
-            member = min(waiting, key=lambda each: each.liveness.probe_s)
-            waiting.remove(member)
+            member = min(waiting, key=lambda each: each.probe_s)
             self._counts["retries"] += 1
-            where = self._telemetry.position if self._group is not None else self._telemetry.block
             self._counts["reads"] += 1
-            answer = self._group(*where, [member.id]) if self._group is not None else None
-            if self._group is None and (single := link.read(member.id, *where)) is not None:
-                answer = {member.id: single}
-            if not answer:
+            if self._grouped:
+                answer = link.read_many(*where, [member.id]).get(member.id)
+            else:
+                answer = link.read(member.id, *where)
+            if answer is None:
                 member.probe_failed(now_s)
                 return answered
             answered = True
             member.answered()
             self._missing.discard(member.id)
-            self._take(link, where, answer, now_s)
+            self._take(where, {member.id: answer}, now_s)
             absent.remove(member)
             for other in absent:
                 other.hurry(now_s)
@@ -336,22 +359,22 @@ class StatusPoll:
             member.back(now_s)
         return answered
 
-    # --- what they say ------------------------------------------------------------------------------------------
+    # --- what they report ---------------------------------------------------------------------------------------
 
-    def _take(self, link: RegisterLink, where: Block, answers: Mapping[int, Answer], now_s: float) -> list[int]:
-        """Values and status of those who told; ids whose alert has just come on."""
+    def _take(self, where: Block, answers: Mapping[int, Answer], now_s: float) -> list[int]:
+        """Pass on values and status of answers; return ids whose alert bit was newly set."""
         telemetry, length, alert = self._telemetry, where[1], self._telemetry.error is not None
         members, flagged = self._by_id, self._flagged
         good: list[int] = []
         data: list[bytes] = []
         fresh: list[int] = []
-        for servo, (error, told) in answers.items():
+        for servo, (error, content) in answers.items():
             member = members[servo]
-            if len(told) != length or (alert and error & ~ALERT):
-                self._counts["errors"] += 1  # it refuses to say
+            if len(content) != length or (alert and error & ~ALERT):
+                self._counts["errors"] += 1  # it refuses
             else:
                 good.append(member.index)
-                data.append(told)
+                data.append(content)
             if error or servo in flagged:
                 fresh += self._take_status(member, error & self._error_bits[member.index], alert, now_s)
         if good:
@@ -361,7 +384,7 @@ class StatusPoll:
         return fresh
 
     def _take_status(self, member: Member, status: int, alert: bool, now_s: float) -> list[int]:
-        """What the error byte of an answer says of the servo; its id when it has to be asked what is wrong."""
+        """Pass on the error byte of an answer; return the servo's id if it has to be asked for its fault."""
         known = member.id in self._flagged
         if not status and not known:
             return []
@@ -372,22 +395,22 @@ class StatusPoll:
         return []
 
     def judge_loads(self, indices: Sequence[int], now_s: float) -> None:
-        """Present currents of servos that have just told them, against their load rules."""
-        currents = self._telemetry.current_mA.tolist()
+        """Compare the present currents of servos that have just reported them with their load rules."""
+        currents = self._telemetry.currents_mA()
         for index in indices:
             member = self._members[index]
             if abs(currents[index]) > member.lowest_mA or member.over_load:
                 member.take_current(currents[index], now_s)
 
     def _look(self, link: RegisterLink, ids: Sequence[int], now_s: float) -> None:
-        """Of a few, what is not in the block: torque, error status, a current that lies elsewhere."""
+        """Read of a few servos what is not in the block: torque, error status, a current with another address."""
         if not ids:
             return
         self._polls += 1
         tells = [servo for servo in ids if servo in self._tells] if self._tells else []
-        if tells and (self._group is not None or self._polls % 2):
+        if tells and (self._grouped or self._polls % 2):
             self._look_at_current(link, self._currents.take(tells, 1)[0], now_s)
-        due = self._polls % _HEALTH_POLLS == 0 if self._group is not None else not (tells and self._polls % 2)
+        due = self._polls % _HEALTH_POLLS == 0 if self._grouped else not (tells and self._polls % 2)
         count = self.fitting(link, "health", self._telemetry.health[1], _HEALTH_SHARE) if due else 0
         if count:
             chosen = self._looks.take(ids, count)
@@ -404,11 +427,11 @@ class StatusPoll:
             self.judge_loads([index], now_s)
 
     def _look_at_alerts(self, link: RegisterLink, fresh: Sequence[int], now_s: float) -> None:
-        """Ask those whose alert bit has just come on what is wrong; who is not told of now is asked next time."""
+        """Ask servos whose alert bit was newly set for their faults; those left out are asked in the next poll."""
         asked = fresh[:_ALERTS_READ]
-        told = self.read_some(link, "alerts", self._telemetry.health, asked) if asked else {}
-        self._flagged -= set(fresh) - told.keys()
-        self._take_health(told, now_s)
+        answers = self.read_some(link, "alerts", self._telemetry.health, asked) if asked else {}
+        self._flagged -= set(fresh) - answers.keys()
+        self._take_health(answers, now_s)
 
     def _take_health(self, answers: Mapping[int, Answer], now_s: float) -> None:
         telemetry = self._telemetry
@@ -421,13 +444,8 @@ class StatusPoll:
                 member.take_torque(torque, now_s)
 
 
-def _status_bits(member: Member) -> int:
-    """Bits of a status packet's error byte that are about the servo; the others are about the request."""
-    return sum(1 << bit for bit in member.table.status_faults)
-
-
 def blocks_per_tick(servos: int, spare_s: float, positions_s: float, blocks_s: Callable[[int], float]) -> int:
-    """Return how many servos' blocks fit in `spare_s` beside all positions; all where one read does for both.
+    """Return how many servos' blocks fit in `spare_s` besides all positions; all if one read does for both.
 
     Args:
         positions_s: time of reading all positions.
@@ -439,13 +457,13 @@ def blocks_per_tick(servos: int, spare_s: float, positions_s: float, blocks_s: C
 
 
 class Rotation:
-    """Turns of servos, `count` at a time."""
+    """A rotation that gives turns to servos, `count` at a time."""
 
     def __init__(self) -> None:
         self._next = 0
 
     def take(self, servos: Sequence[int], count: int) -> list[int]:
-        """Return the next `count` of `servos`, in their own order; one that is missing from the list loses no turn."""
+        """Return the next `count` of `servos`, in their order; one that is missing from the list loses no turn."""
         if count >= len(servos):
             return list(servos)
         start = self._next % len(servos)

@@ -1,0 +1,288 @@
+"""Boards of hobby servos: the bytes to and from each kind, and a port on which their answers, without frame, are read.
+
+Pololu Maestro (User's Guide, pololu.com/docs/0J40, sections 4.a, 4.e, 5.d and 5.e):
+
+1. Get Errors (A1) clears the errors, and shows that the board is there. One in the serial mode "UART, detect baud rate"
+   ignores all bytes before the baud indication byte AA, which is sent only if the board does not answer: a board that
+   runs may take AA alone for a protocol error.
+2. Any error sends the channels to their home; the factory setting of that is no pulses at all. So all goals are sent
+   again after an error.
+3. A board may have "Enable CRC" on, which nothing on the wire reports, so the head's file says it (`crc`). A board that
+   expects a CRC and gets none waits for it and never answers; one that gets a CRC it does not expect has answered
+   before the CRC is there. `connect` checks for both.
+4. All but the Micro Maestro (6 channels) take the targets of neighbouring channels in one Set Multiple Targets (9F).
+
+Lynxmotion SSC-32: its wire is slow (9600 baud unless its jumpers say otherwise), so goals arrive a few times a second.
+Each group move is therefore given the time since the one before it: the board draws a straight line between goals
+instead of steps.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, Final, NamedTuple
+
+import numpy as np
+
+from sfms_robot.config.wire_time import BITS
+from sfms_robot.errors import ConfigError
+from sfms_robot.ports import TickConversion
+from sfms_robot.servo.codecs import maestro, ssc32
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
+
+_CHUNK: Final = 4096
+_CURE: Final = "for this bus in the head's file, or change 'Enable CRC' in Pololu's Maestro Control Center"
+_CRC_TRIES: Final = 2  # the first may be spent on what the board still waits for
+_MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
+_PULSE_FRAME_S: Final = 0.02  # an SSC-32 sends a pulse this often: lines within need not be drawn
+_LONGEST_LINE_S: Final = 0.5
+
+Exchange = Callable[[bytes, int], bytes | None]
+"""Sends a request; returns the answer, if exactly that many bytes came."""
+
+
+class RateLimitedPort:
+    """An open port that knows when its bytes have left, for requests whose answers have no frame.
+
+    At 9600 baud a command is under way for a fifth of a second after `write` returned; sending more before that only
+    fills a buffer.
+
+    Args:
+        port: owned by this from now on.
+        patience_s: how long an answer may take beyond the time of its bytes.
+
+    Attributes:
+        busy_until_s: when the last byte sent will have left.
+        awaiting: a request is open.
+    """
+
+    def __init__(self, port: Port, baud: int, patience_s: float) -> None:
+        self.port = port
+        self.busy_until_s = port.now_s()
+        self.awaiting = False
+        self._byte_s = BITS / baud
+        self._patience_s = patience_s
+        self._answer = bytearray()
+        self._length = 0
+        self._until_s = 0.0
+
+    @property
+    def free(self) -> bool:
+        """Return whether all bytes sent have left."""
+        return self.port.now_s() >= self.busy_until_s
+
+    def send(self, data: bytes) -> float:
+        """Send bytes; return when the first of them leaves. Raises BusError if the port is gone, as all methods do."""
+        start_s = max(self.port.now_s(), self.busy_until_s)
+        self.port.write(data)
+        self.busy_until_s = start_s + len(data) * self._byte_s
+        return start_s
+
+    def wait(self, until_s: float) -> None:
+        """Block until then; drop what comes in meanwhile."""
+        while self.port.now_s() < until_s and self.port.read(_CHUNK, until_s):
+            pass
+
+    def request(self, request: bytes, length: int) -> None:
+        """Send a request for `length` bytes without waiting; `answer` returns them."""
+        self.port.discard_input()
+        self.send(request)
+        self.awaiting = True
+        self._answer.clear()
+        self._length = length
+        self._until_s = self.busy_until_s + length * self._byte_s + self._patience_s
+
+    def answer(self, block: bool = False) -> bytes | None:
+        """Return the answer; b"" if it did not come, or has another length; None while it may still come."""
+        deadline_s = self._until_s if block else self.port.now_s()
+        while len(self._answer) < self._length and (data := self.port.read(_CHUNK, deadline_s)):
+            self._answer += data
+        if len(self._answer) < self._length and not block and self.port.now_s() < self._until_s:
+            return None
+        self.awaiting = False
+        return bytes(self._answer) if len(self._answer) == self._length else b""
+
+    def exchange(self, request: bytes, length: int) -> bytes | None:
+        """Send a request and return the answer; None if there is none. Blocks until it is overdue at most."""
+        self.request(request, length)
+        return self.answer(block=True) or None
+
+
+class BoardStatus(NamedTuple):
+    """The status of a board: faults since the last request, in words."""
+
+    faults: str = ""
+    lasting: bool = False  # the fault is in the board, not only in the bytes it received
+    went_home: bool = False  # it has switched its channels off, or to wherever its home is
+
+
+class Board(ABC):
+    """The bytes to and from one kind of board.
+
+    Args:
+        table: of its model.
+        crc: its setting "Enable CRC" is on, the head's file says.
+
+    Attributes:
+        status_length: bytes of the answer to `status_request`.
+        factory_us: (shortest, longest) pulse that its factory settings allow, if they are narrower than the board.
+        reports_pulses: whether `read_pulses` works.
+    """
+
+    status_length: ClassVar[int]
+    factory_us: ClassVar[tuple[float, float] | None] = None
+    reports_pulses: ClassVar[bool] = False
+
+    def __init__(self, table: Table, crc: bool) -> None:
+        self._table = table
+        self._crc = crc
+
+    @abstractmethod
+    def status_request(self, restarted: bool) -> bytes:
+        """Return a request for the status; `restarted`: the board may have been off since it last answered."""
+
+    @abstractmethod
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
+        """Return the status in an answer; None for bytes that are not an answer."""
+
+    @abstractmethod
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
+
+    @abstractmethod
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        """Return what ends the pulses, whatever the bytes before were; `restarted` as in `status_request`."""
+
+    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        """Return how the board's settings differ from the head's file, and the cure; None if they do not.
+
+        `present`: it has answered `status_request`.
+        """
+        return None
+
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+        """Return ticks of the pulses it sends now, 0 for none; None if a channel is not answered."""
+        return None
+
+
+class Maestro(Board):
+    """A Pololu Maestro with the compact protocol."""
+
+    status_length = 2
+    factory_us = maestro.FACTORY_PULSE_US
+    reports_pulses = True
+
+    def _sealed(self, command: bytes) -> bytes:
+        return maestro.sealed(command) if self._crc else command
+
+    def status_request(self, restarted: bool) -> bytes:
+        return bytes([maestro.BAUD_INDICATION] * restarted) + self._sealed(maestro.get_errors())
+
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
+        bits = int.from_bytes(answer, "little")
+        if len(answer) != self.status_length or bits >> (max(self._table.faults, default=15) + 1):
+            return None
+        return BoardStatus(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
+
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        grouped = (self._table.channels or 0) > _MICRO
+        runs: list[list[int]] = []  # of neighbouring channels, which one command can move
+        for channel in sorted(ticks):
+            if grouped and runs and channel == runs[-1][-1] + 1:
+                runs[-1].append(channel)
+            else:
+                runs.append([channel])
+        commands = (
+            maestro.set_targets(run[0], [ticks[channel] for channel in run])
+            if len(run) > 1
+            else maestro.set_target(run[0], ticks[run[0]])
+            for run in runs
+        )
+        return b"".join(map(self._sealed, commands))
+
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        off = b"".join(self._sealed(maestro.set_target(channel, maestro.OFF)) for channel in channels)
+        return bytes([maestro.BAUD_INDICATION] * restarted) + off
+
+    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        def answers(request: bytes) -> bool:
+            return self.decode_status(exchange(request, self.status_length) or b"") is not None
+
+        question = maestro.get_errors()
+        if not self._crc:
+            differs = not present and any(answers(maestro.sealed(question)) for _ in range(_CRC_TRIES))
+            return f"expects a CRC: set crc: true {_CURE}" if differs else None
+        if answers(question):
+            return f"expects no CRC: set crc: false {_CURE}"
+        answers(bytes([maestro.crc7(question)]))  # the board has been waiting for it
+        return None
+
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+        pulses = {}
+        for channel in channels:
+            answer = exchange(self._sealed(maestro.get_position(channel)), 2)
+            if answer is None:
+                return None
+            pulses[channel] = int.from_bytes(answer, "little")
+        return pulses
+
+
+class Ssc32(Board):
+    """A Lynxmotion SSC-32. It has no error word: it answers, or it does not.
+
+    It reports pulses in steps of 10 us, and for a channel that it never moved the value is not documented, so
+    `read_pulses` returns None.
+    """
+
+    status_length = 1
+
+    def status_request(self, restarted: bool) -> bytes:
+        """Return a query; after a restart, a carriage return in front ends what line noise had begun."""
+        return b"\r" * restarted + ssc32.query_moving()
+
+    def decode_status(self, answer: bytes) -> BoardStatus | None:
+        return BoardStatus() if answer in (ssc32.DONE, ssc32.MOVING) else None
+
+    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        line_s = min(interval_s, _LONGEST_LINE_S) if interval_s > _PULSE_FRAME_S else 0.0
+        return ssc32.group_move({channel: ssc32.Move(us) for channel, us in ticks.items()}, round(line_s * 1e3))
+
+    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        """Return the command, always behind a carriage return: another thread may have been in the middle of a line."""
+        return b"\r" + ssc32.outputs_low(channels)
+
+
+def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
+    """Return the board of these servos. Raises ConfigError if they are not all on one."""
+    tables = [Table.of(servo.map) for servo in servos]
+    table = tables[0]
+    others = sorted({each.model for each in tables} - {table.model})
+    if others:
+        raise ConfigError(f"bus {bus!r}: one board is one model, the head says {table.model} and {', '.join(others)}")
+    if table.channels is None or table.pulse_us is None or table.tick_us is None:
+        raise ConfigError(f"bus {bus!r}: expected a servo board, got {table.model}")
+    for servo in servos:
+        if servo.id >= table.channels:
+            raise ConfigError(
+                f"bus {bus!r}: joints.{servo.joint}.id: expected a channel of a {table.model} "
+                f"(0..{table.channels - 1}), got {servo.id}"
+            )
+    return table
+
+
+def pulses_beyond(
+    servos: Sequence[BusServo], conversion: TickConversion, table: Table, range_us: tuple[float, float] | None
+) -> str:
+    """Return the joints, each with the pulses of its range, that do not fit between (shortest, longest)."""
+    if range_us is None:
+        return ""
+    ends = [conversion.to_ticks(np.array([getattr(servo, end) for servo in servos])) for end in ("min_rad", "max_rad")]
+    pulses = np.sort(np.stack(ends), axis=0) * (table.tick_us or 1.0)
+    return ", ".join(
+        f"{servo.joint} ({low:g}..{high:g} us, not in {range_us[0]:g}..{range_us[1]:g})"
+        for servo, low, high in zip(servos, *pulses, strict=True)
+        if low < range_us[0] or high > range_us[1]
+    )

@@ -1,0 +1,490 @@
+"""A bus of servos with registers, for every family.
+
+Four promises:
+
+1. Torque comes on without a jump: goal := present, read back, then torque. A servo that stands outside the limits of
+   its joint is held where it stands; it may come in, and never go further out. One that stands outside its own stored
+   limits is moved inside by its own profile, slowly.
+2. One servo never costs the frame. The state of each is its own `Member`; `StatusPoll` reads them within a time budget.
+   Each joint has its own last position, age and fault.
+3. What was away (a servo, the wire, the supply) is found again, checked and switched on as at startup, beside the work
+   of the others; until then it gets no goals.
+4. Torque off is written before any request, to all servos at once, and then again until it is confirmed.
+
+Follow a lost answer through three files: `poll` notices it, `member` decides what it means, and this file acts on it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from threading import RLock
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.config import Bus as BusConfig
+from sfms_robot.config import Faults
+from sfms_robot.errors import BusError, PacketError
+from sfms_robot.frames import Doubles, Reading
+from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
+from sfms_robot.servo.bus import WireBus
+from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
+from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member
+from sfms_robot.servo.chain.poll import TURN_S, StatusPoll
+from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
+from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
+from sfms_robot.servo.chain.telemetry import Telemetry
+from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Field, Table
+
+log = logging.getLogger(__name__)
+
+READ_DEADLINE_S: Final = 0.003  # the time that a silent servo takes, once
+_CONFIRM_S: Final = 0.35  # that `stop` waits for servos to confirm, at most
+_ROUNDS: Final = 20  # of asking them; each takes a mute servo's patience
+_STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
+_EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
+_SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
+_WATCHDOG_TICK_S: Final = 0.02
+_STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
+_NO_PLACES: Final = np.zeros(0, np.intp)
+
+
+class ChainBus(WireBus[RegisterLink]):
+    """A wire of servos of one family.
+
+    Args:
+        name, servos, conversion, open_port, baud: see `WireBus`.
+        read_deadline_s: time without a byte after which a servo counts as silent. The default suits a wire; a simulated
+            one on a busy computer needs more.
+        config: rate, watchdog and the like; by default those of a head that does not set them.
+        faults: which faults are acted upon.
+
+    Attributes:
+        maps: family and protocol of its firmware maps.
+        link, startup: classes of requests and of startup.
+
+    Raises ConfigError for servos that cannot share a bus.
+    """
+
+    maps: ClassVar[tuple[str, int]]
+    link: ClassVar[type[RegisterLink]]
+    startup: ClassVar[type[Startup]]
+
+    def __init__(
+        self,
+        name: str,
+        servos: Sequence[BusServo],
+        conversion: TickConversion,
+        open_port: Callable[[], Port],
+        baud: int,
+        read_deadline_s: float = READ_DEADLINE_S,
+        config: BusConfig | None = None,
+        faults: Faults | None = None,
+    ) -> None:
+        config = config or BusConfig(family="dynamixel2", baud=baud)
+        self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
+        super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
+        tables = [Table.of(servo.map) for servo in servos]
+        self._ids = np.array([servo.id for servo in servos])
+        self._telemetry = Telemetry(name, *self.maps, tables, conversion)
+        self._faults: dict[str, None] = {}  # reported so far, for the statistics
+        self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
+        self._startups = [
+            self.startup(servo, table, needs, self._warnings, self._coming_back)
+            for servo, table, needs in zip(servos, tables, needs_of(servos, conversion), strict=True)
+        ]
+        self._members = [Member(i, each, faults or Faults(), self._faults) for i, each in enumerate(self._startups)]
+        self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
+        self._settings = Settings(self._members, self._telemetry.torque)
+        self._enabled = False
+        self._places: NDArray[np.intp] = _NO_PLACES  # members that get goals
+        self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
+        self._arrived: list[Member] = []  # members that came to hold a position in this poll
+        self._stamp_s = 0.0
+        self._peak_mA = 0.0
+        self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]
+        self._release_packet = b""
+        self._released = False  # by `torque_off`: no goal is sent until the next `enable`
+        self._asked: deque[tuple[int, bool]] = deque()  # released, or resumed (True); not yet passed to members
+        self._sending = RLock()
+        goal = self._telemetry.goal
+        # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
+        simple = self.maps[1] == 2 and goal.sign in ("no", "twos_complement")
+        self._goal_type = np.dtype(f"<{'i' if goal.signed else 'u'}{goal.size}") if simple else None
+        self._streamed: tuple[NDArray[np.intp], tuple[int, ...]] = (self._places, ())  # places, and their ids
+        self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
+        self._wrote_s = math.inf
+        self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed
+
+    @property
+    def capabilities(self) -> Mapping[str, frozenset[str]]:
+        return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
+
+    def _open(self) -> RegisterLink:
+        return self.link(self._open_port(), self._baud, self._read_deadline_s)
+
+    # --- start --------------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the port, identify and prepare every servo that answers; torque stays on or off.
+
+        Blocks a few exchanges per servo, and for one that does not answer a few times 50 ms. Raises PortError;
+        BusError if no servo answers; ServoError for a servo that contradicts the head's file.
+        """
+        link = self._open()
+        try:
+            self._warnings.clear()
+            for startup in self._startups:
+                startup.attach(link)
+            bits = start_up(self.name, link, self._startups, self._baud)
+            present = [self._servos[index].id for index in bits]
+            self._read_deadline_s = link.adapt(present[0], *self._telemetry.position)
+            self._poll.read_deadline_s = self._read_deadline_s
+            self._telemetry.forget()
+            self._release_packet = self._packet_off(self._released_ids)
+            self._now_s = link.port.now_s
+            for member in self._members:
+                member.connected(member.index in bits)
+            self._poll.find_reads(link, present, self._startups[0].table.byte_order == "little")
+            self._wrote_s = math.inf
+            self._stamp_s = link.port.now_s()
+            self._poll.measure(link, self._stamp_s)
+            for index, status in bits.items():
+                self._members[index].take_bits(status, self._telemetry.measured(index), self._stamp_s)
+        except BaseException:
+            link.port.close()
+            raise
+        self._forget_silence()
+        self._settings.clear()
+        self._powered, self._released = frozenset(), False
+        self._enabled, self._link = False, link
+
+    def _coming_back(self) -> list[Startup]:
+        return [member.startup for member in self._members if member.comes_back]
+
+    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+        """Switch torque on for `joints` without a jump, one after the other; return the angles held, rad.
+
+        For a joint whose servo has not answered since `connect`: 0 rad, or the end of its range nearest to that, so
+        that easing goals can begin with a number. It gets no goals; when it appears it is started up, held where it
+        stands, and its reading has `rejoined`.
+
+        Blocks a few exchanges per servo, and `stagger_ms`; for one that stands outside its own stored limits also the
+        seconds until its own profile has moved it inside. Raises ServoError if a servo refuses or falls silent
+        meanwhile, BusError if `torque_off` comes meanwhile; others may then have torque, so call `stop`.
+        """
+        link = self._connected()
+        self._released = False
+        self._asked.clear()
+        held = []
+        for joint in joints:
+            index = self.joints.index(joint)
+            member, startup = self._members[index], self._startups[index]
+            if not member.listed:
+                member.awaited()
+                held.append(member.servo.nearest_to_zero_rad)
+                log.warning("%s does not answer; it comes in when it does", member.servo)
+                continue
+            self._forget(member)
+            self._powered |= {member.id}
+            with link.patient(PATIENCE_S, TRIES):
+                steps = startup.torque_on() if member.identified else startup.bring_back(reboot=False)
+                self._telemetry.ticks[index] = finish(steps, partial(self._wait_enabling, link, joint))
+            self._wait_enabling(link, joint, 0.0)
+            member.enabled()
+            held.append(self._hold(index))
+            link.rest(self._config.stagger_ms / 1e3)
+        self._enabled = True
+        self._update_places()
+        return np.array(held)
+
+    def _forget(self, member: Member) -> None:
+        """Forget what was changed on a servo that is, or was, prepared again: its watchdog is off, too."""
+        self._settings.forget(member.id)
+        self._fed = None
+
+    def _wait_enabling(self, link: RegisterLink, joint: str, duration_s: float) -> None:
+        """Wait; raise BusError, with torque off, if `torque_off` has come."""
+        link.wait(duration_s)
+        if self._released:
+            self.torque_off("release")
+            raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
+
+    def _hold(self, index: int) -> float:
+        """Return the angle of a servo that holds where it stands; its range now reaches there."""
+        angle = float(self._conversion.to_rad(self._telemetry.ticks)[index])
+        self._goals.hold(index, angle)
+        return angle
+
+    # --- torque off, and on again -------------------------------------------------------------------------------
+
+    def torque_off(self, policy: StopPolicy) -> None:
+        """Write torque off to the servos whose joints are to be released, in one packet; as `ports.Bus`.
+
+        On a wire that goes both ways it may collide with bytes on their way to us; `stop` repeats it.
+        """
+        if policy == "hold":
+            return
+        self._released = True
+        self._send_at_once(self._release_packet)
+
+    def release(self, joints: Sequence[str]) -> None:
+        """Write torque off to the servos of `joints`, as `ports.Bus`; from any thread."""
+        indices = frozenset(self.joints.index(joint) for joint in joints)
+        if indices:
+            self._asked.extend([(index, False) for index in indices])
+            self._send_at_once(self._packet_off(self._servos[index].id for index in indices))
+
+    def resume(self, joints: Sequence[str]) -> None:
+        """Bring joints back, as `ports.Bus`."""
+        if self._released:  # by `torque_off`, which perhaps no poll has noticed yet
+            self._asked.extend([(index, False) for index in range(len(self.joints))])
+            self._released = False
+        self._asked.extend([(self.joints.index(joint), True) for joint in joints])
+
+    def _packet_off(self, ids: Iterable[int]) -> bytes:
+        """Return torque off for servos in one packet; empty for none."""
+        torque = self._telemetry.torque
+        values = dict.fromkeys(ids, torque.to_bytes(0))
+        return self.link.sync_write_packet(torque.address, values) if values else b""
+
+    def _send_at_once(self, packet: bytes) -> None:
+        alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
+        try:
+            link = self._link
+            if link is not None and packet:
+                link.port.write(packet)
+        except BusError as error:
+            log.warning("bus %r: %s", self.name, error)
+        finally:
+            if alone:
+                self._sending.release()
+
+    def _pass_on(self) -> None:
+        """Pass requests of `release` and `resume` to the members, in the thread that they belong to."""
+        while self._asked:
+            index, back = self._asked.popleft()
+            member = self._members[index]
+            if back:
+                member.called_back(self._now_s())
+            else:
+                member.released()
+        self._update_places()
+
+    def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
+        """Write torque off in one packet, then watchdogs off in another; read both back and repeat them in time.
+
+        Waits for no servo before the torque is off.
+        """
+        self._enabled = False
+        self._released |= policy == "release"
+        armed = self._settings.changed(BUS_WATCHDOG)
+        self._stop_members()
+        self._update_places()
+        link = self._link
+        if link is None and self._lost_s is not None:
+            link = self._open_again()  # perhaps it has just come back
+        if link is None:
+            return
+        limp = self._released_ids if policy == "release" else []
+        torque, watchdog = self._telemetry.torque, self._startups[0].table.role(BUS_WATCHDOG)
+        self._write_off(link, torque, limp)
+        if watchdog is not None:
+            self._write_off(link, watchdog, armed)
+        budget_s = min(_CONFIRM_S, within_s)
+        with link.patient(_STOP_PATIENCE_S), link.within(budget_s, budget_s):
+            self._powered -= self._confirm_off(link, torque, limp)
+            if watchdog is not None:
+                self._confirm_off(link, watchdog, [servo for servo in armed if servo not in limp])
+
+    def _stop_members(self) -> None:
+        self._settings.clear()
+        for member in self._members:
+            member.stopped()
+
+    def _write_off(self, link: RegisterLink, field: Field, ids: Iterable[int]) -> None:
+        values = dict.fromkeys(ids, field.to_bytes(0))
+        if values:
+            self._attempt(lambda: link.sync_write(field.address, values))
+
+    def _confirm_off(self, link: RegisterLink, field: Field, ids: Sequence[int]) -> frozenset[int]:
+        """Read a register of all back, and write 0 again to those that do not report 0; return those that do.
+
+        The servo that is asked first in one round is asked last in the next: behind a dead servo the others are silent.
+        """
+        rest, where, off = list(ids), (field.address, field.size), field.to_bytes(0)
+        for _ in range(len(ids) + _ROUNDS):
+            if not rest or not link.affords(link.framing.reads(1, field.size)):
+                break
+            got = self._attempt(partial(self._poll.read_some, link, "stop", where, rest))
+            if got is None:
+                break  # the port is gone
+            rest = [servo for servo in rest if servo not in got or got[servo].data != off]
+            rest = rest[1:] + rest[:1]
+            self._write_off(link, field, rest)
+        for servo in self._servos:
+            if servo.id in rest:
+                log.warning("%s does not confirm that its %s is off", servo, field.name)
+        return frozenset(ids).difference(rest)
+
+    def close(self) -> None:
+        """Close the port; watchdogs that are still on are switched off, so that a held pose stays held."""
+        link, watchdog = self._link, self._startups[0].table.role(BUS_WATCHDOG)
+        if link is not None and watchdog is not None:
+            self._write_off(link, watchdog, self._settings.changed(BUS_WATCHDOG))
+        self._enabled = False
+        self._stop_members()
+        super().close()
+
+    # --- every tick ---------------------------------------------------------------------------------------------
+
+    def write(self, goals_rad: Doubles, now_s: float) -> None:
+        """Send goals of all joints in one packet; those of joints that are not enabled, or away, are left out.
+
+        Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
+        While the port is gone nothing is sent and nothing is raised.
+        """
+        self._check(self._enabled)
+        if self._asked:
+            self._pass_on()
+        if self._accepted(goals_rad):
+            self._update_places()
+        link = self._link
+        places = self._places if link is not None else _NO_PLACES
+        ticks = self._goals.ticks(goals_rad, places)
+        if link is None or not len(places):
+            return
+        with self._sending:
+            if self._released or self._asked:
+                return
+            self._counts["writes"] += 1
+            try:
+                self._send(link, places, ticks[places])
+            except BusError as error:
+                self._lose(error, now_s)
+            except PacketError as error:  # this one cannot be built: the next may
+                self._count_error(error)
+
+    def _send(self, link: RegisterLink, places: NDArray[np.intp], ticks: NDArray[np.int64]) -> None:
+        """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
+        goal, now_s = self._telemetry.goal, link.port.now_s()
+        if places is not self._streamed[0]:
+            self._streamed = places, tuple(self._ids[places].tolist())
+        if now_s - self._wrote_s > _STALL * self._watchdog * _WATCHDOG_TICK_S:
+            self._settings.look_for_trips()
+        self._wrote_s = now_s
+        if self._goal_type is not None:
+            data = ticks.astype(self._goal_type).tobytes()
+        else:
+            data = b"".join(map(goal.to_bytes, ticks.tolist()))
+        link.sync_write_block(goal.address, self._streamed[1], goal.size, data)
+        if self._watchdog and places is not self._fed:
+            self._fed = places
+            self._settings.arm(self._streamed[1], self._watchdog)
+
+    def _accepted(self, goals_rad: Doubles) -> bool:
+        """Return whether a rejoining member gets goals from now on."""
+        if not self._rejoining:
+            return False
+        ticks = self._goals.ticks(goals_rad, _NO_PLACES)
+        near = [
+            self._goals.allows(member.index, goals_rad[member.index]) and member.accepts(int(ticks[member.index]))
+            for member in self._rejoining
+        ]
+        return any(near)
+
+    def _update_places(self) -> None:
+        """Find the members that get goals; the array stays the same object while it has the same content."""
+        self._rejoining = [member for member in self._members if member.state is REJOINING]
+        places = [member.index for member in self._members if member.gets_goals]
+        if self._places.tolist() != places:
+            self._places = np.array(places, np.intp)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the counters of the report."""
+        return {
+            **self._counts,
+            "silent": [member.id for member in self._members if not member.listed],
+            "faults": list(self._faults),
+            "stored_warnings": [f"{', '.join(joints)}: {problem}" for problem, joints in self._warnings.items()],
+            **self._unconfirmed(self._released),
+            "supply_mA": round(self._telemetry.supply_mA(), 1),
+            "supply_peak_mA": round(self._peak_mA, 1),
+        }
+
+    def poll(self, now_s: float) -> Mapping[str, Reading]:
+        """Read the position of all servos that are not silent, more of some, and probe or start up others.
+
+        Blocks for `StatusPoll.budget_s` at most. Raises BusError if no servo has answered for so long that the bus has
+        failed.
+        """
+        for member in self._arrived:
+            member.rejoined = False
+        self._arrived.clear()
+        return super().poll(now_s)
+
+    def _ask(self, link: RegisterLink, now_s: float) -> bool:
+        stamp_s = self._stamp_s = link.port.now_s()
+        if self._released:
+            for member in self._members:
+                member.stopped()
+        if self._asked:
+            self._pass_on()
+        with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
+            answered = self._poll.step(link, stamp_s)
+            self._settings.command(link, self._poll, stamp_s)
+            self._bring_back(link, stamp_s)
+            self._settings.compare(link, self._poll, stamp_s)
+            self._poll.blocks(link, stamp_s)
+        self._peak_mA = max(self._peak_mA, self._telemetry.supply_mA())
+        self._update_places()
+        return answered
+
+    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+        """Return the readings; ages are by the port's clock, whatever the origin of `now_s`."""
+        stamp_s = self._stamp_s if self._link is not None else self._now_s()
+        rejoined = {member.index for member in self._arrived}
+        for index in rejoined:
+            self._hold(index)
+        faults = [member.fault for member in self._members]
+        return self._telemetry.readings(self.joints, faults, rejoined, stamp_s)
+
+    def _bring_back(self, link: RegisterLink, now_s: float) -> None:
+        """Take a poll's share of the jobs of members on their way back; a silence ends it."""
+        left, longest = _EXCHANGES, link.framing.reads(1, LONGEST_READ)
+        for member in [member for member in self._members if member.state is not ONLINE]:
+            while left and member.waits and member.due(now_s):
+                if not link.grants("return", longest, alone=True, late_s=AWAY_LATE_S):
+                    return
+                left -= 1
+                self._powered |= {member.id}
+                member.step(now_s)
+                if member.rejoined:
+                    self._counts["reconnects"] += not member.recalled
+                    self._arrived.append(member)
+                    self._forget(member)
+                    self._telemetry.ticks[member.index] = member.stands_ticks
+                    self._telemetry.seen_s[member.index] = member.stands_s
+                elif member.job is None or not link.judged:
+                    break
+
+    # --- the port -----------------------------------------------------------------------------------------------
+
+    def _left(self) -> None:
+        for member in self._members:
+            member.gone()
+        self._update_places()
+
+    def _returned(self, link: RegisterLink, now_s: float) -> None:
+        """Ask every member alone first."""
+        self._now_s = link.port.now_s
+        for member in self._members:
+            member.startup.attach(link)
+            member.suspect(link.port.now_s(), pause_s=0.0)

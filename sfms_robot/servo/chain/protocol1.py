@@ -1,0 +1,352 @@
+"""Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
+
+The vendor's SDK builds the Dynamixel packets (`sdk_packets`), our codec those of Feetech, which has other instructions.
+
+The frame does not say what an answer answers, so a late answer could pass for the next one. Three rules prevent that:
+an answer counts only from an id that was asked and with the number of bytes that was asked for; what came before a
+request is dropped; and no request is made whose answer would be as long as one that the servo still owes. In that case
+the servo is first asked for data of another length (a fence). It answers in order, so once it has answered that,
+nothing older can come.
+
+These servos switch their torque on when a goal is written, so the first goal written is always the present position.
+Withholding goals keeps a limp one limp. They have no reboot, and report their faults in every answer.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Final
+
+from sfms_robot.config.wire_time import FRAMINGS
+from sfms_robot.errors import PacketError, ServoError
+from sfms_robot.servo.chain.bus import ChainBus
+from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
+from sfms_robot.servo.chain.sdk_packets import SdkPackets1
+from sfms_robot.servo.chain.startup import Startup
+from sfms_robot.servo.codecs import protocol1
+from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, Frame, encode, maybe_frame, salvage
+from sfms_robot.servo.policy import torque_limit
+from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Field
+
+_OWED_S: Final = 1.0  # an answer that has not come by then never will
+_FENCES: Final = 2  # of a group at most: answers share one wire, so those behind cannot overtake
+_STAGGER_S: Final = 0.003  # lerobot @7427f31, motors/feetech/feetech.py: what a broadcast ping may take per id
+
+
+class Protocol1Link(RegisterLink):
+    """A wire of servos of one of the two families."""
+
+    family: ClassVar[str]
+    who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
+    refusal_bits: ClassVar[int] = 0  # of the error byte, about the request
+
+    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
+        super().__init__(port, baud, silence_s)
+        self._sent = b""
+        self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
+        self._echoed = False
+
+    @abstractmethod
+    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
+        """Return a request."""
+
+    @abstractmethod
+    def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
+        """Return (instruction, parameters) of a read of several servos."""
+
+    @abstractmethod
+    def _identity(self, data: bytes) -> Found:
+        """Return what the first `who_length` bytes of the table say."""
+
+    # --- one servo ----------------------------------------------------------------------------------------------
+
+    def ping(self, servo: int) -> Found | None:
+        """Ping a servo and read its identity, which this protocol's ping does not report."""
+        if self._ask(servo, protocol1.PING, b"", 0) is None:
+            if not self._echoed:
+                return None
+            # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
+            who = self._who(servo)
+            return None if who.model_number is None else who
+        return self._who(servo)
+
+    def read(self, servo: int, address: int, length: int) -> Answer | None:
+        return self._ask(servo, protocol1.READ, bytes([address, length]), length)
+
+    def write(self, servo: int, address: int, data: bytes) -> Answer | None:
+        return self._ask(servo, protocol1.WRITE, bytes([address]) + data, 0)
+
+    def refusal(self, answer: Answer) -> str:
+        return protocol1.refusal_text(answer.error & self.refusal_bits)
+
+    def reboot(self, servo: int) -> Answer | None:
+        """Raise PacketError: these protocols have no such instruction."""
+        raise PacketError(
+            f"{self.port.name}: servo {servo} speaks {self.family} and has no reboot instruction: "
+            "switch its supply off and on"
+        )
+
+    def factory_reset(self, servo: int, option: int) -> Answer | None:
+        """Reset everything, id and baud included. Raises PacketError if `option` asks to keep something."""
+        if option != 0xFF:
+            raise PacketError(f"{self.port.name}: a {self.family} servo resets everything (255), not option {option}")
+        return self._ask(servo, protocol1.FACTORY_RESET, b"", 0)
+
+    def _who(self, servo: int) -> Found:
+        answer = self.read(servo, 0, self.who_length)
+        return Found(None, None) if answer is None or not answer.data else self._identity(answer.data)
+
+    def _ask(self, servo: int, code: int, params: bytes, length: int) -> Answer | None:
+        if self._owes(servo, length) and not self._fence(servo):
+            return None
+        self._send(servo, code, params)
+        return self._answers([servo], length).get(servo)
+
+    # --- several servos -----------------------------------------------------------------------------------------
+
+    @staticmethod
+    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
+        return encode(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
+
+    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
+        values = {servo: data[i * length : (i + 1) * length] for i, servo in enumerate(servos)}
+        self._send(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
+
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+        late = [servo for servo in servos if self._owes(servo, length)]
+        closed: list[int] = []
+        judged = False
+        for servo in late[:_FENCES]:
+            answered = self._fence(servo)
+            judged |= self.judged
+            if answered:
+                for each in servos:  # nothing older than that answer can come, from any of them
+                    self._owed.pop(each, None)
+                break
+            closed.append(servo)
+        else:
+            closed = late  # what they owe may still come
+        asked = [servo for servo in servos if servo not in closed]
+        if not asked:
+            self.judged = judged  # by one of them: the last may have had no time left
+            return {}
+        self._send(BROADCAST, *self._group_request(address, length, asked))
+        return self._answers(asked, length)
+
+    # --- the wire -----------------------------------------------------------------------------------------------
+
+    def _owes(self, servo: int, length: int) -> bool:
+        owed = self._owed.get(servo)
+        if owed is None:
+            return False
+        now_s = self.port.now_s()
+        for size in [size for size, asked_s in owed.items() if now_s - asked_s > _OWED_S]:
+            del owed[size]
+        return length in owed
+
+    def _fence(self, servo: int) -> bool:
+        """Ask for data of a length that no owed answer has; return whether the servo answered."""
+        size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
+        if size == 0:
+            self._send(servo, protocol1.PING, b"")
+        else:
+            self._send(servo, protocol1.READ, bytes([0, size]))
+        return servo in self._answers([servo], size)
+
+    def _send(self, servo: int, code: int, params: bytes) -> None:
+        self.port.discard_input()
+        self._sent = self._packet(servo, code, params)
+        self.port.write(self._sent)
+
+    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+        """Return answers of `servos` with `length` bytes of data, or with a refusal and none.
+
+        Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
+        """
+        buffer, answers, pending, echo = bytearray(), dict[int, Answer](), set(servos), self._sent
+        self._echoed = False
+        size = self.framing.answer + length
+        for data in self._incoming(len(echo) + size, (len(servos) - 1) * size):
+            buffer += data
+            if len(buffer) < len(echo) and echo.startswith(buffer):
+                continue  # perhaps an adapter that receives its own bytes
+            if echo and buffer.startswith(echo):
+                self._echoed = True
+                del buffer[: len(echo)]
+            echo = b""
+            while (frame := maybe_frame(buffer)) is not None:
+                self._take(frame, length, pending, answers)
+            if not pending:
+                break
+        for frame in salvage(buffer):
+            self._take(frame, length, pending, answers)
+        for servo in pending:
+            self._owed.setdefault(servo, {})[length] = self.port.now_s()
+        return answers
+
+    def _take(self, frame: Frame, length: int, pending: set[int], answers: dict[int, Answer]) -> None:
+        refused = frame.code & self.refusal_bits and not frame.params
+        if frame.servo in pending and (len(frame.params) == length or refused):
+            answers[frame.servo] = Answer(frame.code, frame.params)
+            pending.remove(frame.servo)
+            self._owed.pop(frame.servo, None)
+
+
+class Dynamixel1Link(Protocol1Link):
+    """A wire of Dynamixel 1.0 servos. MX servos answer a bulk read, AX servos do not."""
+
+    family = "dynamixel"
+    framing = FRAMINGS["dynamixel1"]
+    who_length = 3
+    refusal_bits = protocol1.REFUSAL_BITS
+
+    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
+        super().__init__(port, baud, silence_s)
+        self._sdk = SdkPackets1()
+
+    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
+        return self._sdk.instruction(servo, code, params)
+
+    def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
+        return protocol1.BULK_READ, protocol1.bulk_read_params((servo, address, length) for servo in servos)
+
+    def _identity(self, data: bytes) -> Found:
+        return Found(int.from_bytes(data[:2], "little"), data[2])
+
+    def broadcast_ping(self) -> dict[int, Found]:
+        """Ping all 254 ids, one silence each: this protocol has no such request."""
+        ids = range(protocol1.MAX_ID + 1)
+        return {servo: found for servo in ids if (found := self.ping(servo)) is not None}
+
+
+class FeetechLink(Protocol1Link):
+    """A wire of Feetech servos. STS and SMS answer a sync read, SCS not reliably.
+
+    Their error byte is about the servo alone: no bit says that a request was refused. Bytes 0 to 4 of the table are
+    firmware (major, minor), byte order (0: low byte first) and model number.
+    """
+
+    family = "feetech"
+    framing = FRAMINGS["feetech"]
+    who_length = 5
+
+    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
+        return encode(servo, code, params)
+
+    def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
+        return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)
+
+    def _identity(self, data: bytes) -> Found:
+        return Found(int.from_bytes(data[3:5], "big" if data[2] else "little"), data[0])
+
+    def broadcast_ping(self) -> dict[int, Found]:
+        ids = range(protocol1.MAX_ID + 1)
+        self._send(BROADCAST, protocol1.PING, b"")
+        with self.patient(_STAGGER_S * len(ids)):
+            there = sorted(self._answers(ids, 0))
+        self._owed.clear()  # no servo owes an answer to a broadcast
+        return {servo: self._who(servo) for servo in there}
+
+
+class Protocol1Startup(Startup):
+    """Startup of servos without reboot, which report their faults in every answer."""
+
+    can_reboot = False
+    unlimited = ("moving_speed", "goal_velocity", "acceleration", "goal_acceleration", "goal_time")
+
+    def ping(self) -> Found | None:
+        who = super().ping()
+        if who is not None and who.model_number is None:
+            self._acknowledge()
+            return None
+        return who
+
+    def _acknowledge(self) -> None:
+        """Raise its status level, unconfirmed: while that is low, it answers pings and nothing else."""
+        servo, lock = self.servo.id, self.table.role("lock")
+        level = self._field("status_level")
+        if lock is not None:
+            self._link.write(servo, lock.address, lock.to_bytes(0))
+        self._link.write(servo, level.address, level.to_bytes(level.high))
+        if lock is not None:
+            self._link.write(servo, lock.address, lock.to_bytes(1))
+
+    def prepare(self) -> Steps[int]:
+        level = self._field("status_level")
+        if self.value(level) != level.high:
+            self._acknowledge()
+        yield 0.0
+        now = yield from self._snapshot(self.table.size)
+        now = yield from self._release_outside(now)
+        for name, target in self._settings(now).items():
+            if name == self._name("torque_limit") and not now[name]:
+                continue  # a torque limit of 0 is a shutdown, and stays until the goal is the present position
+            yield from self._set(now, name, target)
+        return 0
+
+    def bring_back(self, reboot: bool) -> Steps[int]:
+        number = self.table["model_number"]
+        self.recognise(Found(self.value(number), None))
+        yield 0.0
+        yield from self.prepare()
+        return (yield from self.torque_on())
+
+    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
+        """Return position mode, no delay, no speed limit, and all of its torque unless the head's file says less."""
+        settings = self._corrections(now)
+        settings[self._name("return_delay")] = 0
+        limit = self.table.role("torque_limit")
+        if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
+            settings[limit.name] = now["max_torque"]
+        settings |= self.wanted()
+        return {name: target for name, target in settings.items() if name in now}
+
+    def _restore_torque(self) -> Steps[None]:
+        """Restore the torque limit, which a shutdown sets to 0, also when torque is switched on again."""
+        table, limit = self.table, self.table.role("torque_limit")
+        if limit is None or self.value(limit):
+            return
+        yield 0.0
+        full = torque_limit(self.servo)
+        if not full and "max_torque" in table.fields:
+            full = {limit.name: self.value(table["max_torque"])}
+        for name, value in full.items():
+            yield from self._write(table[name], value)
+
+    def _write(self, field: Field, value: int) -> Steps[None]:
+        """Write and verify; an error adds the fault that the servo reports."""
+        try:
+            yield from super()._write(field, value)
+        except Silent:
+            raise
+        except ServoError as error:
+            torque = self._field("torque_enable")
+            answer = self._link.read(self.servo.id, torque.address, torque.size)
+            fault = "" if answer is None else self.table.status_fault_names(answer.error)
+            raise ServoError(f"{error}, and it reports a hardware error ({fault})" if fault else str(error)) from None
+
+
+class Dynamixel1Bus(ChainBus):
+    """A bus of Dynamixel servos of Protocol 1.0: AX, and MX with their old firmware.
+
+    MX servos answer a bulk read, one request for all. AX servos do not, nor does a bus with one of them: there servos
+    are read one by one, in rotation. The bus finds out when it connects.
+    """
+
+    maps = "dynamixel", 1
+    link = Dynamixel1Link
+    startup = Protocol1Startup
+
+
+class FeetechBus(ChainBus):
+    """A bus of Feetech servos, all of one byte order.
+
+    STS and SMS (low byte first) answer a sync read, one request for all. SCS (high byte first) do not reliably, so they
+    are read one by one, in rotation.
+    """
+
+    maps = "feetech", 1
+    link = FeetechLink
+    startup = Protocol1Startup

@@ -1,0 +1,296 @@
+"""Dynamixel servos of Protocol 2.0: requests and answers over a port, their startup, and their bus.
+
+The vendor's SDK builds what is sent on every tick (`sdk_packets`). A request that is sent again is not built again:
+reads are sent unchanged, and of a sync write only data and crc are new. Single writes are built by our own codec,
+because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
+
+Answers are found in the byte stream by id and length, so that a late or foreign reply is never taken for another one.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, cast
+
+import numpy as np
+
+from sfms_robot.config import variant
+from sfms_robot.config.wire_time import FRAMINGS
+from sfms_robot.errors import ConfigError
+from sfms_robot.servo.chain.bus import ChainBus
+from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
+from sfms_robot.servo.chain.sdk_packets import SdkPackets2
+from sfms_robot.servo.chain.startup import Startup
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs.dxl2 import STATUS, maybe_packet
+from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
+from sfms_robot.servo.stored_settings import contradictions
+
+log = logging.getLogger(__name__)
+
+_KEPT: Final = 512  # requests
+_PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
+_LENGTHS: Final = 4  # of a read of several servos, one byte apart
+_HEADER: Final = b"\xff\xff\xfd"
+_BODY: Final = 7  # index of the instruction in a packet
+_SYNC_DATA: Final = 12  # index of the first id in a sync write
+_LONGEST_FAST: Final = dxl2.MAX_PACKET + 4096  # bytes after which a fast answer is given up
+
+_TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
+_REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
+_AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers that startup reads
+
+
+class Dynamixel2Link(RegisterLink):
+    """A wire of Protocol 2.0 servos."""
+
+    framing = FRAMINGS["dynamixel2"]
+    has_fast_read = True
+
+    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
+        super().__init__(port, baud, silence_s)
+        self._sdk = SdkPackets2()
+        self._built: dict[tuple[object, ...], Any] = {}
+        self._sent = 0
+        self._extra = 0  # bytes that reads of several servos ask for besides what is wanted
+
+    # --- one servo ----------------------------------------------------------------------------------------------
+
+    def ping(self, servo: int) -> Found | None:
+        self._send(dxl2.encode_instruction(servo, dxl2.PING))
+        return _found(self._answers([servo], 3)).get(servo)
+
+    def broadcast_ping(self) -> dict[int, Found]:
+        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
+        ids = range(dxl2.MAX_ID + 1)
+        with self.patient(len(ids) * _PING_S):
+            return _found(self._answers(ids, 3))
+
+    def reboot(self, servo: int) -> Answer | None:
+        return self._instruct(servo, dxl2.REBOOT)
+
+    def factory_reset(self, servo: int, option: int) -> Answer | None:
+        return self._instruct(servo, dxl2.FACTORY_RESET, bytes([option]))
+
+    def clear_turns(self, servo: int) -> Answer | None:
+        """Set the present position back into one revolution (CLEAR 01, with its key). Only at rest."""
+        return self._instruct(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22")
+
+    def read(self, servo: int, address: int, length: int) -> Answer | None:
+        self._send(self._once((servo, address, length), self._sdk.read, servo, address, length))
+        return self._answers([servo], length).get(servo)
+
+    def write(self, servo: int, address: int, data: bytes) -> Answer | None:
+        return self._instruct(servo, dxl2.WRITE, address.to_bytes(2, "little") + data)
+
+    def refusal(self, answer: Answer) -> str:
+        """Return the error number in bits 0..6 in words; bit 7 only says that register 70 is worth a look."""
+        if not answer.error & ~dxl2.ALERT:
+            return ""
+        return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
+
+    def _instruct(self, servo: int, instruction: int, params: bytes = b"") -> Answer | None:
+        self._send(dxl2.encode_instruction(servo, instruction, params))
+        return self._answers([servo], 0).get(servo)
+
+    # --- many servos --------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
+        length = len(next(iter(values.values())))
+        params = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        params += b"".join(bytes([servo]) + data for servo, data in values.items())
+        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, params)
+
+    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
+        key = address, length, servos
+        write: _SyncWrite = self._once(key, _SyncWrite, self._sdk, address, length, servos)
+        self._send(write.packet(data))
+
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+        longer = length + self._extra
+        key = address, longer, fast, *servos
+        self._send(self._once(key, self._sdk.sync_read, address, longer, servos, fast))
+        answers = self._fast_answers(servos, longer) if fast else self._answers(servos, longer)
+        if self._extra:
+            answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
+        if len(answers) < len(servos):
+            # A status packet does not say what it answers: after a silence the next request asks for another length,
+            # so that a late answer cannot be taken for its answer.
+            self._extra = (self._extra + 1) % _LENGTHS
+        return answers
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _once(self, key: tuple[object, ...], build: Callable[..., Any], *arguments: object) -> Any:
+        """Return what `build` made of these arguments before, or makes now; `key` stands for them."""
+        built = self._built.get(key)
+        if built is None:
+            if len(self._built) >= _KEPT:
+                self._built.clear()
+            built = self._built[key] = build(*arguments)
+        return built
+
+    def _send(self, packet: bytes) -> None:
+        self.port.discard_input()
+        self.port.write(packet)
+        self._sent = len(packet)
+
+    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+        """Return status packets of `servos` with `length` bytes of data, or with an error and none.
+
+        Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
+        """
+        buffer, answers, pending = bytearray(), dict[int, Answer](), set(servos)
+        size = self.framing.answer + length
+        for data in self._incoming(self._sent + size, (len(servos) - 1) * size):
+            buffer += data
+            while (packet := maybe_packet(buffer)) is not None:
+                servo, instruction, params, error = packet
+                expected = len(params) == length or (error & 0x7F and not params)
+                if instruction == STATUS and servo in pending and expected:
+                    answers[servo] = Answer(error, params)
+                    pending.remove(servo)
+            if not pending:
+                break
+        return answers
+
+    def _fast_answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+        """Return the answers in one packet of all: FF FF FD 00 FE ... ERROR ID data CRC, ERROR ID data CRC, ..."""
+        size = self.framing.answers(len(servos), length, fast=True)
+        buffer, start = bytearray(), -1
+        for data in self._incoming(self._sent + size):
+            buffer += data
+            if start < 0:
+                start = buffer.find(_HEADER + b"\x00\xfe")
+            if len(buffer) >= max(start, 0) + size or len(buffer) > _LONGEST_FAST:
+                break
+        found = dxl2.split_fast_status(buffer[max(start, 0) :], length)
+        return {servo: Answer(error, data) for servo, error, data in found if servo in servos}
+
+
+class _SyncWrite:
+    """A sync write as the SDK built it, with data and crc to be filled in."""
+
+    def __init__(self, sdk: SdkPackets2, address: int, length: int, servos: Sequence[int]) -> None:
+        self._packet = np.frombuffer(sdk.sync_write(address, length, servos), np.uint8).copy()
+        self._data = self._packet[_SYNC_DATA:-2].reshape(-1, length + 1)[:, 1:]  # behind each id
+
+    def packet(self, data: bytes) -> bytes:
+        """Return the packet with the values `data`, one behind the other."""
+        self._data[:] = np.frombuffer(data, np.uint8).reshape(self._data.shape)
+        body = self._packet[:-2].tobytes()
+        if body.find(_HEADER, _BODY) < 0:
+            return body + dxl2.crc16(body).to_bytes(2, "little")
+        # Data that look like a header have to be stuffed: the SDK's own stuffing (4.1.0) works on a copy it drops.
+        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, body[_BODY + 1 :])
+
+
+def _found(answers: Mapping[int, Answer]) -> dict[int, Found]:
+    """Return the servos in answers to a ping, whose data are model number (2 bytes, low first) and firmware."""
+    return {
+        servo: Found(int.from_bytes(answer.data[:2], "little"), answer.data[2])
+        for servo, answer in answers.items()
+        if len(answer.data) == 3
+    }
+
+
+class Dynamixel2Startup(Startup):
+    """Startup of servos that report their firmware, which decides the addresses of their registers."""
+
+    can_reboot = True
+    unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
+
+    def recognise(self, found: Found) -> None:
+        """Raise ServoError for another model; take the table of the firmware that answers."""
+        super().recognise(found)
+        low, high = self.table.firmware
+        if found.firmware is not None and not low <= found.firmware <= high:
+            try:
+                self.table = Table.of(variant(self.servo.map.model, found.firmware))
+            except ConfigError as error:
+                raise self._error(f"has firmware {found.firmware}: {error}") from error
+
+    def prepare(self) -> Steps[int]:
+        table = self.table
+        if (level := table.role("status_level")) is not None:
+            # Status return level 2, unconfirmed: at level 0 a servo answers pings and nothing else.
+            self._link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
+        now = yield from self._clear_turns((yield from self._state()))
+        now = yield from self._release_outside(now)
+        for name, target in self._settings(now).items():
+            if name not in now:
+                now[name] = self.value(table[name])
+                yield 0.0
+            written = yield from self._set(now, name, target)
+            if written and name == self._name("operating_mode"):
+                now = yield from self._state()  # another mode resets gains, profile and goals
+        error = table.role("error_status")
+        return now[error.name] if error is not None else 0
+
+    def bring_back(self, reboot: bool) -> Steps[int]:
+        servo = self.servo.id
+        if reboot:
+            answer = self._link.reboot(servo)
+            if answer is None:
+                raise Silent(self._about("does not answer to a reboot"))
+            if refusal := self._link.refusal(answer):
+                raise self._error(f"refuses to reboot: {refusal}")
+            yield _REBOOT_S
+        found = self._link.ping(servo)
+        if found is None:
+            raise Silent(self._about("does not answer to a ping"))
+        self.recognise(found)
+        yield 0.0
+        yield from self.prepare()
+        return (yield from self.torque_on())
+
+    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
+        """Return register values before torque; the mode comes first, since it resets others."""
+        settings = self._corrections(now)
+        settings["drive_mode"] = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
+        settings[self._name("return_delay")] = 0
+        settings["bus_watchdog"] = 0
+        if "pwm_limit" in now:  # an earlier run may have left less
+            settings["goal_pwm"] = now["pwm_limit"]
+        settings |= self.wanted()
+        return {name: target for name, target in settings.items() if name in self.table.fields}
+
+    def _clear_turns(self, now: dict[str, int]) -> Steps[dict[str, int]]:
+        """Let a servo that was turned by hand past its one turn forget whole turns (CLEAR), at rest without torque.
+
+        The shaft stays; only its reading comes back into the turn of position mode.
+        """
+        present = self._field("present_position")
+        found = contradictions(now, self.table, self._needs)
+        turned = any(each.register == present.name and each.fixable for each in found)
+        if not turned or now[self._name("torque_enable")] or now.get("moving"):
+            return now
+        answer = cast(Dynamixel2Link, self._link).clear_turns(self.servo.id)
+        yield 0.0
+        if answer is not None and (refusal := self._link.refusal(answer)):
+            raise self._error(f"stands at {now[present.name]}, beyond one turn, and refuses CLEAR: {refusal}")
+        cleared = self.value(present)
+        yield 0.0
+        log.warning("%s", self._about(f"was turned past one turn: {now[present.name]} now reads {cleared}"))
+        return {**now, present.name: cleared}
+
+    def _state(self) -> Steps[dict[str, int]]:
+        """Return the values of all registers up to those that report the present."""
+        fields = [field for role in _AT_REST if (field := self.table.role(role)) is not None]
+        return (yield from self._snapshot(max(field.address + field.size for field in fields)))
+
+
+class Dynamixel2Bus(ChainBus):
+    """A bus of Dynamixel servos of Protocol 2.0, in position mode.
+
+    They are read by one fast sync read (all answer in one packet) while that works, else by a plain sync read. A
+    watchdog that stops the servo is armed after the first goal, fed by the goals themselves, and switched off after the
+    torque at the end.
+    """
+
+    maps = "dynamixel", 2
+    link = Dynamixel2Link
+    startup = Dynamixel2Startup
