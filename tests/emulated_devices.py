@@ -1,7 +1,8 @@
 """Emulated servos and boards in this process, without a wire."""
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.device import EmulatedServo, plugged
+from sfms_robot.emulator.chain_process import plugged
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.registers import Table
 
 

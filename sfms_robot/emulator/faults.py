@@ -18,11 +18,13 @@ import random
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from sfms_robot.emulator.device import Reply
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sfms_robot.emulator.emulated_wire import Reply
 
 
 class Kind(NamedTuple):
@@ -67,7 +69,7 @@ _SPEC: Final = re.compile(
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault. `ids` None = everybody. `text` is the spec as it was given."""
+    """One fault. `ids` None: all servos. `text` is the spec as it was given."""
 
     kind: str
     ids: frozenset[int] | None
@@ -76,10 +78,13 @@ class Fault:
     value: float
     text: str
 
+    def concerns(self, servo: Any) -> bool:
+        """Return whether a servo or channel can have it."""
+        return self.ids is None or servo.id in self.ids
+
     def meets(self, servos: Sequence[int], now_s: float) -> bool:
-        if not self.start_s <= now_s < self.end_s:
-            return False
-        return self.ids is None or not self.ids.isdisjoint(servos)
+        """Return whether it hits a packet from `servos` now."""
+        return self.start_s <= now_s < self.end_s and (self.ids is None or not self.ids.isdisjoint(servos))
 
 
 def parse_fault(text: str, now_s: float = 0.0) -> Fault:

@@ -3,9 +3,8 @@
     with launch([EmulatedServo(1), EmulatedServo(2, start_ticks=1500)]) as chain:
         SerialPort(chain.device, 1_000_000, clock)
 
-Servos of several protocols, and boards, may share one wire.
-
-The process ends with the `with` block, and by itself when this one dies.
+Servos of several protocols, and boards, may share one wire. The process ends with the `with` block, and also when this
+process dies.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from functools import partial
 from typing import IO, Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 
@@ -33,6 +32,7 @@ READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be lat
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
+_END_S = 5.0
 _refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
@@ -42,12 +42,12 @@ class Chain:
     """A running chain.
 
     Attributes:
-        device: path of the serial device; it stays the same when the adapter is unplugged and comes back.
-        control: path of the control socket.
+        device: Path of the serial device; it stays the same when the adapter is unplugged and comes back.
+        control: Path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
-        servos: what is plugged in.
+        servos: The servos plugged in.
         priority: "fifo" where it answers as promptly as hardware; else why not (`realtime.realtime_priority`).
-        process, folder: what ends with it.
+        process, folder: End with it.
     """
 
     process: subprocess.Popen[bytes]
@@ -68,10 +68,11 @@ class Chain:
         return PROMPT_DEADLINE_S if self.priority == "fifo" else READ_DEADLINE_S
 
     def kill(self, servo_id: int) -> None:
-        """The servo falls silent, as with its cable out; its motor keeps doing what it was told."""
+        """Let a servo fall silent, as with its cable out; its motor keeps following its last command."""
         self.ask(f"kill {servo_id}")
 
     def revive(self, servo_id: int) -> None:
+        """Let it answer again."""
         self.ask(f"revive {servo_id}")
 
     def fault(self, servo_id: int, bits: int) -> None:
@@ -83,26 +84,27 @@ class Chain:
         self.ask(f"turn {servo_id} {ticks}")
 
     def heat(self, servo_id: int, temperature_C: float) -> None:
-        """A servo has this temperature from now on, and goes where its load takes it."""
+        """Set the temperature of a servo, which then follows its load."""
         self.ask(f"heat {servo_id} {temperature_C}")
 
     def state(self, servo_id: int) -> dict[str, Any]:
-        """What an onlooker sees: position [ticks], goal, torque, faults, temperature_C."""
+        """Return what a look at a servo shows: position [ticks], goal, torque, faults, temperature_C."""
         return cast("dict[str, Any]", self._json(f"state {servo_id}"))
 
     def inject(self, spec: str) -> None:
-        """A fault from now on, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
+        """Add a fault from now on, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
         self.ask(f"inject {spec}")
 
     def clear_faults(self) -> None:
+        """Remove all faults."""
         self.ask("clear")
 
     def faults(self) -> list[str]:
-        """Specs of the faults that go on or are to come."""
+        """Return the specs of the faults that last or are to come."""
         return cast("list[str]", self._json("faults"))
 
     def supply(self, volts: float) -> None:
-        """Another supply voltage for all servos."""
+        """Change the supply voltage of all servos."""
         self.ask(f"supply {volts!r}")
 
     def hang_up(self) -> None:
@@ -114,32 +116,25 @@ class Chain:
         self.ask("return")
 
     def time_is(self, now_s: float) -> None:
-        """In virtual time: let happen what happens by itself by `now_s`, though no host says a word."""
+        """Set virtual time: faults begin and end, and motors move, though no host sends anything."""
         self.ask(f"time {now_s!r}")
 
     def statistics(self) -> dict[str, Any]:
-        """bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
+        """Return bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
         return cast("dict[str, Any]", self._json("stats"))
 
     def stamps(self) -> list[dict[str, Any]]:
-        """The last replies: ids, due_s, sent_s."""
+        """Return the last replies: ids, due_s, sent_s."""
         return cast("list[dict[str, Any]]", self._json("stamps"))
 
-    @property
-    def stdout(self) -> IO[bytes]:
-        """Says nothing any more, and ends with the process."""
-        return cast("IO[bytes]", self.process.stdout)
-
     def digest(self) -> tuple[str, int]:
-        """SHA-256 and number of all bytes that hosts have sent."""
+        """Return SHA-256 and number of all bytes that hosts have sent."""
         _, sha, count = self.ask("digest").split()
         return sha, int(count)
 
     def close(self) -> None:
         """End the process and remove its folder. Idempotent."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        _reap(self.process)
+        _end(self.process)
         shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
             os.unlink(self.device)  # it was killed, and left its link behind
@@ -154,7 +149,7 @@ class Chain:
         return json.loads(self.ask(request).removeprefix("json "))
 
     def ask(self, request: str) -> str:
-        """One line to the control socket, and its answer. Raises BusError when it is refused."""
+        """Send one line to the control socket; return its answer. Raises BusError when it is refused."""
         try:
             with socket.socket(socket.AF_UNIX) as control:
                 control.connect(self.control)
@@ -171,7 +166,7 @@ def launch(
     servos: Sequence[EmulatedServo],
     virtual: bool = False,
     *,
-    timing: Literal["instant", "wire"] = "instant",
+    timing: Timing = "instant",
     behind_silent: Literal["chain_break", "skip"] = "chain_break",
     faults: Sequence[str] = (),
     seed: int = 0,
@@ -180,11 +175,11 @@ def launch(
     """Start a chain and wait until it can be opened.
 
     Args:
-        virtual: time is what the host says it is (see `servo.port.VirtualTimePort`).
-        timing: replies at once, or in the time that bytes and return delays take.
-        behind_silent: whether the ids behind a silent one in a sync read are silent too.
-        faults: specs (see `emulator.faults`); `seed` throws their dice.
-        link: a symbolic link to the device, removed at the end.
+        virtual: The host sets the time (see `servo.port.VirtualTimePort`).
+        timing: Replies at once, or in the time that bytes and return delays take.
+        behind_silent: Whether the ids behind a silent one in a sync read are silent too.
+        faults: Specs (see `emulator.faults`); `seed` throws their dice.
+        link: A symbolic link to the device, removed at the end.
 
     Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
     link that is taken; BusError when the process does not start.
@@ -210,7 +205,7 @@ def launch(
 
 
 def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], dict[str, str]]:
-    """The process, and what it says when it is ready. Raises ConfigError for what it refuses, BusError."""
+    """Start the process; return it, and its `ready` line. Raises ConfigError for a description it refuses, BusError."""
     process = subprocess.Popen(
         [sys.executable, "-m", "sfms_robot.emulator.chain_process"],
         stdin=subprocess.PIPE,
@@ -225,8 +220,7 @@ def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], d
     except OSError:
         ready = b""
     if not ready.startswith(b"ready "):
-        process.kill()
-        _reap(process)
+        _end(process)
         if ready.startswith(b"refused "):
             raise ConfigError(ready.removeprefix(b"refused ").decode().strip())
         raise BusError(f"the emulated chain did not start (exit code {process.returncode})")
@@ -234,13 +228,26 @@ def _started(description: Mapping[str, Any]) -> tuple[subprocess.Popen[bytes], d
 
 
 def wait(chains: Sequence[Chain]) -> Chain:
-    """Block until a chain ends by itself, and say which."""
-    pipes = {chain.stdout: chain for chain in chains}
+    """Block until a chain ends although it was not closed; return that chain."""
+    pipes = {cast("IO[bytes]", chain.process.stdout): chain for chain in chains}
     return pipes[select.select(list(pipes), [], [])[0][0]]
 
 
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process, with force if it takes too long, and close its pipes."""
+    process.terminate()
+    try:
+        process.wait(timeout=_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()
+
+
 def _map(servo: EmulatedServo) -> FirmwareMap:
-    """The layout that holds for its firmware; for families without such layouts, the only one."""
+    """Return the layout of its firmware; for families without such layouts, the only one."""
     named = load_firmware_map(servo.model)
     return variant(servo.model, servo.firmware) if named.protocol == 2 else named
 
@@ -258,7 +265,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
             raise _refusal("id", servo.id, "is not a servo id", [f"0..{highest}"])
         bauds = sorted(table.baud_codes.values())
         if bauds and servo.baud not in bauds:
-            raise _refusal("baud", servo.baud, f"is no rate of {servo.model}", bauds)
+            raise _refusal("baud", servo.baud, f"is not a rate of {servo.model}", bauds)
         if table.channels is not None:
             if servo.registers.keys() - _BOARD_SETTINGS.get(table.family, set()) or servo.supply_v is not None:
                 problem = "is a board of hobby servos: it has no registers, and does not know its supply"
@@ -267,7 +274,7 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
         for name, value in servo.registers.items():
             register = table.registers.get(name)
             if register is None:
-                raise _refusal("register", name, f"is none of {servo.model}", table.registers)
+                raise _refusal("register", name, f"is not one of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
                 raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
@@ -278,15 +285,3 @@ def _check_link(link: str) -> None:
         raise _refusal("link", link, "is already there")
     if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
         raise _refusal("link", link, "lies in a folder that does not exist")
-
-
-def _reap(process: subprocess.Popen[bytes]) -> None:
-    """Wait for the end, with force if it takes too long, and close the pipes."""
-    try:
-        process.wait(timeout=5.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    for pipe in (process.stdin, process.stdout):
-        if pipe is not None and not pipe.closed:
-            pipe.close()

@@ -5,7 +5,7 @@ from emulated_devices import device_of, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_instruction, maybe_packet
 

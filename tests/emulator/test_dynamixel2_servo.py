@@ -5,8 +5,8 @@ import math
 import pytest
 
 from sfms_robot.config import load_firmware_map, map_files, variant
-from sfms_robot.emulator.device import EmulatedServo
-from sfms_robot.emulator.dynamixel2_servo import Dynamixel2Servo
+from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.emulator.servo_chains import Dynamixel2Servo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Table
 
@@ -17,7 +17,8 @@ class Bench:
     def __init__(self, model="xl330-m288", firmware=53, start=2048, supply_v=None, **registers):
         self.table = Table.of(variant(model, firmware))
         self.servo = Dynamixel2Servo(
-            EmulatedServo(1, model, 1_000_000, start, firmware, registers, supply_v), self.table
+            EmulatedServo(1, model, 1_000_000, start, firmware=firmware, registers=registers, supply_v=supply_v),
+            self.table,
         )
         self.t = 0.0
 
@@ -47,7 +48,7 @@ PROTOCOL_2 = sorted(file.stem for file in map_files() if load_firmware_map(file.
 def test_every_shipped_model_stands_still_and_moves_when_told(model):
     table = Table.of(load_firmware_map(model))
     baud = max(table.baud_codes.values())
-    servo = Dynamixel2Servo(EmulatedServo(1, model, baud, table.center_ticks, table.firmware[1]), table)
+    servo = Dynamixel2Servo(EmulatedServo(1, model, baud, table.center_ticks, firmware=table.firmware[1]), table)
     present, goal, torque = (table.role(r) for r in ("present_position", "goal_position", "torque_enable"))
     assert servo.read(0, table.size, 0.5) == (0, servo.read(0, table.size, 0.5)[1])
     assert present.from_bytes(servo.read(present.address, present.size, 1.0)[1]) == table.center_ticks
@@ -133,7 +134,7 @@ def test_turns_are_forgotten_by_clear_and_by_reboot():
     assert bench.get("present_position") == 9000 - 2 * 4096
     assert bench.servo.clear(b"\x01\x00\x00\x00\x00", 0.0) == dxl2.DATA_RANGE_ERROR
     bench = Bench(operating_mode=4, start=9000)
-    bench.servo.reboot(0.0)
+    bench.servo.power_cycle(0.0)
     assert bench.after(1.0) == 9000 - 2 * 4096
 
 
@@ -182,7 +183,7 @@ def test_goals_stay_below_their_limit_registers(limit, value, goal):
 def test_supply_outside_the_limits_raises_the_alert_for_good():
     bench = Bench(supply_v=7.2, shutdown=52)
     assert bench.get("present_input_voltage") == 72 and bench.get("hardware_error_status") == 1
-    bench.servo.reboot(0.0)
+    bench.servo.power_cycle(0.0)
     bench.t = 1.0
     assert bench.get("hardware_error_status") == 1
     assert bench.put(torque_enable=1) == 0  # 52 leaves the voltage out, 53 does not
@@ -193,9 +194,9 @@ def test_brown_out_restarts_the_servo():
     bench = Bench()
     bench.put(torque_enable=1, led=1)
     bench.servo.set_supply(1.0, 0.1)
-    assert not bench.servo.hears(0.2)
+    assert not bench.servo.hears(1_000_000, 0.2)
     bench.servo.set_supply(5.0, 0.3)
-    assert not bench.servo.hears(0.4) and bench.servo.hears(0.7)
+    assert not bench.servo.hears(1_000_000, 0.4) and bench.servo.hears(1_000_000, 0.7)
     bench.t = 1.0
     assert (bench.get("torque_enable"), bench.get("led")) == (0, 0)
 
@@ -245,7 +246,7 @@ def test_xl320_torque_limit_starts_at_max_torque_and_holds_the_motor_back():
         servo.write(24, b"\x01", 0.0)
         way[most] = servo.state(0.1)["position"] - 512
         servo.write(35, b"\x05\x00", 0.1)
-        servo.reboot(0.1)
+        servo.power_cycle(0.1)
         assert servo.read(35, 2, 0.5) == (0, most.to_bytes(2, "little"))
     assert 0 < way[60] < way[1023] / 2
 
@@ -254,5 +255,5 @@ def test_turns_are_forgotten_at_power_up_however_few_they_are():
     bench = Bench()
     bench.servo.turn(4150, 0.0)
     assert bench.servo.state(0.0)["position"] == 4150
-    bench.servo.reboot(0.0)
+    bench.servo.power_cycle(0.0)
     assert bench.servo.state(1.0)["position"] == 4150 - 4096

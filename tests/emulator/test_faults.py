@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.device import Reply
+from sfms_robot.emulator.emulated_wire import Reply
 from sfms_robot.emulator.faults import KINDS, TO_SERVOS, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 

@@ -38,9 +38,9 @@ def test_process_ends_with_its_parent():
 
 
 def test_emulator_needs_no_heavy_library():
-    code = "import sys, sfms_robot.emulator.chain_process, sfms_robot.emulator.dynamixel2_chain; print(*sys.modules)"
+    code = "import sys, sfms_robot.emulator.chain_process, sfms_robot.emulator.servo_chains; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
-    assert "sfms_robot.emulator.dynamixel2_chain" in loaded
+    assert "sfms_robot.emulator.servo_chains" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}
 
 

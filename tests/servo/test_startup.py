@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Safety, load_firmware_map
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.chain.dynamixel2_startup import Dynamixel2Startup
 from sfms_robot.servo.chain.protocol1_startup import Protocol1Startup
@@ -320,7 +320,7 @@ def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
     rig.startup.run()
     servo = rig.servo(1)
     servo.turn(5150, rig.clock.t)
-    servo.reboot(rig.clock.t)
+    servo.power_cycle(rig.clock.t)
     rig.clock.t += 1.0
     with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
         finish(rig.startup.bring_back(0, reboot=False))
