@@ -26,8 +26,8 @@ def test_servos_are_plugged_in_the_middle_of_their_range_at_a_rate_they_have():
         ("xl330-m288", "has no id for 'xl330-m288'"),
         ("1-3", "has no id for '1-3'"),
         ("xl999:1", "'xl999' has no firmware map"),
-        ("xl330-m288:9-1", "holds ids that are none: '9-1'"),
-        ("xl330-m288:one", "holds ids that are none: 'one'"),
+        ("xl330-m288:9-1", "holds bad ids: '9-1'"),
+        ("xl330-m288:one", "holds bad ids: 'one'"),
     ],
 )
 def test_servo_list_that_cannot_be_read_is_one_clear_line(text, message):
@@ -60,7 +60,7 @@ def test_either_a_head_or_servos():
     ("stored", "message"),
     [
         ("joints: {nose: {shutdown: 52}}", "joints = 'nose' is no joint of this head"),
-        ("registers: {homing: 3}", "register = 'homing' is none of xl330-m288"),
+        ("registers: {homing: 3}", "register = 'homing' is not one of xl330-m288"),
         ("supply_v: -1", "emulate.yaml: supply_v = -1"),
     ],
 )
@@ -87,11 +87,11 @@ def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
     ("more", "message"),
     [
         ({"stored": ("min_position_limit=3",)}, "stored = 'min_position_limit=3' cannot be read: IDS:REGISTER=VALUE"),
-        ({"stored": ("1:nose=3",)}, "register = 'nose' is none of xl330-m288"),
+        ({"stored": ("1:nose=3",)}, "register = 'nose' is not one of xl330-m288"),
         ({"stored": ("1:shutdown=300",)}, "shutdown = 300 is out of range of xl330-m288"),
         ({"starts": ("1:4150",)}, "start = '1:4150' cannot be read: IDS=TICKS"),
-        ({"starts": ("7=4150",)}, "start = '7=4150' names 7, which nobody has"),
-        ({"starts": ("3-1=4150",)}, "start = '3-1=4150' holds ids that are none"),
+        ({"starts": ("7=4150",)}, "start = '7=4150' names 7, which no servo has"),
+        ({"starts": ("3-1=4150",)}, "start = '3-1=4150' holds bad ids"),
     ],
 )
 def test_start_that_cannot_be_is_one_clear_line(more, message):
