@@ -1,4 +1,4 @@
-"""The process of an emulated chain: a pseudo terminal for the host, a control socket beside it.
+"""The process of an emulated chain: a pseudo terminal for the host, and a control socket.
 
 Started by `launch`, which writes one JSON line on stdin and reads one line back, `ready {"device": ..., ...}`. It ends
 on SIGTERM, or when stdin closes because its parent is gone.

@@ -247,7 +247,7 @@ def motor_command(
 
 
 def _profile(memory: ControlTable, distance: float) -> tuple[float, float]:
-    """Return the limits of speed and acceleration of a way of `distance`, in ticks and seconds; 0 is no limit."""
+    """Return the limits of speed and acceleration of a way of `distance`, in ticks and seconds; 0 means unlimited."""
     table = memory.table
     if memory.get("drive_mode") & _PROFILE_BY_TIME and table.protocol == 2:  # both registers are durations in ms
         whole_ms = memory.get("profile_velocity")

@@ -1,4 +1,4 @@
-"""Start an emulated servo chain in a process of its own, and stop it again.
+"""Start an emulated servo chain in its own process, and stop it.
 
     with launch([EmulatedServo(1), EmulatedServo(2, start_ticks=1500)]) as chain:
         SerialPort(chain.device, 1_000_000, clock)
@@ -26,7 +26,9 @@ from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 
-__all__ = ["Chain", "EmulatedServo", "launch", "wait"]
+__all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
+
+BehindSilent = Literal["chain_break", "skip"]
 
 READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
@@ -167,7 +169,7 @@ def launch(
     virtual: bool = False,
     *,
     timing: Timing = "instant",
-    behind_silent: Literal["chain_break", "skip"] = "chain_break",
+    behind_silent: BehindSilent = "chain_break",
     faults: Sequence[str] = (),
     seed: int = 0,
     link: str | None = None,

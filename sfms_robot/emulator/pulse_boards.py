@@ -95,7 +95,7 @@ class Channel:
 
     @property
     def moving(self) -> bool:
-        """Whether a limit still holds the pulse back."""
+        """A limit still holds the pulse back."""
         return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
 
 
@@ -149,7 +149,7 @@ class Board(Device):
         return shortest_us / tick_us, longest_us / tick_us
 
     def _send(self, channel: Channel, goal: float, now_s: float) -> None:
-        """Target 0 is no pulses; any other is brought inside the limits of the channel."""
+        """Send a target, brought inside the limits of the channel; 0 ends the pulses."""
         shortest, longest = self.limits[channel.id]
         if goal == 0:
             channel.off(now_s)

@@ -252,7 +252,7 @@ class RegisterServo(ABC):
         self._advance(now_s)
 
     def _advance(self, now_s: float) -> None:
-        """Move the motor on; its firmware looks at it on a fixed grid of time, whoever reads it when."""
+        """Move the motor on; its firmware looks at it on a fixed grid of time, at whatever times it is read."""
         while self.drive is not None and self._checks * _CHECK_S <= now_s:
             self.plant.advance(self._checks * _CHECK_S, self.drive)
             self._checks += 1

@@ -221,7 +221,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
     def _single(
         self, servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool = False
     ) -> bytes | None:
-        """Let one servo obey an instruction of its own; return its answer, or None."""
+        """Let one servo obey an instruction; return its answer, or None."""
         servo_id, result = servo.id, (dxl2.INSTRUCTION_ERROR, b"", 2)
         if code == dxl2.PING:
             servo.advance(now_s)
@@ -265,7 +265,7 @@ def _collided(packets: Sequence[bytes]) -> bytes:
 
 
 class Protocol1Servo(RegisterServo):
-    """A Dynamixel of Protocol 1.0, or a Feetech. `fault_status` is in every answer; errors are bits beside it."""
+    """A Dynamixel of Protocol 1.0, or a Feetech. Errors and `fault_status` are bits of every answer."""
 
     _beyond = _unknown = dxl1.RANGE
 
@@ -358,7 +358,7 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
                 return
 
     def _single(self, servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> Iterator[Reply]:
-        """Let one servo obey an instruction of its own; yield its answer, under the id that it had."""
+        """Let one servo obey an instruction; yield its answer, under the id that it had."""
         servo_id, is_feetech = servo.id, servo.table.family == "feetech"
         answers = [servo.answers(level) for level in range(3)]  # as the request finds it
         error, data, level = 0, b"", 2

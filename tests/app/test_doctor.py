@@ -27,7 +27,7 @@ from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.servo.single_servo import parse_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
-from sfms_robot.config import load_firmware_map, map_files
+from sfms_robot.config import Faults, Threshold, load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -56,7 +56,7 @@ class Patient:
     def __init__(self, chain: Chain, count: int, model: str, masked: Sequence[str]):
         number = load_firmware_map(model).model_number
         self.wanted = {
-            i: Wanted(joint=f"joint{i}", model=model, model_number=number, masked=frozenset(masked))
+            i: Wanted(joint=f"joint{i}", model=model, model_number=number, faults=Faults(mask=tuple(masked)))
             for i in range(1, count + 1)
         }
         self.chain, self.clock = chain, VirtualClock()
@@ -239,7 +239,7 @@ def test_a_servo_that_only_answers_pings_gets_its_voice_back_by_the_fix():
 def test_a_fault_within_the_head_s_own_threshold_is_a_note_and_beyond_it_an_error():
     with patient() as sick:
         for servo, want in sick.wanted.items():
-            sick.wanted[servo] = replace(want, thresholds={"input voltage": (None, 7.5)})
+            sick.wanted[servo] = replace(want, faults=Faults(thresholds={"input voltage": Threshold(max=7.5)}))
         sick.chain.supply(7.2)
         sick.chain.fault(1, 0x01)
         assert sick.examined()["exit_code"] == 0

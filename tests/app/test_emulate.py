@@ -2,7 +2,7 @@ import shutil
 
 import pytest
 
-from sfms_robot.app.servo.emulated_chains import EmulateOptions, described, emulators, parse_servos
+from sfms_robot.app.servo.emulated_chains import described, emulators, parse_servos
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -36,7 +36,7 @@ def test_servo_list_that_cannot_be_read_is_one_clear_line(text, message):
 
 
 def test_whole_head_is_plugged_in_bus_by_bus():
-    with emulators(EmulateOptions(head="face28", voltage=6.0, faults=("silent:3",))) as chains:
+    with emulators(head="face28", voltage=6.0, faults=("silent:3",)) as chains:
         assert len(chains) == 1
         [chain] = chains.values()
         assert chain.faults() == ["silent:3"]
@@ -46,13 +46,13 @@ def test_whole_head_is_plugged_in_bus_by_bus():
 def test_faults_may_stand_in_a_file(tmp_path):
     file = tmp_path / "bad_day.txt"
     file.write_text("# what broke\ndrop:1=0.5\n\nbrownout@3   # somebody trips over the cable\n")
-    with emulators(EmulateOptions(servo="xl330-m288:1", faults=(str(file), "delay=0.001"))) as chains:
+    with emulators(servo="xl330-m288:1", faults=(str(file), "delay=0.001")) as chains:
         assert chains["servos"].faults() == ["drop:1=0.5", "brownout@3", "delay=0.001"]
 
 
 def test_either_a_head_or_servos():
-    for options in (EmulateOptions(), EmulateOptions(head="face28", servo="ax-12a:1")):
-        with pytest.raises(ConfigError, match="either --head NAME or --servo"), emulators(options):
+    for options in ({}, {"head": "face28", "servo": "ax-12a:1"}):
+        with pytest.raises(ConfigError, match="either --head NAME or --servo"), emulators(**options):
             pass
 
 
@@ -67,15 +67,15 @@ def test_either_a_head_or_servos():
 def test_stored_values_that_cannot_be_are_one_clear_line(tmp_path, stored, message):
     shutil.copy(data_dir("configs") / "heads" / "face28" / "head.yaml", tmp_path / "head.yaml")
     (tmp_path / "emulate.yaml").write_text(stored)
-    with pytest.raises(ConfigError, match=message), emulators(EmulateOptions(head=str(tmp_path))):
+    with pytest.raises(ConfigError, match=message), emulators(head=str(tmp_path)):
         pass
 
 
 def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
-    options = EmulateOptions(
+    running = emulators(
         servo="xl330-m288:1-3,sts3215:9", stored=("1,3:min_position_limit=1900", "9:phase=28"), starts=("2-3=4150",)
     )
-    with emulators(options) as chains:
+    with running as chains:
         chain = chains["servos"]
         assert [servo.registers for servo in chain.servos] == [
             {"min_position_limit": 1900}, {}, {"min_position_limit": 1900}, {"phase": 28},
@@ -95,12 +95,12 @@ def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
     ],
 )
 def test_start_that_cannot_be_is_one_clear_line(more, message):
-    with pytest.raises(ConfigError, match=message), emulators(EmulateOptions(servo="xl330-m288:1", **more)):
+    with pytest.raises(ConfigError, match=message), emulators(servo="xl330-m288:1", **more):
         pass
 
 
 def test_what_is_plugged_in_is_described_joint_by_joint():
-    with emulators(EmulateOptions(head="open_duck_mini_v2_head")) as chains:
+    with emulators(head="open_duck_mini_v2_head") as chains:
         told = described(chains, "open_duck_mini_v2_head")
     head = load_head("open_duck_mini_v2_head")
     assert set(told["buses"]) == set(head.buses) and len(told["buses"]) > 1

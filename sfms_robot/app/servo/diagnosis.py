@@ -13,8 +13,10 @@ from typing import Any, Final, Literal, cast
 
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
 from sfms_robot.app.servo.single_servo import State
+from sfms_robot.config import Faults
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
+from sfms_robot.servo.policy import Measured, counts
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
 
@@ -23,7 +25,6 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 FAST_ENOUGH_MS: Final = 1
 _ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
-_MEASURED: Final = {"input voltage": "voltage", "overheating": "temperature"}
 _POLOLU: Final = "1ffb"
 _BOARD_HELP: Final = {
     "maestro": "use the first of its two USB ports (command port) with serial mode USB Dual Port or USB Chained, or "
@@ -61,27 +62,19 @@ class Wanted:
 
     Attributes:
         model_number: None where it cannot be checked.
-        masked: Faults that the head lives with.
-        thresholds: Fault -> (lowest, highest) reading with which the head lives with it; None is open.
+        faults: The faults that the head acts upon.
         needs: The values that its joint needs the servo to have stored.
     """
 
     joint: str
     model: str
     model_number: int | None
-    masked: frozenset[str] = frozenset()
-    thresholds: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    faults: Faults = field(default_factory=Faults)
     needs: JointNeeds | None = None
 
     def lives_with(self, fault: str, state: State) -> bool:
         """Return whether the head's file says that this fault does not count."""
-        if fault in self.masked:
-            return True
-        reading = state.in_unit(_MEASURED.get(fault, ""))
-        if fault not in self.thresholds or reading is None:
-            return False
-        low, high = self.thresholds[fault]
-        return (low is None or reading >= low) and (high is None or reading <= high)
+        return not counts(fault, self.faults, Measured(state.in_unit("voltage"), state.in_unit("temperature")))
 
 
 @dataclass(frozen=True)
@@ -156,7 +149,7 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
 
 
 def udev_rule(device: SerialDevice) -> str | None:
-    """Return lines of a udev rule that last: the latency timer, and a name of its own for this adapter.
+    """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
     None for a port that is not a USB adapter. An adapter without a serial number is known by the socket it is plugged
     into, since two of a kind would share a name.
@@ -318,7 +311,9 @@ def stored_contradictions(state: State, want: Wanted | None) -> list[Contradicti
     else:  # a servo that is not a joint of a head has to stay within its own limits
         low, high = (state.values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
         needs = JointNeeds(*((low, high) if low < high else (table.center_ticks, table.center_ticks)))
-    return contradictions(state.values, table, needs if want is None else replace(needs, allowed_faults=want.masked))
+    if want is not None:
+        needs = replace(needs, allowed_faults=frozenset(want.faults.mask))
+    return contradictions(state.values, table, needs)
 
 
 # --- the bus ----------------------------------------------------------------------------------------------------

@@ -95,7 +95,7 @@ class Line:
 
     @property
     def is_terminal(self) -> bool:
-        """Whether it is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
+        """It is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
         return os.path.realpath(self.device).startswith("/dev/pts/")
 
 
@@ -223,8 +223,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
             joint=name,
             model=joint.model,
             model_number=maps[joint.model].model_number,
-            masked=frozenset(head.faults.mask),
-            thresholds={fault: (each.min, each.max) for fault, each in head.faults.thresholds.items()},
+            faults=head.faults,
             needs=JointNeeds(int(low), int(high), safety.stored, ids - {joint.id}, bounded),
         )
     return found

@@ -11,14 +11,14 @@ import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, load_head
 from sfms_robot.emulator.faults import parse_ids
-from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
+from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch, wait
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import BusError, ConfigError
 
@@ -32,40 +32,42 @@ _FORMS: Final = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class EmulateOptions:
-    """The servos to plug in (a head or a list), and how they behave. Each as in `cli.emulate_command`."""
-
-    head: str | None = None
-    servo: str | None = None
-    link: str | None = None
-    timing: Literal["wire", "instant"] = "wire"
-    baud: int | None = None
-    voltage: float | None = None
-    faults: tuple[str, ...] = ()
-    virtual: bool = False
-    behind_silent: Literal["chain_break", "skip"] = "chain_break"
-    seed: int = 0
-    stored: tuple[str, ...] = ()
-    starts: tuple[str, ...] = ()
-
-
 @contextmanager
-def emulators(options: EmulateOptions) -> Iterator[dict[str, Chain]]:
-    """Start the chains, one per bus; a list of servos is the bus "servos". Raises ConfigError, BusError."""
-    wires = _servos(options)
-    faults = _faults(options.faults)
+def emulators(
+    *,
+    head: str | None = None,
+    servo: str | None = None,
+    link: str | None = None,
+    timing: Timing = "wire",
+    baud: int | None = None,
+    voltage: float | None = None,
+    faults: Sequence[str] = (),
+    virtual: bool = False,
+    behind_silent: BehindSilent = "chain_break",
+    seed: int = 0,
+    stored: Sequence[str] = (),
+    starts: Sequence[str] = (),
+) -> Iterator[dict[str, Chain]]:
+    """Start the chains of a head or of a list of servos, one per bus; a list is the bus "servos".
+
+    The arguments are the options of `cli.emulate_command`. Raises ConfigError, BusError.
+    """
+    settings = {key: value for key, value in (("baud", baud), ("supply_v", voltage)) if value is not None}
+    wires = _servos(
+        head, servo, settings, [*(("stored", each) for each in stored), *(("start", each) for each in starts)]
+    )
+    specs = _faults(faults)
     with ExitStack() as stack:
         chains = {}
         for bus, servos in wires.items():
             chain = launch(
                 servos,
-                options.virtual,
-                timing=options.timing,
-                behind_silent=options.behind_silent,
-                faults=faults,
-                seed=options.seed,
-                link=options.link if options.link is None or len(wires) == 1 else f"{options.link}-{bus}",
+                virtual,
+                timing=timing,
+                behind_silent=behind_silent,
+                faults=specs,
+                seed=seed,
+                link=link if link is None or len(wires) == 1 else f"{link}-{bus}",
             )
             chains[bus] = stack.enter_context(chain)
         yield chains
@@ -94,22 +96,23 @@ def until_stopped(chains: Mapping[str, Chain]) -> None:
     raise BusError(f"the emulated chain {wait(list(chains.values())).device} has ended")
 
 
-def _servos(options: EmulateOptions) -> dict[str, list[EmulatedServo]]:
-    if (options.head is None) == (options.servo is None):
+def _servos(
+    head: str | None, servo: str | None, settings: dict[str, Any], changes: Sequence[tuple[str, str]]
+) -> dict[str, list[EmulatedServo]]:
+    """Return the servos of each bus, with `settings`, then with changes (option, text)."""
+    if (head is None) == (servo is None):
         raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
-    if options.head is not None:
+    if head is not None:
         from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
 
-        wires = plugged_in(options.head, load_head(options.head))
+        wires = plugged_in(head, load_head(head))
     else:
-        wires = {"servos": parse_servos(options.servo or "")}
-    settings: dict[str, Any] = {} if options.baud is None else {"baud": options.baud}
-    settings |= {} if options.voltage is None else {"supply_v": options.voltage}
-    out = {bus: [replace(servo, **settings) for servo in servos] for bus, servos in wires.items()}
-    for option, text in [*(("stored", text) for text in options.stored), *(("start", text) for text in options.starts)]:
+        wires = {"servos": parse_servos(servo or "")}
+    out = {bus: [replace(each, **settings) for each in servos] for bus, servos in wires.items()}
+    for option, text in changes:
         ids, register, value = _change(option, text, out)
         for servos in out.values():
-            servos[:] = [_changed(servo, register, value) if servo.id in ids else servo for servo in servos]
+            servos[:] = [_changed(each, register, value) if each.id in ids else each for each in servos]
     return out
 
 
@@ -164,7 +167,7 @@ def _baud(table: FirmwareMap) -> int:
     return USUAL_BAUD if USUAL_BAUD in rates else max(rates)
 
 
-def _faults(texts: tuple[str, ...]) -> list[str]:
+def _faults(texts: Sequence[str]) -> list[str]:
     """Return specs unchanged, and those of a file: one in a line, `#` starts a comment."""
     out: list[str] = []
     for text in texts:
