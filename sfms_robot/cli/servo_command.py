@@ -95,10 +95,9 @@ def scan(
 ) -> None:
     """Find the servos on a wire, and their rates."""
     from sfms_robot.app.servo.serial_line import protocol_hint
-    from sfms_robot.app.servo.single_servo import parse_ids
     from sfms_robot.app.servo.single_servo import scan as look
 
-    asked = parse_ids(ids) if ids is not None else None
+    asked = _parsed(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
         hint = protocol_hint(wire)
         rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
@@ -411,9 +410,9 @@ def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
 
 
 def _parsed(ids: str) -> list[int]:
-    from sfms_robot.app.servo.single_servo import parse_ids
+    from sfms_robot.app.servo.single_servo import checked_ids
 
-    return parse_ids(ids)
+    return checked_ids(ids)
 
 
 def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:

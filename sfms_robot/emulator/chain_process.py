@@ -163,7 +163,7 @@ class Server:
         return self._now_s
 
     def _deliver(self) -> None:
-        """In real time: send what is due. A wire does not wait: bytes that the host does not take are lost."""
+        """Send the answers that are due in real time. Bytes that the host does not take are lost, as on a wire."""
         self._advance(self._now())
         if self._now_s - self._idled_s >= _IDLE_S:
             self._idled_s = self._now_s

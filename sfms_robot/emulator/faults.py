@@ -109,7 +109,7 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
         start_s = now_s if found["start"] is None else float(found["start"])
         end_s = start_s + kind.lasts_s if found["end"] is None else float(found["end"])
         value = kind.value if found["value"] is None else float(found["value"])
-        ids = parse_ids(found["ids"]) if found["ids"] else None
+        ids = frozenset(parse_ids(found["ids"])) if found["ids"] else None
     except ValueError:
         raise refuse("holds a bad number") from None
     if not kind.low <= value <= kind.high:
@@ -119,16 +119,16 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
     return Fault(name, ids, start_s, end_s, value, text.strip())
 
 
-def parse_ids(text: str) -> frozenset[int]:
-    """Read `3,5-7` as {3, 5, 6, 7}. Raises ValueError."""
-    out: set[int] = set()
+def parse_ids(text: str) -> list[int]:
+    """Read `3,5-7` as [3, 5, 6, 7]. Raises ValueError."""
+    out: list[int] = []
     for part in text.split(","):
-        first, _, last = part.partition("-")
+        first, _, last = (each.strip() for each in part.partition("-"))
         ids = range(whole_number(first), whole_number(last or first) + 1)
         if not ids or ids[-1] > 255:
             raise ValueError(f"{part!r} is not a range of ids")
-        out.update(ids)
-    return frozenset(out)
+        out += ids
+    return out
 
 
 class Faults:

@@ -402,7 +402,7 @@ _Measure = Callable[["RegisterServo", float], float]
 
 
 def _moving_status(servo: RegisterServo, now_s: float) -> int:
-    """Bit 0: in position; bit 1: profile in progress; bits 4, 5: none 0, rectangular 1, trapezoidal 3."""
+    """Return bit 0: in position; bit 1: profile in progress; bits 4 and 5: 1 rectangular, 3 trapezoidal profile."""
     drive = servo.drive
     if drive is None or drive.by_speed or abs(drive.goal - servo.plant.position) < _NEAR_TICKS:
         return 0x01

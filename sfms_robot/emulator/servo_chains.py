@@ -295,7 +295,7 @@ class Protocol1Servo(RegisterServo):
         return 0
 
     def _torque_written(self, value: int, locked: bool) -> None:
-        """Feetech: 128 makes the present position the middle. Torque on clears an overload that is over."""
+        """Take the present position for the middle at 128 (Feetech); clear an overload when torque comes on."""
         if value == feetech.CALIBRATE_HERE and "homing_offset" in self.table.fields:
             one_turn = round(self.plant.position % self.table.ticks_per_revolution)
             self._put("homing_offset", one_turn - _CENTER_ON_STS)

@@ -25,7 +25,7 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.serial_line import Wire
-from sfms_robot.app.servo.single_servo import parse_ids, reboot, set_baud, write_register
+from sfms_robot.app.servo.single_servo import checked_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
 from sfms_robot.config import Faults, Threshold, load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
@@ -139,7 +139,7 @@ def test_servos_at_another_rate_are_found_there_and_the_fix_brings_them_home():
         assert told(report, "error") == ["ids 2-3: set to 57600 baud, the head says 1000000"]
         assert fix_of(report, "57600") == "sfms-robot servo set-baud 2-3 1000000 --port /dev/ttyUSB0 --baud 57600"
         with sick.wire() as wire:
-            for servo in parse_ids("2-3"):
+            for servo in checked_ids("2-3"):
                 set_baud(wire.find(servo), BAUD, lambda question: True)
         assert sick.examined()["exit_code"] == 0
 
@@ -476,7 +476,7 @@ def test_findings_alike_are_one_and_the_worst_come_first():
 
 @pytest.mark.parametrize("ids", [[1], [1, 2, 3], [1, 3, 5], [9, 1, 2, 12, 11]])
 def test_ids_are_written_as_the_commands_take_them(ids):
-    assert parse_ids(ids_text(ids)) == sorted(ids)
+    assert checked_ids(ids_text(ids)) == sorted(ids)
 
 
 def test_every_command_that_is_proposed_is_one_that_the_program_has():

@@ -7,8 +7,8 @@ import pytest
 
 from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire
 from sfms_robot.app.servo.single_servo import (
+    checked_ids,
     factory_reset,
-    parse_ids,
     parse_value,
     read_all,
     read_registers,
@@ -95,10 +95,10 @@ def test_a_fixed_rate_is_the_only_one_looked_at():
 
 
 def test_ids_are_parsed_or_explained():
-    assert parse_ids("1,5,10-12") == [1, 5, 10, 11, 12]
+    assert checked_ids("1,5,10-12") == [1, 5, 10, 11, 12]
     for text in ("", "a", "3-1", "1,,2", "-4"):
         with pytest.raises(ConfigError, match="list of ids"):
-            parse_ids(text)
+            checked_ids(text)
 
 
 def test_a_model_without_a_number_is_read_when_somebody_says_what_it_is():

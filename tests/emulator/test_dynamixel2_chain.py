@@ -107,12 +107,6 @@ def test_without_torque_a_goal_moves_nothing(host):
     assert host.read(1, "present_position") == 2001
 
 
-def test_torque_before_a_goal_jumps_to_the_middle(host):
-    host.write(1, "torque_enable", 1)
-    host.t = 2.0
-    assert host.read(1, "present_position") == 2048
-
-
 def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x01\x02")] == [3, 1, 2]
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]

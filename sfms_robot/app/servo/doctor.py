@@ -44,7 +44,6 @@ from sfms_robot.app.servo.serial_line import (
 from sfms_robot.app.servo.single_servo import Progress, State, no_progress, read_all, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
-from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
@@ -184,17 +183,14 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         device = port or only_port()
         yield Line(device=device, shown=device, family=family, baud=baud, rate_hz=DEFAULT_RATE_HZ, wanted={})
         return
-    from sfms_robot.app.wiring import devices, plugged_in  # slow to load, and only a head needs it
+    from sfms_robot.app.open_head import HeadOptions, open_wires  # slow to load, and only a head needs it
 
     described = load_head(head)
-    if port == SIM:
-        plugged = plugged_in(head, described)
-        where = {name: stack.enter_context(launch(servos)).device for name, servos in plugged.items()}
-    else:
-        where = devices(described, port or only_port())
+    where = stack.enter_context(open_wires(described, HeadOptions(head, port or only_port())))
+    if port != SIM:
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
-    for name, device in where.items():
-        bus = described.buses[name]
+    for name, each in where.items():
+        bus, device = described.buses[name], each if isinstance(each, str) else each.device
         yield Line(
             device=device,
             shown=SIM if port == SIM else device,

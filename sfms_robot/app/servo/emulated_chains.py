@@ -122,9 +122,7 @@ def _changed(servo: EmulatedServo, register: str | None, value: int) -> Emulated
     return replace(servo, registers={**servo.registers, register: value})
 
 
-def _change(
-    option: str, text: str, wires: Mapping[str, Sequence[EmulatedServo]]
-) -> tuple[frozenset[int], str | None, int]:
+def _change(option: str, text: str, wires: Mapping[str, Sequence[EmulatedServo]]) -> tuple[set[int], str | None, int]:
     """Return (ids, register, value) of an option. Raises ConfigError for a bad one, and for ids of no servo."""
     found = _CHANGE.fullmatch(text.strip())
     if found is None or (found["register"] is None) != (option == "start"):
@@ -136,9 +134,9 @@ def _change(
     return ids, found["register"], whole_number(found["value"])
 
 
-def _ids(option: str, text: str, ids: str) -> frozenset[int]:
+def _ids(option: str, text: str, ids: str) -> set[int]:
     try:
-        return parse_ids(ids)
+        return set(parse_ids(ids))
     except ValueError:
         raise ConfigError.at("emulate", option, text, f"holds bad ids: {ids!r}", ["0..252"]) from None
 

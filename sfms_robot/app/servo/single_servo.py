@@ -18,6 +18,7 @@ import yaml
 from sfms_robot.app.out_files import checked_file
 from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
 from sfms_robot.config.base import Model, load
+from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
 from sfms_robot.servo.registers import Field
@@ -60,15 +61,12 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
     return found
 
 
-def parse_ids(text: str) -> list[int]:
+def checked_ids(text: str) -> list[int]:
     """Read `1,5,10-18`; return the ids in order. Raises ConfigError."""
-    ids: list[int] = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d{1,3})\s*(?:-\s*(\d{1,3})\s*)?", part)
-        if match is None or (match[2] and int(match[2]) < int(match[1])):
-            raise ConfigError.at("servo tools", "ids", text, "is not a list of ids", ["5", "1-9", "1,5,10-18"])
-        ids += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return ids
+    try:
+        return parse_ids(text)
+    except ValueError:
+        raise ConfigError.at("servo tools", "ids", text, "is not a list of ids", ["5", "1-9", "1,5,10-18"]) from None
 
 
 # --- looking ----------------------------------------------------------------------------------------------------
