@@ -61,6 +61,7 @@ class ControlTable:
     def __init__(self, table: Table, size: int | None = None) -> None:
         self.table = table
         self.raw = bytearray(size or table.size)
+        self._ranges = {name: _value_range(field) for name, field in table.fields.items()}
         self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
         fields = table.fields
         self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
@@ -79,7 +80,8 @@ class ControlTable:
         """Set a register to the nearest value that it can hold; do nothing where the model has no such register."""
         field = self.table.fields.get(name)
         if field is not None:
-            self.raw[field.address : field.address + field.size] = field.to_bytes(_nearest(field, value))
+            low, high = self._ranges[name]
+            self.raw[field.address : field.address + field.size] = field.to_bytes(min(max(value, low), high))
 
     def covered(self, address: int, length: int) -> tuple[Field, ...]:
         """Return the registers that lie, wholly or in part, in a block."""
@@ -108,14 +110,14 @@ class ControlTable:
         return out
 
 
-def _nearest(field: Field, value: int) -> int:
-    """Return the nearest value that fits the register's size and sign rule."""
+def _value_range(field: Field) -> tuple[int, int]:
+    """Return the smallest and the largest value that fit the register's size and sign rule."""
     if field.sign.startswith("sign_bit_"):
         high = (1 << int(field.sign.removeprefix("sign_bit_"))) - 1
-        return min(max(value, -high), high)
+        return -high, high
     bits = 12 if field.sign == "offset_2048" else 8 * field.size
     low = -(1 << bits - 1) if field.signed else 0
-    return min(max(value, low), low + (1 << bits) - 1)
+    return low, low + (1 << bits) - 1
 
 
 # --- modes ----------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ Feetech memory table V3.6 and communication protocol manual.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any, Final
 
@@ -49,6 +49,10 @@ _FULL_TORQUE: Final = 1000
 _NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
 USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
 _SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # up to this highest supply [V] -> usual supply [V]
+_MEASURED: Final = (  # roles and registers that are worked out whenever they are read
+    "present_position", "present_speed", "present_current", "present_load", "present_pwm", "voltage", "temperature",
+    "error_status", "moving", "moving_status", "realtime_tick", "velocity_trajectory", "position_trajectory",
+)  # fmt: skip
 _PENDING: Final = ("registered_instruction", "registered", "async_write_flag")  # 1 from REG WRITE to ACTION
 
 
@@ -76,12 +80,12 @@ class RegisterServo(ABC):
         self._powered, self._tripped = True, False
         self._received_at_s = self._deaf_until_s = 0.0
         self._checks = 0
-        self._measured = {field.name: work for role, work in _MEASURED.items() if (field := table.role(role))}
+        self._measured = {field.name: role for role in _MEASURED if (field := table.role(role))}
         speed = table.role("present_speed")
         per_turn = 60.0 if speed is None or speed.unit == "rpm" else 360.0
-        self.speed_per_tick = per_turn / (table.ticks_per_revolution * (speed.scale if speed else 1.0))
+        self._speed_per_tick = per_turn / (table.ticks_per_revolution * (speed.scale if speed else 1.0))
         current = table.role("present_current")
-        self.current_scale = current.scale or 1.0 if current else 1.0
+        self._current_scale = current.scale or 1.0 if current else 1.0
         named = table.faults if table.protocol == 2 else table.status_faults
         self._bits = USUAL_BITS | {name: 1 << bit for bit, text in named.items() for name in USUAL_BITS if name in text}
         self._reset_registers()
@@ -120,10 +124,43 @@ class RegisterServo(ABC):
         data = b""
         for start, size in self._memory.runs(address, length):
             for field in self._memory.covered(start, size):
-                if (measure := self._measured.get(field.name)) is not None:
-                    self._put(field.name, round(measure(self, now_s)))
+                if (role := self._measured.get(field.name)) is not None:
+                    self._put(field.name, round(self._measure(role, now_s)))
             data += self._memory.raw[start : start + size]
         return 0, data
+
+    def _measure(self, role: str, now_s: float) -> float:
+        """Return the value of a measured register, before it is rounded."""
+        plant, sign, drive = self.plant, self.frame.sign, self.drive
+        match role:
+            case "present_position":
+                return self.frame.shown(plant.position)
+            case "present_speed":
+                return sign * plant.speed * self._speed_per_tick
+            case "present_current":
+                return sign * plant.current_mA() / self._current_scale
+            case "present_load":
+                return 1000.0 * sign * plant.effort
+            case "present_pwm":
+                return 885.0 * sign * plant.speed / self.table.top_speed_ticks_s
+            case "voltage":
+                return 10.0 * self.supply_v
+            case "temperature":
+                return plant.temperature_C
+            case "moving":
+                return plant.speed != 0.0
+            case "moving_status":  # bit 0: in position, bit 1: profile in progress, bits 4 and 5: kind of profile
+                if drive is None or drive.by_speed or abs(drive.goal - plant.position) < _NEAR_TICKS:
+                    return 0x01
+                return 0x02 | (0x30 if drive.profile_acceleration else 0x10) * bool(drive.profile_speed)
+            case "realtime_tick":
+                return int(now_s * 1000.0) & 0x7FFF
+            case "velocity_trajectory":
+                return sign * plant.reference_speed * self._speed_per_tick
+            case "position_trajectory":
+                return self.frame.reported(plant.reference)
+            case _:
+                return self.fault_status
 
     def write(self, address: int, data: bytes, now_s: float) -> int:
         """Return the error, 0 when the data were taken. A Dynamixel changes nothing unless all of it is allowed."""
@@ -253,11 +290,13 @@ class RegisterServo(ABC):
 
     def _advance(self, now_s: float) -> None:
         """Move the motor on; its firmware looks at it on a fixed grid of time, at whatever times it is read."""
-        while self.drive is not None and self._checks * _CHECK_S <= now_s:
+        while self._checks * _CHECK_S <= now_s:
+            if self.drive is None:
+                self._checks = int(now_s / _CHECK_S) + 1
+                break
             self.plant.advance(self._checks * _CHECK_S, self.drive)
             self._checks += 1
             self._watch_motor()
-        self._checks = max(self._checks, int(now_s / _CHECK_S) + 1)
         self.plant.advance(now_s, self.drive)
         if self.drive is None:
             self._watch_motor()
@@ -274,7 +313,7 @@ class RegisterServo(ABC):
         """Return the error of a write to a register, 0 where it is taken. `value`: None for a part of the register."""
 
     def _apply(self, wanted: Mapping[str, int]) -> None:
-        locked = self._get("lock") == 1
+        locked = "lock" in self.table.fields and self._get("lock") == 1
         for name, value in wanted.items():
             self._store(name, value, locked)
         torque = self.table.role("torque_enable")
@@ -394,33 +433,3 @@ class RegisterServo(ABC):
         field = self.table.role(role)
         if field is not None:
             self._put(field.name, value)
-
-
-# --- measured registers ---------------------------------------------------------------------------------------------
-
-_Measure = Callable[["RegisterServo", float], float]
-
-
-def _moving_status(servo: RegisterServo, now_s: float) -> int:
-    """Return bit 0: in position; bit 1: profile in progress; bits 4 and 5: 1 rectangular, 3 trapezoidal profile."""
-    drive = servo.drive
-    if drive is None or drive.by_speed or abs(drive.goal - servo.plant.position) < _NEAR_TICKS:
-        return 0x01
-    return 0x02 | (0 if not drive.profile_speed else 0x30 if drive.profile_acceleration else 0x10)
-
-
-_MEASURED: Final[Mapping[str, _Measure]] = {  # by role or register; worked out whenever it is read
-    "realtime_tick": lambda servo, now_s: int(now_s * 1000.0) & 0x7FFF,
-    "moving": lambda servo, now_s: servo.plant.speed != 0.0,
-    "moving_status": _moving_status,
-    "present_pwm": lambda servo, now_s: 885.0 * servo.frame.sign * servo.plant.speed / servo.table.top_speed_ticks_s,
-    "present_current": lambda servo, now_s: servo.frame.sign * servo.plant.current_mA() / servo.current_scale,
-    "present_load": lambda servo, now_s: 1000.0 * servo.frame.sign * servo.plant.effort,
-    "present_speed": lambda servo, now_s: servo.frame.sign * servo.plant.speed * servo.speed_per_tick,
-    "present_position": lambda servo, now_s: servo.frame.shown(servo.plant.position),
-    "velocity_trajectory": lambda servo, now_s: servo.frame.sign * servo.plant.reference_speed * servo.speed_per_tick,
-    "position_trajectory": lambda servo, now_s: servo.frame.reported(servo.plant.reference),
-    "voltage": lambda servo, now_s: 10.0 * servo.supply_v,
-    "temperature": lambda servo, now_s: servo.plant.temperature_C,
-    "error_status": lambda servo, now_s: servo.fault_status,
-}

@@ -8,7 +8,7 @@ False, the others answer. Two servos with one id obey both; Dynamixels of Protoc
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
 from typing import Final, Generic, TypeVar
 
@@ -51,9 +51,13 @@ class ServoChain(Device, Generic[S]):
         self._buffer += data
         return list(self._obey_all(baud, now_s))
 
-    def _listening(self, baud: int | None, now_s: float) -> list[S]:
-        """Return the servos that receive a packet now; without any, the buffer holds noise of another baud."""
-        listening = [servo for servo in self.servos if servo.hears(baud, now_s)]
+    def _listening(self, baud: int | None, now_s: float) -> dict[int, list[S]]:
+        """Return the servos that receive a packet now, by id; without any, the buffer holds noise of another baud."""
+        listening: dict[int, list[S]] = {}
+        for servo in self.servos:
+            if servo.hears(baud, now_s):
+                servo.feed_watchdog(now_s)
+                listening.setdefault(servo.id, []).append(servo)
         if not listening:
             self._buffer.clear()
         return listening
@@ -76,10 +80,6 @@ class ServoChain(Device, Generic[S]):
         if code == protocol1.REG_WRITE:
             return servo.register(self._number(params, 0), params[self._width :]), b"", 2
         return (servo.action(now_s), b"", 2) if code == protocol1.ACTION else None
-
-
-def _of(servos: Iterable[S], servo_id: int) -> list[S]:
-    return [servo for servo in servos if servo.id == servo_id]
 
 
 # --- Protocol 2.0 ---------------------------------------------------------------------------------------------------
@@ -138,21 +138,23 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             if packet.instruction == dxl2.STATUS:
                 continue
             listening = self._listening(baud, now_s)
-            for servo in listening:
-                servo.feed_watchdog(now_s)
             try:
                 yield from self._answers(packet, listening, now_s)
             except IndexError:
                 continue  # parameters are missing: no servo knows what was meant
 
-    def _answers(self, packet: dxl2.Packet, listening: list[Dynamixel2Servo], now_s: float) -> Iterator[Reply]:
+    def _answers(
+        self, packet: dxl2.Packet, listening: dict[int, list[Dynamixel2Servo]], now_s: float
+    ) -> Iterator[Reply]:
         code, params, number = packet.instruction, packet.params, self._number
+        followers: dict[int, list[Dynamixel2Servo]] = {}  # the second id of a servo obeys, and never answers
+        for servo in (servo for each in listening.values() for servo in each if servo.second_id is not None):
+            followers.setdefault(servo.second_id or 0, []).append(servo)
         if code in (dxl2.SYNC_WRITE, dxl2.BULK_WRITE):
             parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
             for servo_id, address, data in parts:
-                for servo in listening:
-                    if servo_id in (servo.id, servo.second_id):
-                        servo.write(address, data, now_s)
+                for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
+                    servo.write(address, data, now_s)
         elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
             requests = [(servo_id, number(params, 0), number(params, 1)) for servo_id in params[4:]]
             yield from self._reads(requests, code == dxl2.FAST_SYNC_READ, listening, now_s)
@@ -162,14 +164,14 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             yield from self._reads(requests, code == FAST_BULK_READ, listening, now_s)
         elif packet.servo == dxl2.BROADCAST:
             last = 0
-            for servo_id in sorted({servo.id for servo in listening}):
-                for reply in self._together(_of(listening, servo_id), code, params, now_s, broadcast=True):
+            for servo_id in sorted(listening):
+                for reply in self._together(listening[servo_id], code, params, now_s, broadcast=True):
                     yield reply._replace(pause_s=reply.pause_s + _SLOT_S * (servo_id - last))
                     last = servo_id
-        else:  # the second id of a servo obeys, and never answers
-            for servo in [servo for servo in listening if servo.second_id == packet.servo]:
+        else:
+            for servo in followers.get(packet.servo, ()):
                 self._single(servo, code, params, now_s)
-            yield from self._together(_of(listening, packet.servo), code, params, now_s)
+            yield from self._together(listening.get(packet.servo, []), code, params, now_s)
 
     def _sync_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
         """Yield (id, address, data) of a sync write."""
@@ -185,7 +187,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             params = params[5 + length :]
 
     def _reads(
-        self, requests: Sequence[Request], fast: bool, listening: list[Dynamixel2Servo], now_s: float
+        self, requests: Sequence[Request], fast: bool, listening: dict[int, list[Dynamixel2Servo]], now_s: float
     ) -> Iterator[Reply]:
         """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
 
@@ -194,7 +196,9 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
         parts: list[tuple[int, int, bytes]] = []
         pause_s = 0.0
         for servo_id, address, length in requests:
-            there = [servo for servo in _of(listening, servo_id) if servo.answers(1) and not (fast and _is_old(servo))]
+            there = [
+                servo for servo in listening.get(servo_id, ()) if servo.answers(1) and (_is_new(servo) or not fast)
+            ]
             if not there and (self.chain_break or fast):
                 break
             answers = [(servo, *servo.read(address, length, now_s)) for servo in there]
@@ -250,8 +254,9 @@ def _alerted(servo: Dynamixel2Servo, error: int) -> int:
     return error | (dxl2.ALERT if servo.fault_status else 0)
 
 
-def _is_old(servo: Dynamixel2Servo) -> bool:
-    return servo.firmware < _FAST_FIRMWARE or "operating_mode" not in servo.table.fields
+def _is_new(servo: Dynamixel2Servo) -> bool:
+    """Return whether a servo knows fast reads."""
+    return servo.firmware >= _FAST_FIRMWARE and "operating_mode" in servo.table.fields
 
 
 def _collided(packets: Sequence[bytes]) -> bytes:
@@ -270,18 +275,15 @@ class Protocol1Servo(RegisterServo):
     _beyond = _unknown = dxl1.RANGE
 
     def __init__(self, what: EmulatedServo, table: Table) -> None:
-        self._nothing_registered = 0 if table.family == "feetech" else dxl1.INSTRUCTION
+        is_feetech = table.family == "feetech"
+        self._nothing_registered = 0 if is_feetech else dxl1.INSTRUCTION
+        # MX knows bulk read, AX does not; their tables differ in the multi-turn registers. STS knows sync read, the
+        # turn counter and the calibration of its middle, SCS does not.
+        self.is_sts = is_feetech and table.byte_order == "little"
+        self.group_reads = {feetech.SYNC_READ} if self.is_sts else set()
+        if not is_feetech and "multi_turn_offset" in table.fields:
+            self.group_reads = {dxl1.BULK_READ}
         super().__init__(what, table)
-
-    @property
-    def is_bulk_reader(self) -> bool:
-        """The MX series knows bulk read, AX does not; their tables differ in the multi-turn registers."""
-        return not self._is_feetech and "multi_turn_offset" in self.table.fields
-
-    @property
-    def is_sync_reader(self) -> bool:
-        """Feetech's little-endian series knows sync read."""
-        return self._is_feetech and self.table.byte_order == "little"
 
     def _refusal(self, field: Field, value: int | None) -> int:
         if value is None or not field.writable:
@@ -326,32 +328,34 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
             except IndexError:
                 continue  # parameters are missing: no servo knows what was meant
 
-    def _answers(self, frame: protocol1.Frame, listening: list[Protocol1Servo], now_s: float) -> Iterator[Reply]:
+    def _answers(
+        self, frame: protocol1.Frame, listening: dict[int, list[Protocol1Servo]], now_s: float
+    ) -> Iterator[Reply]:
         code, params = frame.code, frame.params
         if code == protocol1.SYNC_WRITE:
             address, parts = dxl1.sync_write_parts(params)
             for servo_id, data in parts:
-                for servo in _of(listening, servo_id):
+                for servo in listening.get(servo_id, ()):
                     servo.write(address, data, now_s)
         elif code == feetech.SYNC_READ:
             address, length, ids = feetech.sync_read_parts(params)
-            readers = [servo for servo in listening if servo.is_sync_reader]
-            yield from self._group([(servo_id, address, length) for servo_id in ids], readers, now_s)
+            yield from self._group([(servo_id, address, length) for servo_id in ids], code, listening, now_s)
         elif code == dxl1.BULK_READ:
-            readers = [servo for servo in listening if servo.is_bulk_reader]
-            yield from self._group(dxl1.bulk_read_parts(params), readers, now_s)
+            yield from self._group(dxl1.bulk_read_parts(params), code, listening, now_s)
         elif frame.servo == protocol1.BROADCAST:
-            for servo in sorted(listening, key=lambda servo: servo.id):
+            for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
                 answers = list(self._single(servo, code, params, now_s))
                 if code == protocol1.PING and servo.table.family == "feetech":
                     yield from answers
         else:
-            for servo in _of(listening, frame.servo):
+            for servo in listening.get(frame.servo, ()):
                 yield from self._single(servo, code, params, now_s)
 
-    def _group(self, requests: Sequence[Request], readers: list[Protocol1Servo], now_s: float) -> Iterator[Reply]:
+    def _group(
+        self, requests: Sequence[Request], code: int, listening: dict[int, list[Protocol1Servo]], now_s: float
+    ) -> Iterator[Reply]:
         for servo_id, address, length in requests:
-            there = [servo for servo in _of(readers, servo_id) if servo.answers(1)]
+            there = [servo for servo in listening.get(servo_id, ()) if code in servo.group_reads and servo.answers(1)]
             if there:
                 yield _status(there[0], servo_id, *there[0].read(address, length, now_s))
             elif self.chain_break:
@@ -371,10 +375,10 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
             level = 0
         elif code == protocol1.FACTORY_RESET:
             servo.factory_reset(now_s)
-        elif code == feetech.CALIBRATE_OFFSET and servo.is_sync_reader:
+        elif code == feetech.CALIBRATE_OFFSET and servo.is_sts:
             torque = servo.table["torque_enable"]
             error = servo.write(torque.address, torque.to_bytes(feetech.CALIBRATE_HERE), now_s)
-        elif code == feetech.RESET_TURNS and servo.is_sync_reader:
+        elif code == feetech.RESET_TURNS and servo.is_sts:
             servo.forget_turns(now_s)
         elif is_feetech:
             return

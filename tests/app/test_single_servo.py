@@ -16,7 +16,7 @@ from sfms_robot.app.servo.single_servo import (
     scan,
     set_baud,
     set_id,
-    watch,
+    watched,
     write_register,
 )
 from sfms_robot.config import load_firmware_map
@@ -298,9 +298,9 @@ def test_a_reboot_forgets_a_fault_and_asks_before_it_lets_go(three):
     with pytest.raises(ConfigError, match="lets go"):
         reboot(wire.find(1), no)
     chain.fault(1, 0x20)
-    assert watch([wire.find(1)])[0]["faults"] == "overload"
+    assert watched(wire.find(1))["faults"] == "overload"
     assert reboot(wire.find(1), yes).id == 1
-    assert watch([wire.find(1)])[0]["faults"] == ""
+    assert watched(wire.find(1))["faults"] == ""
 
 
 @pytest.mark.parametrize(("keep", "servo", "baud"), [("all", 1, 57_600), ("keep-id", 7, 57_600),
@@ -326,7 +326,7 @@ def test_watching_shows_position_supply_and_who_fell_silent(three):
     servos = [wire.find(1), wire.find(7)]
     chain.kill(7)
     before = chain.digest()
-    one, seven = watch(servos)
+    one, seven = (watched(seen) for seen in servos)
     assert one["position"] == 2048 and one["position_deg"] == 180.0 and one["torque"] is False
     assert 3.0 < one["voltage_V"] < 9.0 and one["temperature_degC"] > 0 and one["faults"] == ""
     assert seven["faults"] == "silent" and seven["position"] is None

@@ -145,22 +145,18 @@ def read_all(seen: FoundServo) -> State:
     return State.of(seen, 0, data, error)
 
 
-def watch(servos: Sequence[FoundServo]) -> list[dict[str, Any]]:
-    """Return one row per servo: its position and health; `silent` for one that does not answer."""
-    return [_watched(seen) for seen in servos]
-
-
 def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[dict[str, Any]]]:
-    """Yield `watch` every `period_s`, `count` times or without end."""
+    """Yield a row per servo (`watched`) every `period_s`, `count` times or without end."""
     clock = servos[0].wire.clock
     due_s = clock.now_s()
     for _ in range(count) if count is not None else itertools.count():
         clock.wait_until(due_s)
-        yield watch(servos)
+        yield [watched(seen) for seen in servos]
         due_s = max(due_s + period_s, clock.now_s())
 
 
-def _watched(seen: FoundServo) -> dict[str, Any]:
+def watched(seen: FoundServo) -> dict[str, Any]:
+    """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
     names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
     if seen.table is None or not names:
         return State(seen, {}).row("no firmware map")
