@@ -282,7 +282,7 @@ class RegisterServo(ABC):
             self._advance(trip_s)
             self._put("bus_watchdog", -1)
             self._tripped = True
-            if self.table.watchdog != "flags_only":
+            if self.table.watchdog != "flags_only":  # firmware from 53 on stops where it is
                 self._put("goal_position", round(self.frame.reported(self.plant.position)))
                 self._put("goal_velocity", 0)
             self._settings()
@@ -334,7 +334,7 @@ class RegisterServo(ABC):
         field = self.table[name]
         if locked and not self._is_feetech and (field.eeprom or name == "lock"):
             return  # a Dynamixel that is locked stays locked until its supply is switched off
-        if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:
+        if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:  # clipped, not refused
             value = min(max(value, self._lowest), self._highest) if self._lowest < self._highest else value
         self._put(name, value)
         if field.eeprom and not locked:
@@ -386,7 +386,7 @@ class RegisterServo(ABC):
             if not field.eeprom:
                 self._put(field.name, field.initial)
         self._put_role("torque_enable", 0)
-        self._put("goal_position", self.table.center_ticks)
+        self._put("goal_position", self.table.center_ticks)  # the least helpful goal: torque would be a jump
         self._put_role("torque_limit", self._get("max_torque") or _FULL_TORQUE)
         self._settings()
         self._watch_supply()
@@ -413,6 +413,7 @@ class RegisterServo(ABC):
         self.torque = self._role("torque_enable")
         self._watchdog, self._hottest_C = get("bus_watchdog"), get("temperature_limit")
         self._lowest, self._highest = angle_limits(self._memory)
+        # Drive mode (10) of Protocol 2.0; the others always switch torque on by a goal.
         drive_mode = get("drive_mode") if self.table.protocol == 2 else TORQUE_ON_BY_GOAL
         self._goal_enables, self._by_time = bool(drive_mode & TORQUE_ON_BY_GOAL), bool(drive_mode & 0x04)
         self._mode = mode_of(self._memory)

@@ -8,9 +8,9 @@ False, the others answer. Two servos with one id obey both; Dynamixels of Protoc
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import reduce
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from sfms_robot.emulator.control_table import Mode
 from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, Reply
@@ -37,6 +37,7 @@ class ServoChain(Device, Generic[S]):
 
     _servo_class: type[S]
     _width: int  # bytes of an address and of a length in the parameters of an instruction
+    _decode: Callable[[bytearray], Any]  # takes a whole packet off the front of a buffer, or returns None
 
     def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> None:
         self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
@@ -62,9 +63,18 @@ class ServoChain(Device, Generic[S]):
             self._buffer.clear()
         return listening
 
-    @abstractmethod
     def _obey_all(self, baud: int | None, now_s: float) -> Iterator[Reply]:
         """Yield the answers to the whole packets in the buffer, which are taken out of it."""
+        while (packet := self._decode(self._buffer)) is not None:
+            listening = self._listening(baud, now_s)
+            try:
+                yield from self._answers(packet, listening, now_s)
+            except IndexError:
+                continue  # parameters are missing: no servo knows what was meant
+
+    @abstractmethod
+    def _answers(self, packet: Any, listening: dict[int, list[S]], now_s: float) -> Iterator[Reply]:
+        """Yield the answers to a packet of the servos that receive it, by id."""
 
     def _number(self, params: bytes, index: int) -> int:
         """Return an address or a length. Raises IndexError where it is missing."""
@@ -103,25 +113,27 @@ class Dynamixel2Servo(RegisterServo):
 
     def _refusal(self, field: Field, value: int | None) -> int:
         name = field.name
-        if not field.writable or (field.eeprom and self.torque):
+        if not field.writable or (field.eeprom and self.torque):  # "EEPROM Area": only while Torque Enable (64) is 0
             return dxl2.ACCESS_ERROR
         if value is None:
             return dxl2.DATA_LENGTH_ERROR
-        if not field.low <= value <= field.high or (name == "bus_watchdog" and value < 0):
+        if not field.low <= value <= field.high or (name == "bus_watchdog" and value < 0):  # -1 only reports a trip
             return dxl2.DATA_RANGE_ERROR
+        # "Bus Watchdog (98)": after a trip all goals are refused until it is set to 0.
         if self._tripped and (name == "goal_position" or name in _LIMITED):
             return dxl2.DATA_RANGE_ERROR
-        if name == "goal_position" and self._mode is Mode.JOINT:
+        if name == "goal_position" and self._mode is Mode.JOINT:  # Min and Max Position Limit (52, 48)
             return 0 if self._lowest <= value <= self._highest else dxl2.DATA_LIMIT_ERROR
         if (limit := _LIMITED.get(name, "")) in self.table.fields and abs(value) > self._get(limit):
             return dxl2.DATA_LIMIT_ERROR
+        # "Shutdown (63)": torque stays off until a reboot.
         return dxl2.ACCESS_ERROR if name == "torque_enable" and value and self._shut_down() else 0
 
     def _apply(self, wanted: Mapping[str, int]) -> None:
         if "bus_watchdog" in wanted:
             self._tripped = False
         super()._apply(wanted)
-        if "operating_mode" in wanted:
+        if "operating_mode" in wanted:  # "Operating Mode (11)": a change resets gains, profile and goals
             for name in _RESET_BY_MODE:
                 self._put(name, 0)
             self._put("goal_position", round(self.frame.reported(self.plant.position)))
@@ -131,34 +143,26 @@ class Dynamixel2Servo(RegisterServo):
 class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
     """Servos that speak Protocol 2.0."""
 
-    _servo_class, _width = Dynamixel2Servo, 2
-
-    def _obey_all(self, baud: int | None, now_s: float) -> Iterator[Reply]:
-        while (packet := dxl2.maybe_packet(self._buffer)) is not None:
-            if packet.instruction == dxl2.STATUS:
-                continue
-            listening = self._listening(baud, now_s)
-            try:
-                yield from self._answers(packet, listening, now_s)
-            except IndexError:
-                continue  # parameters are missing: no servo knows what was meant
+    _servo_class, _width, _decode = Dynamixel2Servo, 2, staticmethod(dxl2.maybe_packet)
 
     def _answers(
         self, packet: dxl2.Packet, listening: dict[int, list[Dynamixel2Servo]], now_s: float
     ) -> Iterator[Reply]:
         code, params, number = packet.instruction, packet.params, self._number
+        if code == dxl2.STATUS:
+            return
         followers: dict[int, list[Dynamixel2Servo]] = {}  # the second id of a servo obeys, and never answers
         for servo in (servo for each in listening.values() for servo in each if servo.second_id is not None):
             followers.setdefault(servo.second_id or 0, []).append(servo)
-        if code in (dxl2.SYNC_WRITE, dxl2.BULK_WRITE):
+        if code in (dxl2.SYNC_WRITE, dxl2.BULK_WRITE):  # nothing answers
             parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
             for servo_id, address, data in parts:
                 for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
                     servo.write(address, data, now_s)
-        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
+        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):  # address (2), length (2), then ids
             requests = [(servo_id, number(params, 0), number(params, 1)) for servo_id in params[4:]]
             yield from self._reads(requests, code == dxl2.FAST_SYNC_READ, listening, now_s)
-        elif code in (dxl2.BULK_READ, FAST_BULK_READ):
+        elif code in (dxl2.BULK_READ, FAST_BULK_READ):  # id, address (2), length (2) of each
             starts = range(0, len(params), 5)
             requests = [(params[i], number(params[i + 1 :], 0), number(params[i + 1 :], 1)) for i in starts]
             yield from self._reads(requests, code == FAST_BULK_READ, listening, now_s)
@@ -175,13 +179,13 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
 
     def _sync_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
         """Yield (id, address, data) of a sync write."""
-        address, length = self._number(params, 0), self._number(params, 1)
+        address, length = self._number(params, 0), self._number(params, 1)  # then id and data of each
         for start in range(4, len(params) - length, length + 1):
             yield params[start], address, params[start + 1 : start + 1 + length]
 
     def _bulk_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
         """Yield (id, address, data) of a bulk write."""
-        while params:
+        while params:  # id, address (2), length (2), data
             length = self._number(params[1:], 1)
             yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
             params = params[5 + length :]
@@ -227,7 +231,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
     ) -> bytes | None:
         """Let one servo obey an instruction; return its answer, or None."""
         servo_id, result = servo.id, (dxl2.INSTRUCTION_ERROR, b"", 2)
-        if code == dxl2.PING:
+        if code == dxl2.PING:  # answered at any status return level: model number (2), firmware (1)
             servo.advance(now_s)
             number = servo.table.model_number or 0
             result = 0, number.to_bytes(2, "little") + bytes([servo.firmware]), 0
@@ -288,9 +292,11 @@ class Protocol1Servo(RegisterServo):
     def _refusal(self, field: Field, value: int | None) -> int:
         if value is None or not field.writable:
             return dxl1.RANGE
+        # Register 44 of a Feetech is a time, and in PWM mode a duty with a sign bit.
         signed_duty = field.name == "goal_time" and self._mode is Mode.PWM
         if not (-field.high if signed_duty else field.low) <= value <= field.high:
             return dxl1.RANGE
+        # A Feetech moves to the nearer limit instead; equal limits are wheel or multi-turn mode.
         if field.name == "goal_position" and not self._is_feetech:
             lowest, highest = self._lowest, self._highest
             return 0 if lowest == highest or lowest <= value <= highest else dxl1.ANGLE_LIMIT
@@ -304,7 +310,7 @@ class Protocol1Servo(RegisterServo):
             if not locked:
                 self._keep(self.table["homing_offset"])
             self._put_role("torque_enable", 0)
-        elif value == 1 and self._role("torque_limit", 1):
+        elif value == 1 and self._role("torque_limit", 1):  # "Shutdown (18)": first a torque limit, then torque
             self.fault_status &= ~self._bits["overload"]
             if self._shut_down():
                 self._put_role("torque_enable", 0)
@@ -312,26 +318,18 @@ class Protocol1Servo(RegisterServo):
     def _fail(self, bits: int) -> None:
         super()._fail(bits)
         if self._shut_down() and not self._is_feetech:
-            self._put_role("torque_limit", 0)  # stays 0 when torque is switched on again
+            self._put_role("torque_limit", 0)  # "Torque Limit (34)" is 0 after a shutdown, until a host sets it
 
 
 class Protocol1Chain(ServoChain[Protocol1Servo]):
     """Servos that speak the FF FF frame. Frames of Protocol 2.0 on the same wire look like noise to them."""
 
-    _servo_class, _width = Protocol1Servo, 1
-
-    def _obey_all(self, baud: int | None, now_s: float) -> Iterator[Reply]:
-        listening = self._listening(baud, now_s)
-        while (frame := protocol1.maybe_frame(self._buffer)) is not None:
-            try:
-                yield from self._answers(frame, listening, now_s)
-            except IndexError:
-                continue  # parameters are missing: no servo knows what was meant
+    _servo_class, _width, _decode = Protocol1Servo, 1, staticmethod(protocol1.maybe_frame)
 
     def _answers(
-        self, frame: protocol1.Frame, listening: dict[int, list[Protocol1Servo]], now_s: float
+        self, packet: protocol1.Frame, listening: dict[int, list[Protocol1Servo]], now_s: float
     ) -> Iterator[Reply]:
-        code, params = frame.code, frame.params
+        target, code, params = packet
         if code == protocol1.SYNC_WRITE:
             address, parts = dxl1.sync_write_parts(params)
             for servo_id, data in parts:
@@ -342,13 +340,13 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
             yield from self._group([(servo_id, address, length) for servo_id in ids], code, listening, now_s)
         elif code == dxl1.BULK_READ:
             yield from self._group(dxl1.bulk_read_parts(params), code, listening, now_s)
-        elif frame.servo == protocol1.BROADCAST:
+        elif target == protocol1.BROADCAST:
             for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
                 answers = list(self._single(servo, code, params, now_s))
                 if code == protocol1.PING and servo.table.family == "feetech":
                     yield from answers
         else:
-            for servo in listening.get(frame.servo, ()):
+            for servo in listening.get(target, ()):
                 yield from self._single(servo, code, params, now_s)
 
     def _group(
