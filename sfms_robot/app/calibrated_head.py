@@ -11,7 +11,6 @@ from contextlib import suppress
 from typing import Final
 
 from sfms_robot.app.servo.serial_line import FoundServo, Wire
-from sfms_robot.app.servo.single_servo import read
 from sfms_robot.app.wiring import SIM, devices, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.head import held_back
@@ -100,19 +99,19 @@ def _identity(port: Port, family: str, baud: int, joint: Joint, clock: Clock) ->
     expected = load_firmware_map(joint.model)
     model = joint.model if seen.model_number in (None, expected.model_number) else seen.model
     table = Table.of(expected) if seen.table is None or seen.model_number == expected.model_number else seen.table
-    drive_mode = _register(wire, seen, table, "drive_mode")
+    drive_mode = _register(seen, table, "drive_mode")
     return Identity(
         id=joint.id,
         model=model,
         firmware=seen.firmware,
-        homing_offset=_register(wire, seen, table, "homing_offset"),
+        homing_offset=_register(seen, table, "homing_offset"),
         drive_mode=None if drive_mode is None else drive_mode & _REVERSED,
     )
 
 
-def _register(wire: Wire, seen: FoundServo, table: Table, name: str) -> int | None:
+def _register(seen: FoundServo, table: Table, name: str) -> int | None:
     with suppress(ServoError):
-        return read(wire, seen, table.fields[name]) if name in table.fields else None
+        return seen.read(table.fields[name]) if name in table.fields else None
     return None
 
 

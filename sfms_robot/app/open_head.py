@@ -35,8 +35,6 @@ from sfms_robot.ports import Bus, Clock
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.safety import HeatGuard
-from sfms_robot.servo.absent_bus import LEFT_OUT, AbsentBus
-from sfms_robot.runtime.heat import HeatGuard
 from sfms_robot.servo.bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.discovery import access_problem

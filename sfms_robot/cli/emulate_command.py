@@ -28,7 +28,7 @@ def emulate(
     timing: Timing = typer.Option(
         Timing.wire, help="Replies in the time that bytes and return delays take, or at once."
     ),
-    baud: int | None = typer.Option(None, min=1, help="What the servos are set to; default: the head's, or 1 Mbit/s."),
+    baud: int | None = typer.Option(None, min=1, help="Rate of the servos; default: the head's, or 1 Mbit/s."),
     voltage: float | None = typer.Option(None, min=0.0, help="Supply; default: one the servos are content with."),
     fault: list[str] = typer.Option(
         [], help="KIND[:IDS][@START[-END]][=VALUE], as in drop:3@2-4=0.5, or a FILE of such lines. Repeatable."
@@ -40,34 +40,34 @@ def emulate(
         [], help="IDS=TICKS: where servos are found, outside their limits or beyond one turn, too. Repeatable."
     ),
     behind_silent: BehindSilent = typer.Option(
-        BehindSilent.chain_break, help="Whether the ids behind a silent one in a sync read are silent too."
+        BehindSilent.chain_break, help="In a sync read, ids behind a silent one are silent too, or answer."
     ),
     virtual: bool = typer.Option(False, help="Virtual time: answers only through the control socket."),
-    seed: int = typer.Option(0, min=0, help="Of the faults that are left to chance."),
+    seed: int = typer.Option(0, min=0, help="Seed of the faults that are left to chance."),
     json: bool = typer.Option(False, "--json", help="Print devices and servos as one JSON object when all is up."),
 ) -> None:
     """Serve emulated servos until SIGTERM or Ctrl-C; prints the device to open, one line per bus."""
-    from sfms_robot.app.servo.emulated_chains import EmulateOptions, described, emulators, until_stopped
+    from sfms_robot.app.servo.emulated_chains import described, emulators, until_stopped
 
-    options = EmulateOptions(
-        head,
-        servo,
-        link,
-        cast(Any, timing.value),
-        baud,
-        voltage,
-        tuple(fault),
-        virtual,
-        cast(Any, behind_silent.value),
-        seed,
-        tuple(stored),
-        tuple(start),
+    chains = emulators(
+        head=head,
+        servo=servo,
+        link=link,
+        timing=cast(Any, timing.value),
+        baud=baud,
+        voltage=voltage,
+        faults=fault,
+        virtual=virtual,
+        behind_silent=cast(Any, behind_silent.value),
+        seed=seed,
+        stored=stored,
+        starts=start,
     )
-    with emulators(options) as chains:
+    with chains as running:
         if json:
-            print_json(described(chains, head))
+            print_json(described(running, head))
         else:
-            for bus, chain in chains.items():
-                print(chain.device if len(chains) == 1 else f"{bus}={chain.device}", flush=True)
+            for bus, chain in running.items():
+                print(chain.device if len(running) == 1 else f"{bus}={chain.device}", flush=True)
                 print(f"control socket of {bus}: {chain.control}", file=sys.stderr)
-        until_stopped(chains)
+        until_stopped(running)

@@ -20,7 +20,6 @@ from sfms_robot.cli import (
     bench_command,
     data_command,
     demo_command,
-    doctor_command,
     emulate_command,
     evaluate_command,
     export_command,
@@ -55,7 +54,7 @@ app.command("serve")(serve_command.serve)
 app.command("export")(export_command.export)
 app.command("replay")(replay_command.replay)
 app.command("emulate")(emulate_command.emulate)
-app.command("doctor")(doctor_command.doctor)
+app.command("doctor")(servo_command.doctor)
 app.command("bench", epilog=bench_command.EPILOG)(bench_command.bench)
 app.add_typer(fleet_command.app, name="fleet")
 app.add_typer(head_command.app, name="head")

@@ -1,17 +1,20 @@
-"""`sfms-robot servo`: find servos, look into them, change them."""
+"""`sfms-robot servo`: find servos, look into them, change them; `sfms-robot doctor`: look before a run."""
 
 from __future__ import annotations
 
+import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sfms_robot.cli.json_line import print_json
-from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -22,6 +25,12 @@ app = typer.Typer(help="Servos: find them, read and write their registers, set i
 _SHOWN = ("model", "family", "protocol", "number", "firmware", "watchdog")  # the rest is in --json
 
 
+class Family(StrEnum):
+    dynamixel2 = "dynamixel2"
+    dynamixel1 = "dynamixel1"
+    feetech = "feetech"
+
+
 class Keep(StrEnum):
     all = "all"
     id = "keep-id"
@@ -29,7 +38,53 @@ class Keep(StrEnum):
 
 
 Ids = Annotated[str, typer.Argument(metavar="ID", help="One id, or several: 1-9,12.")]
+OneId = Annotated[int, typer.Argument(metavar="ID")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before EEPROM is written.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wiring:
+    """Where the servos of a command are. A field is an option of every command."""
+
+    port: Annotated[
+        str | None, typer.Option("--port", help="Serial device, or 'sim'. Default: the only one there is.")
+    ] = None
+    baud: Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: at all.")] = None
+    family: Annotated[Family, typer.Option("--family", help="The protocol of the servos.")] = Family.dynamixel2
+    head: Annotated[str, typer.Option("--head", help="The head whose servos --port sim emulates.")] = "face28"
+    model: Annotated[
+        str | None, typer.Option("--model", help="Take the servos for this model. Default: by their model number.")
+    ] = None
+    json: JsonOption = False
+
+    @contextmanager
+    def open(self) -> Iterator[Wire]:
+        """Open the wire to the servos."""
+        from sfms_robot.app.servo.serial_line import open_wire
+
+        with open_wire(self.port, self.family.value, self.baud, self.head, self.model) as wire:
+            yield wire
+
+
+def on_wire(command: Callable[..., None]) -> Callable[..., None]:
+    """Return `command(wiring, ...)` as typer is to see it: with the options of `Wiring` behind its own."""
+    own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+    shared = list(inspect.signature(Wiring, eval_str=True).parameters.values())
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        wiring = Wiring(**{field.name: given.pop(field.name) for field in fields(Wiring)})
+        command(wiring, **given)
+
+    seen = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *shared)]
+    run.__dict__.pop("__wrapped__")  # or its signature would be looked at instead
+    run.__signature__ = inspect.Signature(seen)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in seen}
+    return run
+
+
+# --- looking ----------------------------------------------------------------------------------------------------
 
 
 @app.command()
@@ -38,12 +93,11 @@ def scan(
     on: Wiring,
     ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
 ) -> None:
-    """Who is there, at which rate."""
-    from sfms_robot.app.servo.protocol_hint import protocol_hint
-    from sfms_robot.app.servo.single_servo import parse_ids
+    """Find the servos on a wire, and their rates."""
+    from sfms_robot.app.servo.serial_line import protocol_hint
     from sfms_robot.app.servo.single_servo import scan as look
 
-    asked = parse_ids(ids) if ids is not None else None
+    asked = _parsed(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
         hint = protocol_hint(wire)
         rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
@@ -55,15 +109,15 @@ def scan(
 @app.command()
 @on_wire
 def ping(on: Wiring, ids: Ids) -> None:
-    """Whether servos answer, and who they are."""
+    """Check that servos answer, and show their models."""
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
         for servo in _parsed(ids):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
-                rows.append({"id": servo, "model": None, "model_number": None, "firmware": None, "baud": None,
-                             "note": "", "answers": False})  # fmt: skip
+                unknown = dict.fromkeys(("model", "model_number", "firmware", "baud"))
+                rows.append({"id": servo, **unknown, "note": "", "answers": False})
     _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):
         sys.exit(BusError.exit_code)
@@ -76,13 +130,95 @@ def read(
     ids: Ids,
     registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
 ) -> None:
-    """Registers by name: raw and in their unit."""
+    """Read registers by name: raw and in their unit."""
     from sfms_robot.app.servo.single_servo import read_registers
 
-    def look(wire: Wire, seen: FoundServo) -> list[dict[str, Any]]:
-        return [{"id": seen.id, **value.row()} for value in read_registers(wire, seen, registers)]
+    _each(ids, on, "registers", lambda seen: [value.row() for value in read_registers(seen, registers)])
 
-    _each(ids, on, look, "registers")
+
+@app.command()
+@on_wire
+def monitor(
+    on: Wiring,
+    ids: Annotated[str | None, typer.Argument(metavar="ID", help="1-9,12. Default: all.")] = None,
+    samples: Annotated[int | None, typer.Option(min=1, help="End after so many samples. Default: Ctrl-C ends.")] = None,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Samples per second.")] = 5.0,
+) -> None:
+    """Show position, load, voltage, temperature and faults, live. Reads only."""
+    from sfms_robot.app.servo.single_servo import samples as looks
+
+    taken: list[list[dict[str, Any]]] = []
+    with on.open() as wire:
+        with _bar("looking for servos", hidden=on.json) as progress:
+            servos = _chosen(wire, ids, progress)
+        count = samples if samples is not None else 1 if on.json else None
+        seen = looks(servos, 1.0 / rate, count)
+        if on.json:
+            taken = list(seen)
+        else:
+            from sfms_robot.cli.show_servo import live
+
+            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends")
+    if on.json:
+        print_json({"samples": taken})
+
+
+@app.command()
+def maps(
+    files: list[Path] = typer.Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
+    check: bool = typer.Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
+    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+) -> None:
+    """List the servo models and boards that have a firmware map."""
+    from sfms_robot.app.servo.maps import check_maps, list_maps
+
+    if not check:
+        rows = list_maps(files or [])
+        _show([{key: row[key] for key in _SHOWN} for row in rows], {"maps": rows}, json)
+        return
+    findings = check_maps(files or [])
+    if json:
+        print_json({"sound": not findings, "findings": [each._asdict() for each in findings]})
+    else:
+        for each in findings:
+            print(f"{each.file}: {each.problem}")
+        print("the firmware maps are sound" if not findings else f"{len(findings)} problem(s)")
+    if findings:
+        raise typer.Exit(2)
+
+
+def doctor(
+    port: str | None = typer.Option(
+        None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
+    ),
+    head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
+    baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
+    family: Family | None = typer.Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
+    fix: bool = typer.Option(
+        False, "--fix", help="Mend stored values, in the servos or in the head's file; asks before each."
+    ),
+    yes: bool = typer.Option(False, "--yes", "-y", help="With --fix: do not ask."),
+    json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
+) -> None:
+    """Look before you run: port, adapter, every servo, its stored values, wire budget. Reads only, except with --fix.
+
+    Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
+    """
+    from sfms_robot.app.servo.doctor import examine
+    from sfms_robot.cli.show_servo import print_doctor
+
+    confirm = confirmation(yes) if fix else None
+    with _bar("looking", hidden=json or fix) as progress:
+        report = examine(port, head, family and family.value, baud, progress, confirm)
+    if json:
+        print_json(report)
+    else:
+        print_doctor(report)
+    if report["exit_code"]:
+        sys.exit(report["exit_code"])
+
+
+# --- changing ---------------------------------------------------------------------------------------------------
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
@@ -94,32 +230,32 @@ def write(
     value: Annotated[str, typer.Argument(help="Raw number, or one with the register's unit: 90deg.")],
     yes: YesOption = False,
 ) -> None:
-    """Write a register and read it back. What lasts (EEPROM) is asked about first, and refused while torque is on."""
+    """Write a register and read it back. EEPROM is asked about first, and refused while torque is on."""
     from sfms_robot.app.servo.single_servo import write_register
 
     confirm = confirmation(yes, ids)
 
-    def change(wire: Wire, seen: FoundServo) -> list[dict[str, Any]]:
-        before, after = write_register(wire, seen, register, value, confirm)
+    def change(seen: FoundServo) -> list[dict[str, Any]]:
+        before, after = write_register(seen, register, value, confirm)
         row = after.row()
-        return [{"id": seen.id, "register": row["register"], "before": before.raw if before else None,
-                 "raw": row["raw"], "value": row["value"], "unit": row["unit"]}]  # fmt: skip
+        kept = {key: row[key] for key in ("raw", "value", "unit")}
+        return [{"register": row["register"], "before": before.raw if before else None, **kept}]
 
-    _each(ids, on, change, "written")
+    _each(ids, on, "written", change)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
 @on_wire
 def move(
     on: Wiring,
-    servo: Annotated[int, typer.Argument(metavar="ID")],
+    servo: OneId,
     to: Annotated[str | None, typer.Option("--to", help="Ticks, or degrees of its shaft: 180deg.")] = None,
-    by: Annotated[str | None, typer.Option("--by", help="From where it stands: ticks, or -5deg.")] = None,
+    by: Annotated[str | None, typer.Option("--by", help="From its present position: ticks, or -5deg.")] = None,
 ) -> None:
     """Move one servo slowly, and leave torque and profile as they were."""
     from sfms_robot.app.servo.move import move as go
 
-    _each(str(servo), on, lambda wire, seen: [go(wire, seen, to, by)], "moved")
+    _each(str(servo), on, "moved", lambda seen: [go(seen, to, by)])
 
 
 @app.command()
@@ -130,26 +266,17 @@ def release(
     ] = "auto",
     everything: Annotated[bool, typer.Option("--all", help="Every id on the wires, at the rates of the head.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before --all.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Take torque off a head's servos, whatever state they are in; the head may fall."""
-    from sfms_robot.app.open_head import HeadOptions, open_wires
-    from sfms_robot.app.servo.move import release as let_go
-    from sfms_robot.app.servo.serial_line import real_clock
-    from sfms_robot.config import load_head
+    from sfms_robot.app.servo.move import release_head
 
     if everything and not confirmation(yes)(f"--all takes torque off every servo on {port}"):
         raise ConfigError("--all: not confirmed, nothing was written")
-    found = load_head(head)
-    with open_wires(found, HeadOptions(head, port)) as opened:
-        rows = let_go(found, opened, real_clock(), everything)
+    rows = release_head(head, port, everything)
     left = [row["joint"] or f"id {row['id']}" for row in rows if row["torque"] != "off"]
-    _show(
-        rows,
-        {"released": rows, "torque_unconfirmed": left},
-        json,
-        f"torque off: {len(rows) - len(left)} of {len(rows)}",
-    )
+    title = f"torque off: {len(rows) - len(left)} of {len(rows)}"
+    _show(rows, {"released": rows, "torque_unconfirmed": left}, json, title)
     if left:
         print(f"torque is not confirmed off: {', '.join(left)}; switch off their supply", file=sys.stderr)
         sys.exit(BusError.exit_code)
@@ -159,18 +286,19 @@ def release(
 @on_wire
 def dump(
     on: Wiring,
-    file: Annotated[Path, typer.Argument(help="Is written; must not be there yet.")],
-    ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: everybody.")] = None,
+    file: Annotated[Path, typer.Argument(help="Is written; must not exist yet.")],
+    ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: all.")] = None,
 ) -> None:
-    """All registers of servos into a YAML file."""
-    from sfms_robot.app.servo.dump import check_new, save_dump
-    from sfms_robot.app.servo.dump import dump as taken
+    """Write all registers of servos to a YAML file."""
+    from sfms_robot.app.servo.single_servo import check_new, save_dump
+    from sfms_robot.app.servo.single_servo import dump as taken
 
     check_new(file)
     with on.open() as wire, _bar("reading", hidden=on.json) as progress:
         servos = _chosen(wire, ids, progress)
-        save_dump(taken(wire, servos), file)
-    _show([seen.row() for seen in servos], {"file": str(file), "servos": [seen.row() for seen in servos]}, on.json)
+        save_dump(taken(servos), file)
+    rows = [seen.row() for seen in servos]
+    _show(rows, {"file": str(file), "servos": rows}, on.json)
 
 
 @app.command()
@@ -185,21 +313,19 @@ def restore(
     identity: Annotated[bool, typer.Option("--identity", help="Give it id and rate of the file as well.")] = False,
     yes: YesOption = False,
 ) -> None:
-    """Lasting settings (EEPROM) of a dumped servo into one of the same model. Shows the differences and asks."""
-    from sfms_robot.app.servo.dump import load_dump
-    from sfms_robot.app.servo.dump import restore as write_back
+    """Write the EEPROM of a dumped servo to one of the same model. Shows the differences and asks."""
+    from sfms_robot.app.servo.single_servo import load_dump
+    from sfms_robot.app.servo.single_servo import restore as write_back
 
     kept = {each.id: each for each in load_dump(file).servos}
     if source is None and into is not None:
         raise ConfigError("servo restore: --into needs --from, the id in the file")
     if source is not None and source not in kept:
         raise ConfigError.at(str(file), "--from", source, "is not in the file", kept)
-    pairs = {into if into is not None else servo: kept[servo] for servo in ([source] if source is not None else kept)}
+    pairs = kept if source is None else {source if into is None else into: kept[source]}
     confirm = confirmation(yes)
     with on.open() as wire:
-        rows = [
-            row for servo, was in pairs.items() for row in write_back(wire, wire.find(servo), was, confirm, identity)
-        ]
+        rows = [row for servo, was in pairs.items() for row in write_back(wire.find(servo), was, confirm, identity)]
     _show(rows, {"written": rows}, on.json, None if rows else "nothing differs")
 
 
@@ -215,7 +341,7 @@ def set_id(
     """Give a servo another id. Best with that one servo on the wire."""
     from sfms_robot.app.servo.single_servo import set_id as change
 
-    _each(str(old), on, lambda wire, seen: [change(wire, seen, new, confirmation(yes), in_chain).row()], "servos")
+    _each(str(old), on, "servos", lambda seen: [change(seen, new, confirmation(yes), in_chain).row()])
 
 
 @app.command("set-baud")
@@ -230,113 +356,83 @@ def set_baud(
     from sfms_robot.app.servo.single_servo import set_baud as change
 
     confirm = confirmation(yes, ids)
-    _each(ids, on, lambda wire, seen: [change(wire, seen, rate, confirm).row()], "servos")
+    _each(ids, on, "servos", lambda seen: [change(seen, rate, confirm).row()])
 
 
 @app.command()
 @on_wire
 def reboot(on: Wiring, ids: Ids, yes: YesOption = False) -> None:
-    """Start servos over: torque goes off, latched hardware errors go away."""
+    """Start servos over: torque goes off, latched hardware errors are cleared."""
     from sfms_robot.app.servo.single_servo import reboot as restart
 
     confirm = confirmation(yes, ids)
-    _each(ids, on, lambda wire, seen: [restart(wire, seen, confirm).row()], "servos")
+    _each(ids, on, "servos", lambda seen: [restart(seen, confirm).row()])
 
 
 @app.command("factory-reset")
 @on_wire
 def factory_reset(
     on: Wiring,
-    servo: Annotated[int, typer.Argument(metavar="ID")],
-    keep: Annotated[Keep, typer.Option("--reset", help="What goes back to its factory value.")] = Keep.id_and_baud,
+    servo: OneId,
+    keep: Annotated[
+        Keep, typer.Option("--reset", help="The settings that get their factory values.")
+    ] = Keep.id_and_baud,
     yes: YesOption = False,
 ) -> None:
-    """Put a servo's settings back to what they were when it was new."""
+    """Set a servo to its factory values."""
     from sfms_robot.app.servo.single_servo import factory_reset as reset
 
-    _each(str(servo), on, lambda wire, seen: [reset(wire, seen, keep.value, confirmation(yes)).row()], "servos")
+    _each(str(servo), on, "servos", lambda seen: [reset(seen, keep.value, confirmation(yes)).row()])
 
 
-@app.command()
-@on_wire
-def monitor(
-    on: Wiring,
-    ids: Annotated[str | None, typer.Argument(metavar="ID", help="1-9,12. Default: everybody.")] = None,
-    samples: Annotated[int | None, typer.Option(min=1, help="End after so many looks. Default: Ctrl-C ends.")] = None,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Looks per second.")] = 5.0,
-) -> None:
-    """Position, load, voltage, temperature and faults, live. Reads only."""
-    from sfms_robot.app.servo.register_view import samples as looks
-
-    taken: list[list[dict[str, Any]]] = []
-    with on.open() as wire:
-        with _bar("looking for servos", hidden=on.json) as progress:
-            servos = _chosen(wire, ids, progress)
-        count = samples if samples is not None else 1 if on.json else None
-        if on.json:
-            taken = list(looks(wire, servos, 1.0 / rate, count))
-        else:
-            from sfms_robot.cli.show_servo import live
-
-            title = f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends"
-            live(looks(wire, servos, 1.0 / rate, count), title)
-    if on.json:
-        print_json({"samples": taken})
+# --- shared -----------------------------------------------------------------------------------------------------
 
 
-@app.command()
-def maps(
-    files: list[Path] = typer.Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
-    check: bool = typer.Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
-    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
-) -> None:
-    """The servo models and boards that have a firmware map."""
-    from sfms_robot.app.servo.maps import check_maps, list_maps
+def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
+    """Return a function that asks, unless `yes`.
 
-    if not check:
-        rows = list_maps(files or [])
-        if json:
-            print_json({"maps": rows})
-        else:
-            from sfms_robot.cli.show import print_rows
+    With several `ids` one yes holds for the same change to all of them; else each is asked.
+    """
+    alike = f" and the same for all of {ids}" if len(ids) > 1 and not ids.isdigit() else ""
+    said: list[bool] = [True] if yes else []
 
-            print_rows([{key: row[key] for key in _SHOWN} for row in rows])
-        return
-    findings = check_maps(files or [])
-    if json:
-        print_json({"sound": not findings, "findings": [each._asdict() for each in findings]})
-    else:
-        for each in findings:
-            print(f"{each.file}: {each.problem}")
-        print("the firmware maps are sound" if not findings else f"{len(findings)} problem(s)")
-    if findings:
-        raise typer.Exit(2)
+    def ask(question: str) -> bool:
+        if said:
+            return said[0]
+        if not sys.stdin.isatty():
+            raise ConfigError(f"{question}: no terminal to ask on, say --yes")
+        answer = typer.confirm(f"{question}{alike}. Do it?", err=True)
+        if alike:
+            said.append(answer)
+        return answer
+
+    return ask
 
 
 def _parsed(ids: str) -> list[int]:
-    from sfms_robot.app.servo.single_servo import parse_ids
+    from sfms_robot.app.servo.single_servo import checked_ids
 
-    return parse_ids(ids)
+    return checked_ids(ids)
 
 
 def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:
-    """Those of `ids`, or everybody. Raises BusError when nobody answers."""
+    """Return the servos of `ids`, or all. Raises BusError when none answers."""
     from sfms_robot.app.servo.single_servo import scan as look
 
     servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
     if not servos:
-        raise BusError(f"{wire.port.name}: nobody answers")
+        raise BusError(f"{wire.port.name}: no servo answers")
     return servos
 
 
-def _each(ids: str, on: Wiring, work: Callable[[Wire, FoundServo], list[dict[str, Any]]], key: str) -> None:
-    """Do `work` for every id; what was done is shown even when a later one fails."""
+def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], list[dict[str, Any]]]) -> None:
+    """Do `work` for every id; the rows of the first ids are shown even when a later one fails."""
     rows: list[dict[str, Any]] = []
     servos = _parsed(ids)
     try:
         with on.open() as wire:
             for servo in servos:
-                rows += work(wire, wire.find(servo))
+                rows += [{"id": servo, **row} for row in work(wire.find(servo))]
     except Exception:
         if rows and not on.json:
             _show(rows, {}, on.json)
@@ -354,7 +450,7 @@ def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, ti
 
 
 def _for_people(row: dict[str, Any]) -> dict[str, Any]:
-    """A register in fewer columns; any other row as it is."""
+    """Return a register in fewer columns, and any other row unchanged."""
     if "area" not in row:
         return row
     takes = None if row["min"] is None else f"{row['min']}..{row['max']}"

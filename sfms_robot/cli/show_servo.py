@@ -23,7 +23,7 @@ _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
 def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> None:
-    """Rows that share their keys; columns that say nothing are left out."""
+    """Print rows that share their keys, without empty columns."""
     console = screen()
     if title is not None:
         console.print(Text(title, style="bold"), soft_wrap=True)
@@ -32,7 +32,7 @@ def print_table(rows: Sequence[Mapping[str, Any]], title: str | None = None) -> 
 
 
 def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
-    """One table that is drawn anew with every sample, until they end or somebody presses Ctrl-C."""
+    """Show one table, redrawn with every sample, until they end or Ctrl-C is pressed."""
     console = screen()
     rows: Sequence[Mapping[str, Any]] = []
     try:
@@ -48,7 +48,7 @@ def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
 
 @contextmanager
 def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """A progress bar on stderr, for people only."""
+    """Show a progress bar on stderr where that is a terminal; yield the function that moves it."""
     console = Console(stderr=True)
     progress = Progress(
         TextColumn(text), BarColumn(), TextColumn("{task.percentage:.0f} %  {task.description}"),
@@ -60,7 +60,7 @@ def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def print_doctor(report: Mapping[str, Any]) -> None:
-    """Every bus: adapter, servos, budget, findings."""
+    """Print adapter, servos, budget and findings of every bus."""
     console = screen()
     for bus in report["buses"]:
         for part in _bus(bus):
@@ -72,9 +72,9 @@ def _bus(bus: Mapping[str, Any]) -> Iterator[RenderableType]:
     adapter = bus["adapter"] or {}
     usb = f"{adapter['vendor']}:{adapter['product']} {adapter['serial'] or ''}" if adapter.get("vendor") else None
     latency = f"latency timer {adapter['latency_ms']} ms" if adapter.get("latency_ms") is not None else None
-    told = [adapter.get("description"), usb, adapter.get("driver"), latency, adapter.get("by_id")]
-    if any(told):
-        yield Text("adapter: " + ", ".join(str(each).strip() for each in told if each))
+    known = [adapter.get("description"), usb, adapter.get("driver"), latency, adapter.get("by_id")]
+    if any(known):
+        yield Text("adapter: " + ", ".join(str(each).strip() for each in known if each))
     if bus["servos"]:
         columns = ("id", "joint", "model", "firmware", "baud", "voltage_V", "temperature_degC", "return_delay_us",
                    "torque", "faults")  # fmt: skip
@@ -83,7 +83,10 @@ def _bus(bus: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield from _budget(bus)
     for each in bus.get("fixed", ()):
         yield Text(f"fixed   {each}", style="green")
-    yield from _findings(bus["findings"])
+    for each in bus["findings"]:
+        yield Text.assemble((f"{each['severity']:8}", _STYLES[each["severity"]]), f"{each['about']}: {each['problem']}")
+        if each["fix"]:
+            yield Text(f"        {each['fix']}", style="cyan")
     if bus["udev_rule"] and any("udev rule" in each["fix"] for each in bus["findings"]):
         yield Text("udev rule, for /etc/udev/rules.d/99-servos.rules (then sudo udevadm control --reload, and replug):")
         yield Text(bus["udev_rule"], style="cyan")
@@ -101,20 +104,10 @@ def _budget(bus: Mapping[str, Any]) -> Iterator[RenderableType]:
     )
     tried = {True: "works here", False: "does not work here", None: "not tried"}[bus["fast_sync_read"]]
     names = {"write_only": "goals", "plain": "goals, and all read", "fast": f"the same by fast sync read ({tried})"}
+    costs = [(name, budget[key]) for key, name in names.items() if budget[key]]
     yield _table(
-        [
-            {"on the wire": names[key], "bytes": tick["bytes"], "ms": tick["ms"], "Hz": tick["hz"]}
-            for key in names
-            if (tick := budget[key])
-        ]
+        [{"on the wire": name, "bytes": cost["bytes"], "ms": cost["ms"], "Hz": cost["hz"]} for name, cost in costs]
     )
-
-
-def _findings(findings: Sequence[Mapping[str, Any]]) -> Iterator[Text]:
-    for each in findings:
-        yield Text.assemble((f"{each['severity']:8}", _STYLES[each["severity"]]), f"{each['about']}: {each['problem']}")
-        if each["fix"]:
-            yield Text(f"        {each['fix']}", style="cyan")
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -36,14 +36,15 @@ import sys
 import tempfile
 import time
 import tty
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfms_robot.emulator.device import EmulatedServo, plugged
-from sfms_robot.emulator.emulated_wire import EmulatedWire
+from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
+from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
+from sfms_robot.emulator.servo_chains import Dynamixel2Chain, Protocol1Chain
 from sfms_robot.errors import ConfigError
 from sfms_robot.processes import ParentPipe, realtime_priority
 from sfms_robot.servo.registers import Table
@@ -51,9 +52,16 @@ from sfms_robot.servo.registers import Table
 _CHUNK: Final = 4096
 _PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
 _IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
-_TCGETS2: Final = 0x802C542A  # struct termios2 tells any rate as a number, odd ones too
+_TCGETS2: Final = 0x802C542A  # struct termios2 holds any rate as a number, odd ones too
 _TERMIOS2: Final = struct.Struct("=4IB19s2I")
 _OUTPUT_RATE: Final = -1
+_KINDS: Final[Mapping[tuple[str, int | None], Any]] = {  # family, protocol
+    ("dynamixel", 2): Dynamixel2Chain,
+    ("dynamixel", 1): Protocol1Chain,
+    ("feetech", 1): Protocol1Chain,
+    ("maestro", None): MaestroBoard,
+    ("ssc32", None): Ssc32Board,
+}
 
 
 class PseudoTerminal:
@@ -81,7 +89,7 @@ class PseudoTerminal:
         return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
 
     def send(self, data: bytes, patience_s: float) -> None:
-        """Write what the terminal takes within `patience_s`; the rest is lost, as on a wire."""
+        """Write the bytes that the terminal takes within `patience_s`; the rest is lost, as on a wire."""
         view = memoryview(data)
         while view and select.select([], [self.fd], [], patience_s)[1]:
             view = view[os.write(self.fd, view) :]
@@ -102,6 +110,12 @@ class _Client:
     buffer: bytearray = field(default_factory=bytearray)
     taken: int = 0
     wanted_from: int = 0
+
+    def reply(self, answer: str) -> None:
+        try:
+            self.connection.sendall(answer.encode() + b"\n")
+        except OSError:
+            self.buffer.clear()  # it is gone; the end of its connection is seen next
 
 
 class Server:
@@ -128,8 +142,8 @@ class Server:
             watched = [parent, listener, *self._clients]
             if self._terminal is not None and not self._virtual:
                 watched.append(self._terminal.fd)
-            ready = select.select(watched, [], [], self._patience_s())[0]
-            for fd in ready:
+            patience_s = None if self._virtual else min(max(0.0, self._wire.next_s - self._now()), _IDLE_S)
+            for fd in select.select(watched, [], [], patience_s)[0]:
                 if self._terminal is not None and fd == self._terminal.fd:
                     self._wire.receive(os.read(fd, _CHUNK), self._terminal.baud(), self._now())
                 elif fd == listener:
@@ -143,28 +157,25 @@ class Server:
             if not self._virtual:
                 self._deliver()
 
-    def _patience_s(self) -> float | None:
-        return None if self._virtual else min(max(0.0, self._wire.next_s - self._now()), _IDLE_S)
-
     def _now(self) -> float:
         if not self._virtual:
             self._now_s = time.monotonic() - self._start_s
         return self._now_s
 
     def _deliver(self) -> None:
-        """In real time: send what is due. A wire does not wait: what the host leaves lying is lost."""
-        self._wire.advance(self._now())
+        """Send the answers that are due in real time. Bytes that the host does not take are lost, as on a wire."""
+        self._advance(self._now())
         if self._now_s - self._idled_s >= _IDLE_S:
             self._idled_s = self._now_s
             self._wire.idle(self._now_s)
-        self._plug()
         outs = self._wire.take(self._now_s)
         if outs and self._terminal is not None:
             self._terminal.send(b"".join(out.data for out in outs), 0.0)
             self._wire.sent(outs, self._now())
 
-    def _plug(self) -> None:
-        """Hang up, or come back, as the wire says."""
+    def _advance(self, now_s: float) -> None:
+        """Move the wire on, then hang up or come back as it says."""
+        self._wire.advance(now_s)
         if self._wire.hung and self._terminal is not None:
             self._terminal.close()
             self._terminal = None
@@ -183,35 +194,24 @@ class Server:
             words = client.buffer[:end].decode(errors="replace").split()
             del client.buffer[: end + 1]
             try:
-                self._request(client, words)
-            except (ValueError, IndexError, KeyError):
-                self._tell(client, f"error not understood: {' '.join(words)}")
+                if words[0] == "sync":
+                    self._sync(client, int(words[1]), int(words[2]), *map(float, words[3:5]))
+                else:
+                    client.reply(self._command(words))
+            except (ValueError, IndexError, TypeError):
+                client.reply(f"error not understood: {' '.join(words)}")
             except ConfigError as error:
-                self._tell(client, f"error {error}")
+                client.reply(f"error {error}")
         if not data:
             del self._clients[client.connection.fileno()]
             client.connection.close()
 
-    def _request(self, client: _Client, words: list[str]) -> None:
-        if words[0] == "sync":
-            now_s = float(words[3])
-            self._sync(client, int(words[1]), int(words[2]), now_s, float(words[4]) if len(words) > 4 else None)
-        else:
-            self._tell(client, self._command(words))
-
-    def _tell(self, client: _Client, answer: str) -> None:
-        try:
-            client.connection.sendall(answer.encode() + b"\n")
-        except OSError:
-            client.buffer.clear()  # it is gone; the end of its connection is seen next
-
-    def _sync(self, client: _Client, count: int, wanted_from: int, now_s: float, until_s: float | None) -> None:
+    def _sync(self, client: _Client, count: int, wanted_from: int, now_s: float, until_s: float | None = None) -> None:
         self._now_s = now_s
-        self._wire.advance(now_s)
-        self._plug()
+        self._advance(now_s)
         terminal = self._terminal
         if terminal is None:
-            self._tell(client, "error the adapter is unplugged")
+            client.reply("error the adapter is unplugged")
             return
         data = bytearray()
         while client.taken + len(data) < count:
@@ -228,67 +228,84 @@ class Server:
             client.wanted_from = wanted_from
         if data[unwanted:]:
             self._wire.receive(bytes(data[unwanted:]), baud, now_s)
-        if until_s is None:
-            outs = self._wire.take(now_s, all_but_late=True)
-        else:
-            outs = self._wire.take(max(now_s, until_s))
+        outs = self._wire.take(now_s if until_s is None else max(now_s, until_s), all_but_late=until_s is None)
         reply = b"".join(out.data for out in outs)
-        self._tell(client, f"ack {len(reply)}")
+        client.reply(f"ack {len(reply)}")
         terminal.send(reply, _PATIENCE_S)
         self._wire.sent(outs, None)
 
     def _command(self, words: list[str]) -> str:
-        wire, name = self._wire, words[0]
-        if name == "time":
+        """Carry out any other request; return the answer. Raises ValueError for a number that cannot be read."""
+        wire = self._wire
+        if words[0] == "time":
             self._now_s = float(words[1])
         now_s = self._now()
-        if name == "digest":
-            return "digest {} {}".format(*wire.digest())
-        if name == "stats":
-            return f"json {json.dumps(wire.statistics())}"
-        if name == "stamps":
-            return f"json {json.dumps(wire.stamps())}"
-        if name == "faults":
-            return f"json {json.dumps(wire.faults(now_s))}"
-        if name in ("time", "inject", "clear", "supply", "hangup", "return"):
-            self._happen(words, now_s)
-            wire.advance(now_s)
-            self._plug()
-            return "ok"
-        if name not in ("kill", "revive", "fault", "turn", "heat", "state"):
-            return f"error unknown request {name}"
-        servo = wire.servo(int(words[1]))
-        if servo is None:
-            return f"error no such servo: {' '.join(words)}"
-        servo.advance(now_s)
-        if name == "state":
-            return f"json {json.dumps(servo.state(now_s))}"
-        if name in ("kill", "revive"):
-            servo.dead = name == "kill"
-        elif name == "fault":
-            servo.fail(int(words[2]), now_s)
-        elif name == "heat":
-            servo.plant.temperature_C = float(words[2])
-        else:
-            servo.turn(float(words[2]), now_s)
+        match words:
+            case ["digest"]:
+                return "digest {} {}".format(*wire.digest())
+            case ["stats"]:
+                return _json(wire.statistics())
+            case ["stamps"]:
+                return _json(wire.stamps())
+            case ["faults"]:
+                return _json(wire.faults(now_s))
+            case ["kill" | "revive" | "fault" | "turn" | "heat" | "state" as name, servo_id, *value]:
+                servo = wire.servo(int(servo_id))
+                return "error no such servo" if servo is None else _to_servo(servo, name, value, now_s)
+            case ["time", _]:
+                pass
+            case ["inject", spec]:
+                wire.inject(spec, now_s)
+            case ["clear"]:
+                wire.clear(now_s)
+            case ["supply", volts]:
+                wire.set_supply(float(volts), now_s)
+            case ["hangup" | "return" as name]:
+                wire.hung = name == "hangup"
+            case _:
+                return f"error not understood: {' '.join(words)}"
+        self._advance(now_s)
         return "ok"
 
-    def _happen(self, words: list[str], now_s: float) -> None:
-        if words[0] == "inject":
-            self._wire.inject(words[1], now_s)
-        elif words[0] == "clear":
-            self._wire.clear(now_s)
-        elif words[0] == "supply":
-            self._wire.set_supply(float(words[1]), now_s)
-        elif words[0] in ("hangup", "return"):
-            self._wire.hung = words[0] == "hangup"
-
     def close(self) -> None:
+        """Close the terminal, the control socket and all connections to it."""
         for client in self._clients.values():
             client.connection.close()
         self._listener.close()
         if self._terminal is not None:
             self._terminal.close()
+
+
+def _to_servo(servo: Any, name: str, value: list[str], now_s: float) -> str:
+    servo.advance(now_s)
+    if name == "state":
+        return _json(servo.state(now_s))
+    if name in ("kill", "revive"):
+        servo.dead = name == "kill"
+    elif name == "fault":
+        servo.fail(int(value[0]), now_s)
+    elif name == "heat":
+        servo.plant.temperature_C = float(value[0])
+    else:
+        servo.turn(float(value[0]), now_s)
+    return "ok"
+
+
+def _json(value: object) -> str:
+    return f"json {json.dumps(value)}"
+
+
+def plugged(servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> list[Device]:
+    """Return a device for the servos of each protocol, and one for each board; `tables` by model."""
+    groups: dict[tuple[Any, str], list[EmulatedServo]] = {}
+    for servo in servos:
+        table = tables[servo.model]
+        board = "" if table.channels is None else table.model
+        groups.setdefault((_KINDS[table.family, table.protocol], board), []).append(servo)
+    return [
+        kind(tables[board], members) if board else kind(members, tables, chain_break)
+        for (kind, board), members in groups.items()
+    ]
 
 
 def _wire(description: Mapping[str, Any]) -> EmulatedWire:

@@ -1,18 +1,21 @@
-"""One emulated wire: devices hear what the host sends, their answers leave in time, and faults come between.
+"""One emulated wire: devices receive the host's bytes, their answers leave in time, and faults come between.
 
 In `instant` timing an answer leaves at once. In `wire` timing the line is a line: the request takes 10 bits a byte to
 arrive, each servo waits its return delay, and its answer takes 10 bits a byte; an answer is due when its last bit is
-through. What leaves later than it was due is the emulator's own doing, and is counted as `emulator_late`.
+through. An answer that leaves later than it was due is the fault of the emulator, and is counted as `emulator_late`.
+
+`EmulatedServo` is plain data, so that the process of an emulated chain loads neither configs nor libraries.
 """
 
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
-from sfms_robot.emulator.device import Device, Reply, replies_of, servos_of
 from sfms_robot.emulator.faults import TO_SERVOS, Fault, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 
@@ -20,7 +23,62 @@ Timing = Literal["instant", "wire"]
 LATE_S: Final = 0.001
 _BITS: Final = 10  # of a byte, with start and stop
 _STAMPS: Final = 4096
-_USUAL_BITS: Final = {"overload": 0x20, "overheating": 0x04}  # of a status byte, where a servo has no names
+
+
+@dataclass(frozen=True)
+class EmulatedServo:
+    """A servo that is plugged in, or a channel of a board.
+
+    Attributes:
+        start_ticks: Its position when the host comes, torque off; outside its limits, or beyond one turn where it was
+            turned by hand after it was switched on.
+        registers: Values stored in it before, by name (homing offset, position limits, shutdown, ...).
+        supply_v: None is a voltage within its limits.
+    """
+
+    id: int
+    model: str = "xl330-m288"
+    baud: int = 1_000_000
+    start_ticks: int = 2048
+    _: KW_ONLY
+    firmware: int = 53
+    registers: Mapping[str, int] = field(default_factory=dict)
+    supply_v: float | None = None
+
+
+class Reply(NamedTuple):
+    """One packet on the wire: its senders, and how long the line is quiet before it. A board names no senders."""
+
+    servos: tuple[int, ...]
+    data: bytes
+    pause_s: float = 0.0
+
+
+class Device(ABC):
+    """All servos of one protocol, or one board. It receives every byte of the wire and keeps its own place in it."""
+
+    servos: Sequence[Any]
+
+    @abstractmethod
+    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
+        """Take bytes that the host sent at `baud` (None: unknown) and return the answers, packet by packet."""
+
+    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
+        """Return the bytes of `replies`."""
+        return b"".join(reply.data for reply in self.replies(data, baud, now_s))
+
+    def servo(self, servo_id: int) -> Any:
+        """Return the first servo or channel of that id, or None."""
+        return next((servo for servo in self.servos if servo.id == servo_id), None)
+
+    def advance(self, now_s: float) -> None:
+        """Move all its servos on to `now_s`."""
+        for servo in self.servos:
+            servo.advance(now_s)
+
+    def restart(self, now_s: float) -> None:
+        """Restart a board whose supply came back; servos with a controller restart on their own."""
+        return
 
 
 class Out(NamedTuple):
@@ -37,7 +95,7 @@ class EmulatedWire:
     """Devices, faults and the line between. Times are seconds of the emulator's clock.
 
     Attributes:
-        hung: the adapter is unplugged; the server closes the terminal meanwhile.
+        hung: The adapter is unplugged; the server closes the terminal meanwhile.
     """
 
     def __init__(
@@ -60,32 +118,31 @@ class EmulatedWire:
             self.add(fault)
 
     def servo(self, servo_id: int) -> Any:
-        """The servo or channel of that id on any device, or None."""
+        """Return the servo or channel of that id on any device, or None."""
         found = (device.servo(servo_id) for device in self._devices)
         return next((servo for servo in found if servo is not None), None)
 
     def digest(self) -> tuple[str, int]:
-        """SHA-256 and number of all bytes the host ever sent, at whatever baud."""
+        """Return SHA-256 and number of all bytes the host ever sent, at whatever baud."""
         return self._seen.hexdigest(), self._counts["bytes_in"]
 
     # --- traffic ------------------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, baud: int | None, now_s: float) -> None:
-        """Take bytes that the host sent at `baud` (None = unknown); the answers wait in the outbox."""
+        """Take bytes that the host sent at `baud` (None: unknown); the answers wait in the outbox."""
         self.advance(now_s)
         self._seen.update(data)
         self._counts["bytes_in"] += len(data)
         if self.hung:
             return
-        faults = self._faults
         through_s = self._occupy(now_s, len(data), baud)
-        if faults.echoes(now_s):
+        if self._faults.echoes(now_s):
             self._post(Reply((), data), through_s, 0.0)
-        for spoilt, late_s in faults.spoil(Reply((), data), now_s, TO_SERVOS):
+        for spoilt, late_s in self._faults.spoil(Reply((), data), now_s, TO_SERVOS):
             # Bytes do not overtake one another.
             self._inbox.append((max([now_s + late_s, *(each[0] for each in self._inbox)]), spoilt, baud))
         self.advance(now_s)
-        if noise := faults.noise(now_s):
+        if noise := self._faults.noise(now_s):
             self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)
 
     def _deliver(self, until_s: float) -> None:
@@ -94,7 +151,7 @@ class EmulatedWire:
             now_s, data, baud = self._inbox.popleft()
             self._turn_faults(now_s)
             for device in self._devices:
-                for reply in replies_of(device, data, baud, now_s):
+                for reply in device.replies(data, baud, now_s):
                     start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
                     due_s = self._occupy(start_s, len(reply.data), baud)
                     for spoilt, late_s in self._faults.spoil(reply, now_s):
@@ -110,7 +167,7 @@ class EmulatedWire:
         return out
 
     def sent(self, outs: Iterable[Out], now_s: float | None) -> None:
-        """Stamp what has just left; None = in virtual time, where nothing is late."""
+        """Stamp the bytes that have just left; None: in virtual time, where nothing is late."""
         for out in outs:
             at_s = out.due_s if now_s is None else now_s
             self._stamps.append((out.servos, out.due_s, at_s))
@@ -124,18 +181,17 @@ class EmulatedWire:
         return min([self._faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
     def statistics(self) -> dict[str, Any]:
-        """Counts since the start; how late answers left [ms] and how long the line was busy [s]."""
-        late = sorted(1e3 * (at_s - due_s) for _, due_s, at_s in self._stamps)
-        spread = {f"p{q}": late[min(len(late) - 1, len(late) * q // 100)] if late else None for q in (50, 99)}
-        spread["max"] = late[-1] if late else None
+        """Return counts since the start, the lateness of answers [ms], and how long the line was busy [s]."""
+        late: Sequence[float | None] = sorted(1e3 * (at_s - due_s) for _, due_s, at_s in self._stamps) or [None]
+        spread = {f"p{q}": late[min(len(late) - 1, len(late) * q // 100)] for q in (50, 99)} | {"max": late[-1]}
         return {**self._counts, "busy_s": self._busy_s, "late_ms": spread}
 
     def stamps(self) -> list[dict[str, Any]]:
-        """The last answers: who, when due, when gone."""
+        """Return the last answers: senders, time due, time gone."""
         return [{"ids": ids, "due_s": due_s, "sent_s": at_s} for ids, due_s, at_s in self._stamps]
 
     def _occupy(self, start_s: float, count: int, baud: int | None) -> float:
-        """Fill the line with `count` bytes from `start_s` on; when the last one is through."""
+        """Fill the line with `count` bytes from `start_s` on; return when the last one is through."""
         seconds = _BITS * count / baud if baud else 0.0
         self._busy_s += seconds
         if not self._on_the_wire:
@@ -151,22 +207,24 @@ class EmulatedWire:
     # --- faults -------------------------------------------------------------------------------------------------
 
     def add(self, fault: Fault) -> None:
-        """Raises ConfigError when nobody here can have that fault."""
-        concerned = [s for s in self._concerned(fault) if hasattr(s, "set_supply") or fault.kind != "voltage"]
-        if fault.kind not in ("echo", "noise", "hangup") and not concerned:
+        """Add a fault. Raises ConfigError when no servo of the wire can have it."""
+        servos = self._supplied if fault.kind == "voltage" else self._servos
+        if fault.kind not in ("echo", "noise", "hangup") and not any(map(fault.concerns, servos)):
             raise ConfigError.at("emulate", "fault", fault.text, "concerns no servo of this wire")
         self._faults.add(fault)
 
     def inject(self, text: str, now_s: float) -> None:
-        """A fault by its spec, from now on unless it says. Raises ConfigError."""
+        """Add a fault by its spec, which begins now unless it names a time. Raises ConfigError."""
         self.add(parse_fault(text, now_s))
         self.advance(now_s)
 
     def clear(self, now_s: float) -> None:
+        """Remove all faults."""
         self._faults.clear(now_s)
         self.advance(now_s)
 
     def faults(self, now_s: float) -> list[str]:
+        """Return the specs of the faults that last or are to come."""
         return self._faults.texts(now_s)
 
     def advance(self, now_s: float) -> None:
@@ -174,38 +232,45 @@ class EmulatedWire:
         self._deliver(now_s)
         self._turn_faults(now_s)
 
-    def _turn_faults(self, now_s: float) -> None:
-        for time_s, fault, began in self._faults.edges(now_s):
-            self._happen(fault, began, time_s)
-
     def idle(self, now_s: float) -> None:
-        """Move everything on, so that nobody has to make up for a long silence."""
+        """Move everything on, so that no servo has to make up for a long silence."""
         self.advance(now_s)
         for device in self._devices:
             device.advance(now_s)
 
     def set_supply(self, volts: float, now_s: float) -> None:
-        for servo in self._servos:
-            if hasattr(servo, "set_supply"):
-                servo.set_supply(volts, now_s)
+        """Change the supply of all servos that measure it."""
+        for servo in self._supplied:
+            servo.set_supply(volts, now_s)
 
     @property
     def _servos(self) -> list[Any]:
-        return [servo for device in self._devices for servo in servos_of(device)]
+        return [servo for device in self._devices for servo in device.servos]
 
-    def _concerned(self, fault: Fault) -> list[Any]:
-        return [servo for servo in self._servos if fault.ids is None or servo.id in fault.ids]
+    @property
+    def _supplied(self) -> list[Any]:
+        """Servos with a controller of their own; those of a board know no supply."""
+        return [servo for servo in self._servos if hasattr(servo, "set_supply")]
+
+    def _turn_faults(self, now_s: float) -> None:
+        for time_s, fault, began in self._faults.edges(now_s):
+            self._happen(fault, began, time_s)
 
     def _happen(self, fault: Fault, began: bool, now_s: float) -> None:
         kind = fault.kind
+        concerned = [servo for servo in self._servos if fault.concerns(servo)]
         if kind == "hangup":
             self.hung = began
             self._inbox.clear()
             self._outbox.clear()
-        elif kind == "brownout":
-            self._brown_out(fault, began, now_s)
-        for servo in self._concerned(fault):
-            if kind == "silent":
+        elif kind in ("voltage", "brownout"):
+            for servo in self._supplied:
+                usual_v = self._before_brownout.setdefault(servo.id, servo.supply_v)
+                servo.set_supply(fault.value if began else usual_v, now_s)
+            if not began:
+                self._before_brownout.clear()
+        for servo in concerned:
+            if kind == "silent" or (kind == "brownout" and not hasattr(servo, "set_supply")):
                 servo.dead = began
             elif kind == "mute":
                 servo.mute = began
@@ -213,33 +278,7 @@ class EmulatedWire:
                 servo.advance(now_s)
                 setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)
             elif kind in ("overload", "overheat") and began:
-                _fail(servo, "overheating" if kind == "overheat" else kind, now_s)
-            elif kind == "voltage":
-                _feed(servo, self._before_brownout, fault.value, began, now_s)
-
-    def _brown_out(self, fault: Fault, began: bool, now_s: float) -> None:
-        """Drop the supply: all servos fall silent, and start again when it is back."""
-        for servo in self._servos:
-            if hasattr(servo, "set_supply"):
-                _feed(servo, self._before_brownout, fault.value, began, now_s)
-            else:
-                servo.dead = began
-        for device in self._devices:
-            if hasattr(device, "restart"):
-                device.restart(now_s)  # without a supply there are no pulses either
-
-
-def _feed(servo: Any, before: dict[int, float], volts: float, began: bool, now_s: float) -> None:
-    """Another supply voltage, or the one from before."""
-    if began:
-        before.setdefault(servo.id, servo.supply_v)
-        servo.set_supply(volts, now_s)
-    else:
-        servo.set_supply(before.pop(servo.id, servo.supply_v), now_s)
-
-
-def _fail(servo: Any, fault: str, now_s: float) -> None:
-    if hasattr(servo, "fail_named"):
-        servo.fail_named(fault, now_s)
-    else:
-        servo.fail(_USUAL_BITS[fault], now_s)
+                servo.fail_named("overheating" if kind == "overheat" else kind, now_s)
+        if kind == "brownout":
+            for device in self._devices:
+                device.restart(now_s)  # a board without a supply makes no pulses either

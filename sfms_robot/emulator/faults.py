@@ -2,8 +2,8 @@
 
     KIND[:IDS][@START[-END]][=VALUE]        drop:3,5-7@2-4=0.5    delay:2=0.012    brownout@1    noise=0.1
 
-Times are seconds of the emulator's clock; a fault without an END lasts, except for the two that pass (brownout,
-hangup). All chance comes from one seeded generator, so that in virtual time the same requests meet the same faults.
+Times are seconds of the emulator's clock; a fault without an END lasts, except for brownout and hangup. All chance
+comes from one seeded generator, so that in virtual time the same requests meet the same faults.
 
 `drop`, `corrupt`, `delay` and their like hit what servos send; `request-drop`, `request-corrupt` and `request-delay`
 hit what the host sends, each write as a whole and for all servos of the wire alike. Corrupted: one byte of it became
@@ -18,11 +18,13 @@ import random
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from sfms_robot.emulator.device import Reply
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sfms_robot.emulator.emulated_wire import Reply
 
 
 class Kind(NamedTuple):
@@ -67,7 +69,7 @@ _SPEC: Final = re.compile(
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault. `ids` None = everybody. `text` is the spec as it was given."""
+    """One fault. `ids` None: all servos. `text` is the spec as it was given."""
 
     kind: str
     ids: frozenset[int] | None
@@ -76,21 +78,24 @@ class Fault:
     value: float
     text: str
 
+    def concerns(self, servo: Any) -> bool:
+        """Return whether a servo or channel can have it."""
+        return self.ids is None or servo.id in self.ids
+
     def meets(self, servos: Sequence[int], now_s: float) -> bool:
-        if not self.start_s <= now_s < self.end_s:
-            return False
-        return self.ids is None or not self.ids.isdisjoint(servos)
+        """Return whether it hits a packet from `servos` now."""
+        return self.start_s <= now_s < self.end_s and (self.ids is None or not self.ids.isdisjoint(servos))
 
 
 def parse_fault(text: str, now_s: float = 0.0) -> Fault:
-    """A fault from its spec; `now_s` is when it starts unless it says. Raises ConfigError of one line."""
+    """Read a fault from its spec; without a START it begins at `now_s`. Raises ConfigError of one line."""
 
     def refuse(problem: str, choices: Iterable[object] = ()) -> ConfigError:
         return ConfigError.at("emulate", "fault", text, problem, choices)
 
     found = _SPEC.fullmatch(text.strip())
     if found is None:
-        raise refuse("is no fault: KIND[:IDS][@START[-END]][=VALUE]", KINDS)
+        raise refuse("cannot be read: KIND[:IDS][@START[-END]][=VALUE]", KINDS)
     name, kind = found["kind"], KINDS.get(found["kind"])
     if kind is None:
         raise refuse(f"has no such kind as {name!r}", KINDS)
@@ -104,9 +109,9 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
         start_s = now_s if found["start"] is None else float(found["start"])
         end_s = start_s + kind.lasts_s if found["end"] is None else float(found["end"])
         value = kind.value if found["value"] is None else float(found["value"])
-        ids = parse_ids(found["ids"]) if found["ids"] else None
+        ids = frozenset(parse_ids(found["ids"])) if found["ids"] else None
     except ValueError:
-        raise refuse("holds a number that is none") from None
+        raise refuse("holds a bad number") from None
     if not kind.low <= value <= kind.high:
         raise refuse(f"is out of range: {kind.meaning} of {name}", [f"{kind.low:g}..{kind.high:g}"])
     if end_s <= start_s:
@@ -114,20 +119,20 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
     return Fault(name, ids, start_s, end_s, value, text.strip())
 
 
-def parse_ids(text: str) -> frozenset[int]:
-    """`3,5-7` -> {3, 5, 6, 7}. Raises ValueError."""
-    out: set[int] = set()
+def parse_ids(text: str) -> list[int]:
+    """Read `3,5-7` as [3, 5, 6, 7]. Raises ValueError."""
+    out: list[int] = []
     for part in text.split(","):
-        first, _, last = part.partition("-")
+        first, _, last = (each.strip() for each in part.partition("-"))
         ids = range(whole_number(first), whole_number(last or first) + 1)
         if not ids or ids[-1] > 255:
-            raise ValueError(f"{part!r} is no range of ids")
-        out.update(ids)
-    return frozenset(out)
+            raise ValueError(f"{part!r} is not a range of ids")
+        out += ids
+    return out
 
 
 class Faults:
-    """The faults of one wire and the dice they throw."""
+    """The faults of one wire, and their random numbers."""
 
     def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:
         self._random = random.Random(seed)
@@ -138,6 +143,7 @@ class Faults:
             self.add(fault)
 
     def add(self, fault: Fault) -> None:
+        """Add a fault."""
         self._faults.append(fault)
         for time_s, began in ((fault.start_s, True), (fault.end_s, False)):
             if time_s < math.inf:
@@ -145,7 +151,7 @@ class Faults:
                 heapq.heappush(self._edges, (time_s, self._count, began, fault))
 
     def clear(self, now_s: float) -> None:
-        """No more faults. Those that hold a servo or the supply are let go at `now_s`."""
+        """Remove all faults. Those that have begun end at `now_s`."""
         begun = [fault for fault in self._faults if fault.start_s <= now_s < fault.end_s]
         self._faults, self._edges = [], []
         for fault in begun:
@@ -153,16 +159,16 @@ class Faults:
             heapq.heappush(self._edges, (now_s, self._count, False, fault))
 
     def texts(self, now_s: float) -> list[str]:
-        """What is still to come or goes on."""
+        """Return the specs of faults that last or are to come."""
         return [fault.text for fault in self._faults if now_s < fault.end_s]
 
     @property
     def next_s(self) -> float:
-        """When the next fault begins or ends."""
+        """Time at which the next fault begins or ends."""
         return self._edges[0][0] if self._edges else math.inf
 
     def edges(self, now_s: float) -> Iterator[tuple[float, Fault, bool]]:
-        """(time, fault, whether it begins) of all that began or ended by now, once each, in order."""
+        """Yield (time, fault, it begins) of all that began or ended by now, once each, in order."""
         while self._edges and self._edges[0][0] <= now_s:
             time_s, _, began, fault = heapq.heappop(self._edges)
             if not began and fault in self._faults:
@@ -170,7 +176,7 @@ class Faults:
             yield time_s, fault, began
 
     def spoil(self, packet: Reply, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
-        """Return what becomes of a reply, or on the way `TO_SERVOS` of what one write of the host sent.
+        """Return the packets that arrive for a reply, or with `way` `TO_SERVOS` for one write of the host.
 
         Each is (bytes, seconds late); none when it is lost.
         """
@@ -186,11 +192,11 @@ class Faults:
         return out
 
     def echoes(self, now_s: float) -> bool:
-        """Whether the adapter sends the host its own request back."""
+        """Return whether the adapter sends the host its own request back."""
         return any(self._random.random() < f.value for f in self._faults if f.kind == "echo" and f.meets((), now_s))
 
     def noise(self, now_s: float) -> bytes:
-        """What the wire makes up by itself after a request."""
+        """Return bytes of noise that follow a request."""
         for fault in self._faults:
             if fault.kind == "noise" and fault.meets((), now_s) and self._random.random() < fault.value:
                 return self._random.randbytes(self._random.randint(1, 12))

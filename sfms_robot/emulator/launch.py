@@ -22,12 +22,14 @@ from functools import partial
 from typing import Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.processes import Child
 
-__all__ = ["Chain", "EmulatedServo", "launch", "wait"]
+__all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
+
+BehindSilent = Literal["chain_break", "skip"]
 
 READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
@@ -43,8 +45,8 @@ class Chain:
     """A running chain.
 
     Attributes:
-        device: path of the serial device; it stays the same when the adapter is unplugged and comes back.
-        control: path of the control socket.
+        device: Path of the serial device; it stays the same when the adapter is unplugged and comes back.
+        control: Path of the control socket.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
         priority: "fifo" where it answers as promptly as hardware; else why not (`processes.realtime_priority`).
@@ -168,8 +170,8 @@ def launch(
     servos: Sequence[EmulatedServo],
     virtual: bool = False,
     *,
-    timing: Literal["instant", "wire"] = "instant",
-    behind_silent: Literal["chain_break", "skip"] = "chain_break",
+    timing: Timing = "instant",
+    behind_silent: BehindSilent = "chain_break",
     faults: Sequence[str] = (),
     seed: int = 0,
     link: str | None = None,

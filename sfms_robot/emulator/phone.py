@@ -1,4 +1,4 @@
-"""An emulated phone: packets of a real one, recorded, sent again at their pace. Also as a command:
+"""An emulated phone: recorded packets of a real one, sent again at their pace. Also as a command:
 
     python -m sfms_robot.emulator.phone [[HOST:]PORT]
 
@@ -27,7 +27,7 @@ _LENGTH: Final = struct.Struct(">I")
 
 
 def recorded_packets(path: Path | None = None) -> list[bytes]:
-    """Packets of Live Link Face as the phone sent them; those that ship with the package by default.
+    """Return packets of Live Link Face as the phone sent them; by default those that ship with the package.
 
     A file is gzip of one byte, a big-endian uint32 count, and per packet its uint32 length and bytes. Raises
     ConfigError for another.
@@ -47,7 +47,7 @@ def recorded_packets(path: Path | None = None) -> list[bytes]:
 
 
 def renumbered(packet: bytes, number: int) -> bytes:
-    """The packet with another frame number."""
+    """Return the packet with another frame number."""
     start = 1
     for _ in ("device", "subject"):
         start += _LENGTH.size + _LENGTH.unpack_from(packet, start)[0]
@@ -55,9 +55,9 @@ def renumbered(packet: bytes, number: int) -> bytes:
 
 
 class EmulatedPhone:
-    """Packet i is due at i / rate_hz. A recording is played to its end and back, for ever, its numbers going on.
+    """A sender of packets; packet i is due at i / rate_hz.
 
-    Holds no time of its own: `send_until` is told it.
+    A recording is played to its end and back without end, with increasing numbers. The caller gives the time.
     """
 
     def __init__(
@@ -74,13 +74,13 @@ class EmulatedPhone:
         self._target = (host, port)
 
     def packet(self, number: int) -> bytes:
-        """Packet `number` of the endless stream."""
+        """Return packet `number` of the endless stream."""
         last = len(self._packets) - 1
         place = number % (2 * last) if last else 0
         return renumbered(self._packets[min(place, 2 * last - place) if last else 0], number)
 
     def send_until(self, now_s: float) -> int:
-        """Send what is due by `now_s` and not sent yet; how many that were. Does not wait."""
+        """Send the packets due by `now_s`; return their number. Does not wait."""
         due = math.floor(now_s * self._rate_hz + 1e-6) + 1
         before = self.sent
         while self.sent < due:
@@ -94,13 +94,14 @@ class EmulatedPhone:
         now_s: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Send at the phone's pace for so long. Blocks."""
+        """Send at the phone's pace for `duration_s`. Blocks."""
         start_s = now_s()
         while (elapsed_s := now_s() - start_s) < duration_s:
             self.send_until(elapsed_s)
             sleep(max(0.0, self.sent / self._rate_hz - (now_s() - start_s)))
 
     def close(self) -> None:
+        """Close the socket."""
         self._socket.close()
 
 
@@ -110,7 +111,7 @@ def main(arguments: Sequence[str]) -> None:
     host, _, number = target.rpartition(":")
     port = port_number(number, least=1)
     if port is None:
-        raise ConfigError(f"{target!r} is no place to send to (PORT, HOST:PORT)")
+        raise ConfigError(f"{target!r} is not an address to send to (PORT, HOST:PORT)")
     phone = EmulatedPhone(host or LOOPBACK, port)
     try:
         phone.play()

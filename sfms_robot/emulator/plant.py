@@ -1,12 +1,12 @@
-"""The moving part of an emulated servo: a profile generator, then a motor that follows it and grows warm.
+"""Motor of an emulated servo: a profile generator, then a motor that follows it and grows warm.
 
     reference   trapezoid towards the goal under profile velocity and acceleration (0 = no limit: it jumps)
     motor       x'' = w^2 (reference - x) - 2 w x' - load, with |x''| and |x'| held to what the motor can do
     heat        T' = (ambient + _HEATING * effort^2 - T) / _COOLING_S
 
 Critically damped, so a servo lags a ramp by 2 / w = 33 ms and does not ring; under a load it hangs a little below its
-goal, as a proportional controller does. Time runs on a fixed grid of `STEP_S`: where the servo is depends on what it
-was told when, never on how often somebody looked.
+goal, as a proportional controller does. Time runs on a fixed grid of `STEP_S`: the position depends on the commands
+and their times, never on how often it is read.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SPIN_UP_S: Final = 0.05  # from rest to top speed
 _FRICTION_MA: Final = 25.0
 _CREEP: Final = 20.0  # ticks/s, from where on friction is whole
 _STALL_MA: Final = 1200.0  # at full effort
-_THERE: Final = 0.02  # ticks from the goal at which a motor counts as there
+_THERE: Final = 0.02  # ticks from the goal at which a motor has arrived
 _HEATING: Final = 110.0  # degrees above ambient of a motor that stalls for good
 _COOLING_S: Final = 45.0
 _HEAT_STEPS: Final = 100
@@ -32,9 +32,11 @@ _STRAINED: Final = 0.95  # of full effort
 
 
 class MotorCommand(NamedTuple):
-    """What a motor is told. Ticks and seconds; a profile limit of 0 is no limit.
+    """Command of a motor, in ticks and seconds; a profile limit of 0 means unlimited.
 
-    goal: a position, or a speed when `by_speed`. torque: fraction of its full torque that the motor may use.
+    Attributes:
+        goal: A position, or a speed when `by_speed`.
+        torque: Fraction of its full torque that the motor may use.
     """
 
     goal: float
@@ -47,9 +49,13 @@ class MotorCommand(NamedTuple):
 
 @dataclass(slots=True)
 class Plant:
-    """State of one motor, in ticks and seconds. `drive` None = no torque: it stays where it is.
+    """State of one motor, in ticks and seconds.
 
-    effort: fraction of full torque that the motor uses now, signed. load: fraction that holding its place takes.
+    Attributes:
+        effort: Fraction of full torque that the motor uses now, signed.
+        load: Fraction that holding its position takes.
+        stuck: The shaft does not turn.
+        strained_steps: Steps at full effort without turning.
     """
 
     position: float
@@ -70,7 +76,10 @@ class Plant:
         return self.strained_steps * STEP_S >= OVERLOAD_S
 
     def advance(self, now_s: float, drive: MotorCommand | None) -> None:
-        """Move on to the last grid point at or before `now_s`; going back in time does nothing."""
+        """Move on to the last grid point at or before `now_s`; going back in time does nothing.
+
+        `drive` None: no torque, the shaft stays.
+        """
         steps = int(now_s / STEP_S + 1e-6) - self.step
         if steps <= 0:
             return
@@ -113,7 +122,7 @@ class Plant:
             self.speed = self.acceleration = self.effort = 0.0
 
     def _move(self, drive: MotorCommand, pull: float) -> None:
-        """One step of a motor that wants to accelerate by `pull`."""
+        """Make one step of a motor whose controller asks for the acceleration `pull`."""
         full = drive.top_speed / _SPIN_UP_S
         limit = full * drive.torque
         motor = min(max(pull, -limit), limit)
@@ -156,7 +165,7 @@ class Plant:
             self._warm()
 
     def _warm(self) -> None:
-        """Once every `_HEAT_STEPS`, with the effort of all of them."""
+        """Update the temperature, once every `_HEAT_STEPS`, by the effort of all of them."""
         target = AMBIENT_C + _HEATING * self._heat / _HEAT_STEPS
         self._heat = 0.0
         self.temperature_C += _DECAY * (target - self.temperature_C)

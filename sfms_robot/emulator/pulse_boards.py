@@ -1,23 +1,25 @@
 """Emulated hobby-servo boards: bytes of the host in, bytes of the board out. Opens nothing.
 
-A board makes pulses; the servos behind it only follow them and tell nobody where they are. So each channel is two
-things: the pulse, which the board knows and moves under its speed limits, and a shaft, which a plant moves and only a
-test can see. Nothing about the shaft ever reaches the wire.
+A board makes pulses; its servos only follow them and report nothing. So each channel has two parts: the pulse, which
+the board knows and moves under its speed limits, and a shaft, which a plant moves and only a test can see. Nothing
+about the shaft ever reaches the wire.
 
-Everything plugged in is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
+A servo of the description is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
 all of whose channels are mute obeys and never answers.
 
 Not modelled: the script, serial timeout, PWM output and daisy chain of a Maestro; the inputs, sequencer and offsets
 of an SSC-32.
+
+Sources: Pololu Maestro User's Guide, sections 4 and 5; Lynxmotion SSC-32 manual, "Command Formatting for the SSC-32".
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, Reply
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
@@ -27,6 +29,7 @@ _MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
 _MINI_SSC_NEUTRAL: Final = 127
 _MINI_SSC_STEP: Final = 15  # quarter microseconds: 476.25 us / 127
 _NEUTRAL: Final = 6000
+_FAULT_BITS: Final = {"overload": 0x20, "overheating": 0x04}  # a board has no such faults; these bits stand for them
 
 
 class Channel:
@@ -34,8 +37,7 @@ class Channel:
 
     def __init__(self, number: int, board: Board, start_ticks: int) -> None:
         self.id = number
-        self.dead = self.mute = False
-        self.on = False
+        self.dead = self.mute = self.on = False
         self.goal = 0.0
         self.speed = 0.0  # ticks/s, 0 = no limit
         self.acceleration = 0.0  # ticks/s^2, 0 = no limit
@@ -43,13 +45,14 @@ class Channel:
         self._board = board
 
     def send(self, goal: float, now_s: float) -> None:
-        """Pulses at `goal` ticks. Where there were none the board knows no speed limit: the pulse is there at once."""
+        """Send pulses of `goal` ticks. Where there were none the board knows no speed limit: the pulse jumps."""
         self.advance(now_s)
         if not self.on:
             self.plant.reference = goal
         self.on, self.goal = True, goal
 
     def off(self, now_s: float) -> None:
+        """End the pulses."""
         self.advance(now_s)
         self.on = False
 
@@ -63,13 +66,17 @@ class Channel:
         """Latch bits in the error word of the board."""
         self._board.fail(bits, now_s)
 
+    def fail_named(self, fault: str, now_s: float) -> None:
+        """Latch a fault by name: overheating, overload."""
+        self.fail(_FAULT_BITS[fault], now_s)
+
     def turn(self, ticks: float, now_s: float) -> None:
-        """Somebody turns the shaft by hand."""
+        """Turn the shaft by hand."""
         self.advance(now_s)
         self.plant.position = ticks
 
     def state(self, now_s: float) -> dict[str, Any]:
-        """What an onlooker sees, whatever the wire says."""
+        """Return what a look at the channel shows, whatever is on the wire."""
         self.advance(now_s)
         return {
             "position": self.plant.position,
@@ -88,32 +95,28 @@ class Channel:
 
     @property
     def moving(self) -> bool:
-        """Whether a limit still holds the pulse back."""
+        """A limit still holds the pulse back."""
         return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
 
 
-class Board(ABC):
-    """What the boards have in common. The id of a servo is its channel."""
+class Board(Device):
+    """The part that all boards share. The id of a servo is its channel.
+
+    Attributes:
+        servos: Channels with a servo plugged in.
+        limits: Shortest and longest pulse of each channel, ticks.
+    """
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
         if table.channels is None or table.pulse_us is None or table.tick_us is None:
-            raise ValueError(f"{table.model} is no servo board")
+            raise ValueError(f"{table.model} is not a servo board")
         self.table = table
         self.errors = 0
-        self._plugged = {servo.id for servo in servos}
         starts = {servo.id: servo.start_ticks for servo in servos}
         self.channels = [Channel(i, self, starts.get(i, table.center_ticks)) for i in range(table.channels)]
-        self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]  # shortest and longest pulse, ticks
+        self.servos = [channel for channel in self.channels if channel.id in starts]
+        self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]
         self._buffer = bytearray()
-
-    @property
-    def servos(self) -> Sequence[Channel]:
-        """Channels with a servo plugged in."""
-        return [self.channels[i] for i in sorted(self._plugged)]
-
-    def servo(self, channel: int) -> Channel | None:
-        """The channel, where a servo is plugged in."""
-        return self.channels[channel] if channel in self._plugged else None
 
     def advance(self, now_s: float) -> None:
         for channel in self.channels:
@@ -124,19 +127,19 @@ class Board(ABC):
         self.errors |= bits
 
     def restart(self, now_s: float) -> None:
-        """The supply came back: no pulses, nothing remembered."""
+        """Start again after a loss of supply: no pulses, nothing remembered."""
         self._buffer.clear()
         self.errors = 0
         for channel in self.channels:
             channel.off(now_s)
             channel.speed = channel.acceleration = 0.0
 
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take what the host sent at `baud` (None = unknown); what the board answers."""
+    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
         if not data or baud is None or (self.servos and all(channel.dead for channel in self.servos)):
-            return b""
+            return []
         answer = self._obey_all(data, baud, now_s)
-        return b"" if self.servos and all(channel.mute for channel in self.servos) else answer
+        mute = self.servos and all(channel.mute for channel in self.servos)
+        return [Reply((), answer)] if answer and not mute else []
 
     @abstractmethod
     def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes: ...
@@ -146,7 +149,7 @@ class Board(ABC):
         return shortest_us / tick_us, longest_us / tick_us
 
     def _send(self, channel: Channel, goal: float, now_s: float) -> None:
-        """Target 0 is no pulses; any other is brought inside the limits of the channel."""
+        """Send a target, brought inside the limits of the channel; 0 ends the pulses."""
         shortest, longest = self.limits[channel.id]
         if goal == 0:
             channel.off(now_s)

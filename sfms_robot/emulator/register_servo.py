@@ -1,258 +1,436 @@
-"""Parts of every emulated servo with a control table: a register file, a plant, a supply, and what an onlooker sees.
+"""One emulated servo that has a control table: registers with the rules of its firmware, and a motor behind them.
 
-What its firmware makes of an instruction is the subclass's business. An indirect data register is a window: byte k of
-the block shows the byte whose address stands in `indirect_address_k`. Where the block lies is the firmware map's
-business (X330 servos up to firmware 52 have it elsewhere than later ones).
+The servo is as unkind as the worst real one: at power-up its goal is the middle of its range, wherever it stands, so a
+host that enables torque before it has set a goal sees a jump. Dynamixel 1.0 and Feetech switch their torque on when a
+goal is written. A locked EEPROM takes a value and forgets it at the next power-up (Feetech), or does not take it and
+reports no error (Dynamixel 1.0). Where the sources are silent the servo does the least helpful thing.
+
+    rule                    Dynamixel 2.0                 Dynamixel 1.0                Feetech
+    bad write               one error number, no change   error bits, no change        no error, the rest is taken
+    faults                  latched until a reboot        in each status, overload     as Dynamixel 1.0
+                                                          until torque is enabled
+    supply out of limits    latched                       as long as it lasts          as long as it lasts
+    EEPROM under torque     access error                  written                      written
+    read beyond the table   data range error              range error                  answered up to address 255
+
+Sources: ROBOTIS e-manual, control tables of the X series, xl320, ax-12a and mx-28, "Status Packet", "Bus Watchdog";
+Feetech memory table V3.6 and communication protocol manual.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Final, Generic, Protocol, Self, TypeVar
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any, Final
 
-from sfms_robot.emulator.device import EmulatedServo, Reply
+from sfms_robot.emulator.control_table import (
+    POSITIONING,
+    TORQUE_ON_BY_GOAL,
+    ControlTable,
+    Frame,
+    Mode,
+    angle_limits,
+    mode_of,
+    motor_command,
+)
+from sfms_robot.emulator.emulated_wire import EmulatedServo
 from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table
 
+WATCHDOG_TICK_S: Final = 0.02
+_CHECK_S: Final = 0.1  # between two looks of the firmware at the load and the temperature of its motor
+_DELAY_TICK_S: Final = 2e-6  # of the return delay
 _BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
-_GAP_S: Final = 0.05  # an unfinished packet older than this is forgotten
 _BAUD_TOLERANCE: Final = 0.03  # what a UART forgives
-
-
-class RegisterFile:
-    """Values by register name; raw bytes by address. Reading an absent register gives its default.
-
-    `size`: bytes that can be read; default: the whole table and no more.
-    """
-
-    def __init__(self, table: Table, size: int | None = None) -> None:
-        self.table = table
-        self.raw = bytearray(table.size if size is None else size)
-        self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
-        fields = table.fields
-        self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
-            field.address: fields[f"indirect_address_{name.removeprefix('indirect_data_')}"].address
-            for name, field in fields.items()
-            if name.startswith("indirect_data_") and f"indirect_address_{name.removeprefix('indirect_data_')}" in fields
-        }
-        self._first_window = min(self._windows, default=table.size)
-        self._last_window = max(self._windows, default=-1)
-
-    def get(self, name: str, default: int = 0) -> int:
-        field = self.table.fields.get(name)
-        return default if field is None else field.from_bytes(self.raw[field.address : field.address + field.size])
-
-    def put(self, name: str, value: int) -> None:
-        """At most what the register can show; does nothing where the model has no such register."""
-        field = self.table.fields.get(name)
-        if field is not None:
-            self.raw[field.address : field.address + field.size] = field.to_bytes(_shown(field, value))
-
-    def covered(self, address: int, length: int) -> tuple[Field, ...]:
-        """The registers that lie, wholly or in part, in a block."""
-        found = self._covers.get((address, length))
-        if found is None:
-            end = address + length
-            found = tuple(f for f in self.table.fields.values() if f.address < end and f.address + f.size > address)
-            if len(self._covers) < 1024:  # rubbish from a host must not fill the memory
-                self._covers[address, length] = found
-        return found
-
-    def has_windows(self, address: int, length: int) -> bool:
-        return address <= self._last_window and address + length > self._first_window
-
-    def seen_through(self, address: int, length: int) -> Iterator[int]:
-        """The addresses that the bytes of a block really are."""
-        for at in range(address, address + length):
-            word = self._windows.get(at)
-            if word is None:
-                yield at
-                continue
-            target = self.raw[word] | self.raw[word + 1] << 8
-            yield target if target < len(self.raw) and target not in self._windows else at
-
-
-def _shown(field: Field, value: int) -> int:
-    """The nearest value that fits the register's size and sign rule."""
-    if field.sign == "twos_complement":
-        half = 1 << 8 * field.size - 1
-        return min(max(value, -half), half - 1)
-    if field.sign == "offset_2048":
-        return min(max(value, -2048), 2047)
-    bits = int(field.sign.removeprefix("sign_bit_")) if field.signed else 8 * field.size
-    most = (1 << bits) - 1
-    return min(max(value, -most if field.signed else 0), most)
-
-
-class Frame(Protocol):
-    """Position registers <-> ticks of the shaft, as the registers stand. `sign`: -1 where they count the other way."""
-
-    sign: float
-
-    def reported(self, shaft: float) -> float: ...
-
-    def shaft(self, told: float) -> float: ...
+_WHOLE_SPACE: Final = 256  # a Feetech answers a read of any address
+_FULL_TORQUE: Final = 1000
+_NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
+USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
+_SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # up to this highest supply [V] -> usual supply [V]
+_MEASURED: Final = (  # roles and registers that are worked out whenever they are read
+    "present_position", "present_speed", "present_current", "present_load", "present_pwm", "voltage", "temperature",
+    "error_status", "moving", "moving_status", "realtime_tick", "velocity_trajectory", "position_trajectory",
+)  # fmt: skip
+_PENDING: Final = ("registered_instruction", "registered", "async_write_flag")  # 1 from REG WRITE to ACTION
 
 
 class RegisterServo(ABC):
     """A servo that answers instructions. All times are seconds of the wire's clock.
 
     Attributes:
-        dead: silent, as with its cable out; its motor keeps doing what it was told.
-        mute: it obeys, and never answers.
-        fault_status: bits of what is wrong with it.
-        plant: what turns; its ticks are those of the shaft.
+        dead: Silent, as with its cable out; its motor keeps following its last command.
+        mute: It obeys, and never answers.
+        fault_status: Bits of its faults, as the firmware map numbers them.
+        plant: The motor; its ticks are those of the shaft.
+        id, second_id, baud, return_delay_s, torque: As the registers say now.
     """
 
-    id: int
-    baud: int | None
-    supply_v: float
-    _frame: Frame
-    _bits: dict[str, int]  # of `fault_status`, by the name of the fault
-
-    def __init__(self, table: Table, size: int | None = None) -> None:
+    def __init__(self, what: EmulatedServo, table: Table) -> None:
         self.table = table
         self.dead = self.mute = False
         self.fault_status = 0
-        self.plant = Plant(0.0)
-        self._file = RegisterFile(table, size)
-        self._get, self._put = self._file.get, self._file.put
-        self._drive: MotorCommand | None = None
-        self._powered = True
-
-    def _take_stored(self, what: EmulatedServo) -> None:
-        """What somebody has stored in it before."""
+        self.firmware = what.firmware
+        self.drive: MotorCommand | None = None
+        self._is_feetech = table.family == "feetech"
+        self._memory = ControlTable(table, _WHOLE_SPACE if self._is_feetech else None)
+        self._get, self._put = self._memory.get, self._memory.put
+        self._registered: tuple[int, bytes] | None = None
+        self._powered, self._tripped = True, False
+        self._received_at_s = self._deaf_until_s = 0.0
+        self._checks = 0
+        self._measured = {field.name: role for role in _MEASURED if (field := table.role(role))}
+        speed = table.role("present_speed")
+        per_turn = 60.0 if speed is None or speed.unit == "rpm" else 360.0
+        self._speed_per_tick = per_turn / (table.ticks_per_revolution * (speed.scale if speed else 1.0))
+        current = table.role("present_current")
+        self._current_scale = current.scale or 1.0 if current else 1.0
+        named = table.faults if table.protocol == 2 else table.status_faults
+        self._bits = USUAL_BITS | {name: 1 << bit for bit, text in named.items() for name in USUAL_BITS if name in text}
+        self._reset_registers()
         self._put_role("id", what.id)
-        self._put_role("baud_rate", next(code for code, rate in self.table.baud_codes.items() if rate == what.baud))
+        self._put_role("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == what.baud))
         for name, value in what.registers.items():
             self._put(name, value)
+        self._stored = bytes(self._memory.raw)
+        self._mode = mode_of(self._memory)
+        self.frame = Frame(self._memory, self._mode)
+        shaft = self.frame.shaft(float(what.start_ticks))
+        self.plant = Plant(shaft, reference=shaft)
+        highest = self._volts("max_voltage_limit")
+        usual = next((volts for limit, volts in _SUPPLIES if highest <= limit), 24.0)
+        self.supply_v = usual if what.supply_v is None else what.supply_v
+        self._power_up()
 
-    # --- what happens to it -------------------------------------------------------------------------------------
+    # --- instructions -------------------------------------------------------------------------------------------
 
-    @abstractmethod
-    def advance(self, now_s: float) -> None:
-        """Move the plant on, and see what that did to it."""
+    def hears(self, baud: int | None, now_s: float) -> bool:
+        """Return whether it understands a host at `baud` now."""
+        awake = self._powered and not self.dead and now_s >= self._deaf_until_s
+        if not awake or self.baud is None or baud is None:
+            return False
+        return abs(self.baud - baud) <= _BAUD_TOLERANCE * self.baud
 
-    @abstractmethod
-    def fail(self, status: int, now_s: float) -> None:
-        """Faults, as bits of `fault_status`; those it is told to give way to take the torque away."""
+    def answers(self, level: int) -> bool:
+        """Return whether it answers instructions of a status return level: 0 ping, 1 read, 2 all others."""
+        return not self.mute and self._level >= level
+
+    def read(self, address: int, length: int, now_s: float) -> tuple[int, bytes]:
+        """Return (error, data)."""
+        self.advance(now_s)
+        if length == 0 or address + length > len(self._memory.raw):
+            return (0 if self._is_feetech else self._beyond), b""
+        data = b""
+        for start, size in self._memory.runs(address, length):
+            for field in self._memory.covered(start, size):
+                if (role := self._measured.get(field.name)) is not None:
+                    self._put(field.name, round(self._measure(role, now_s)))
+            data += self._memory.raw[start : start + size]
+        return 0, data
+
+    def _measure(self, role: str, now_s: float) -> float:
+        """Return the value of a measured register, before it is rounded."""
+        plant, sign, drive = self.plant, self.frame.sign, self.drive
+        match role:
+            case "present_position":
+                return self.frame.shown(plant.position)
+            case "present_speed":
+                return sign * plant.speed * self._speed_per_tick
+            case "present_current":
+                return sign * plant.current_mA() / self._current_scale
+            case "present_load":
+                return 1000.0 * sign * plant.effort
+            case "present_pwm":
+                return 885.0 * sign * plant.speed / self.table.top_speed_ticks_s
+            case "voltage":
+                return 10.0 * self.supply_v
+            case "temperature":
+                return plant.temperature_C
+            case "moving":
+                return plant.speed != 0.0
+            case "moving_status":  # bit 0: in position, bit 1: profile in progress, bits 4 and 5: kind of profile
+                if drive is None or drive.by_speed or abs(drive.goal - plant.position) < _NEAR_TICKS:
+                    return 0x01
+                return 0x02 | (0x30 if drive.profile_acceleration else 0x10) * bool(drive.profile_speed)
+            case "realtime_tick":
+                return int(now_s * 1000.0) & 0x7FFF
+            case "velocity_trajectory":
+                return sign * plant.reference_speed * self._speed_per_tick
+            case "position_trajectory":
+                return self.frame.reported(plant.reference)
+            case _:
+                return self.fault_status
+
+    def write(self, address: int, data: bytes, now_s: float) -> int:
+        """Return the error, 0 when the data were taken. A Dynamixel changes nothing unless all of it is allowed."""
+        self.advance(now_s)
+        wanted: dict[str, int] = {}
+        errors: list[int] = []
+        done = 0
+        for start, size in self._memory.runs(address, len(data)):
+            part = data[done : done + size]
+            done += size
+            fields = self._memory.covered(start, size)
+            errors += [] if fields else [self._unknown]
+            for field in fields:
+                at = field.address - start
+                whole = 0 <= at <= size - field.size
+                value = field.from_bytes(part[at : at + field.size]) if whole else None
+                error = self._refusal(field, value)
+                if value is None or error:
+                    errors.append(error)
+                else:
+                    wanted[field.name] = value
+        counted = errors[:1] if self.table.protocol == 2 else errors  # a number, or bits
+        error = 0 if self._is_feetech else reduce(int.__or__, counted, 0)
+        if not error:
+            self._apply(wanted)
+        return error
+
+    def register(self, address: int, data: bytes) -> int:
+        """Keep a write for `action`."""
+        self._set_registered((address, data))
+        return 0
+
+    def action(self, now_s: float) -> int:
+        """Carry out the registered write; return the error."""
+        kept = self._registered
+        self._set_registered(None)
+        if kept is None:
+            return self._nothing_registered
+        return self.write(*kept, now_s)
+
+    def factory_reset(self, now_s: float, keep: Sequence[str] = ()) -> None:
+        """Set all registers but those of `keep` to their factory values, and restart."""
+        self.advance(now_s)
+        kept = {name: self._get(name) for name in keep}
+        self._reset_registers()
+        for name, value in kept.items():
+            self._put(name, value)
+        self._stored = bytes(self._memory.raw)
+        self.power_cycle(now_s)
+
+    def forget_turns(self, now_s: float) -> None:
+        """Bring the position into one turn; the shaft stays."""
+        self.advance(now_s)
+        self.plant.position %= self.table.ticks_per_revolution
+        self.plant.reference = self.plant.position
+        self._put("goal_position", round(self.frame.reported(self.plant.position)))
+        self._settings()
+
+    def feed_watchdog(self, now_s: float) -> None:
+        """Note that a packet was on the wire; any instruction, to any servo, feeds the bus watchdog."""
+        if self._watchdog:
+            self.advance(now_s)
+        self._received_at_s = now_s
+
+    # --- events -------------------------------------------------------------------------------------------------
+
+    def power_cycle(self, now_s: float) -> None:
+        """Restart: RAM, whole turns, latched faults and what a locked EEPROM did not keep are gone; the shaft stays."""
+        self.advance(now_s)
+        self._memory.raw[:] = self._stored
+        self.plant.position %= self.table.ticks_per_revolution
+        self.fault_status, self._registered, self._tripped = 0, None, False
+        self._deaf_until_s = now_s + self._start_s
+        self._power_up()
+
+    def fail(self, bits: int, now_s: float) -> None:
+        """Set faults, as bits of `fault_status`; those of the shutdown register take the torque away."""
+        self.advance(now_s)
+        self._fail(bits)
 
     def fail_named(self, fault: str, now_s: float) -> None:
-        """The same by name: overheating, overload."""
+        """Set a fault by name: overheating, overload."""
         self.fail(self._bits[fault], now_s)
 
     def set_supply(self, volts: float, now_s: float) -> None:
-        """Too low stops the controller; when it comes back the servo starts anew."""
+        """Change the supply. Too low stops the controller, which restarts when the supply is back."""
         self.advance(now_s)
         self.supply_v = volts
         was_powered, self._powered = self._powered, volts >= _BROWN_OUT * self._volts("min_voltage_limit")
         if not self._powered:
-            self._lose_power()
+            self._put_role("torque_enable", 0)
+            self._settings()
         elif not was_powered:
-            self._start_anew(now_s)
+            self.power_cycle(now_s)
         self._watch_supply()
 
-    @abstractmethod
-    def _lose_power(self) -> None:
-        """The controller stops."""
-
-    @abstractmethod
-    def _start_anew(self, now_s: float) -> None:
-        """The supply is back."""
-
-    @abstractmethod
-    def _watch_supply(self) -> None:
-        """See whether the supply is within the servo's limits."""
-
     def turn(self, ticks: float, now_s: float) -> None:
-        """Somebody turns the shaft by hand, to where its position reads `ticks`."""
+        """Turn the shaft by hand, to where its position reads `ticks`."""
         self.advance(now_s)
-        self.plant.position = self._frame.shaft(ticks)
+        self.plant.position = self.frame.shaft(ticks)
 
     def state(self, now_s: float) -> dict[str, Any]:
-        """What an onlooker sees, whatever the wire says."""
+        """Return what a look at the servo shows, whatever is on the wire."""
         self.advance(now_s)
+        names = self.table.fault_names if self.table.protocol == 2 else self.table.status_fault_names
         return {
-            "position": self._frame.reported(self.plant.position),
-            "speed": self._frame.sign * self.plant.speed,
+            "position": self.frame.reported(self.plant.position),
+            "speed": self.frame.sign * self.plant.speed,
             "goal": self._get("goal_position"),
-            "torque": self._powered and self._role("torque_enable") == 1,
-            "faults": self._fault_names(),
+            "torque": self._powered and self.torque == 1,
+            "faults": names(self.fault_status),
             "temperature_C": self.plant.temperature_C,
         }
 
-    @abstractmethod
-    def _fault_names(self) -> str:
-        """`fault_status` in words."""
+    def advance(self, now_s: float) -> None:
+        """Move the motor on; where the bus watchdog trips meanwhile, the motor stops there."""
+        trip_s = self._received_at_s + self._watchdog * WATCHDOG_TICK_S
+        if self.drive is not None and self._watchdog > 0 and now_s >= trip_s:
+            self._advance(trip_s)
+            self._put("bus_watchdog", -1)
+            self._tripped = True
+            if self.table.watchdog != "flags_only":  # firmware from 53 on stops where it is
+                self._put("goal_position", round(self.frame.reported(self.plant.position)))
+                self._put("goal_velocity", 0)
+            self._settings()
+        self._advance(now_s)
 
-    # --- registers ----------------------------------------------------------------------------------------------
+    def _advance(self, now_s: float) -> None:
+        """Move the motor on; its firmware looks at it on a fixed grid of time, at whatever times it is read."""
+        while self._checks * _CHECK_S <= now_s:
+            if self.drive is None:
+                self._checks = int(now_s / _CHECK_S) + 1
+                break
+            self.plant.advance(self._checks * _CHECK_S, self.drive)
+            self._checks += 1
+            self._watch_motor()
+        self.plant.advance(now_s, self.drive)
+        if self.drive is None:
+            self._watch_motor()
+
+    # --- firmware -----------------------------------------------------------------------------------------------
+
+    _beyond: int  # error of a read beyond the table
+    _unknown: int  # error of a write where there is no register
+    _nothing_registered = 0
+    _start_s = 0.0  # it neither listens nor answers after power-up
+
+    @abstractmethod
+    def _refusal(self, field: Field, value: int | None) -> int:
+        """Return the error of a write to a register, 0 where it is taken. `value`: None for a part of the register."""
+
+    def _apply(self, wanted: Mapping[str, int]) -> None:
+        locked = "lock" in self.table.fields and self._get("lock") == 1
+        for name, value in wanted.items():
+            self._store(name, value, locked)
+        torque = self.table.role("torque_enable")
+        if torque is not None and torque.name in wanted:
+            self._torque_written(wanted[torque.name], locked)
+        elif "goal_position" in wanted and self._goal_enables and not self.torque and not self._shut_down():
+            self._put_role("torque_enable", 1)
+        if self.drive is not None and not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
+            if self._mode in POSITIONING:
+                goal = self.frame.shaft(float(self._get("goal_position")))
+                self.drive = self.drive._replace(goal=self._stepped(wanted) if self._mode is Mode.STEP else goal)
+            return
+        self._settings(self._stepped(wanted))
+        if wanted.keys() & {"min_voltage_limit", "max_voltage_limit"}:
+            self._watch_supply()
+
+    def _store(self, name: str, value: int, locked: bool) -> None:
+        field = self.table[name]
+        if locked and not self._is_feetech and (field.eeprom or name == "lock"):
+            return  # a Dynamixel that is locked stays locked until its supply is switched off
+        if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:  # clipped, not refused
+            value = min(max(value, self._lowest), self._highest) if self._lowest < self._highest else value
+        self._put(name, value)
+        if field.eeprom and not locked:
+            self._keep(field)
+
+    def _keep(self, field: Field) -> None:
+        """Keep a register over the next power-up."""
+        end = field.address + field.size
+        self._stored = self._stored[: field.address] + bytes(self._memory.raw[field.address : end]) + self._stored[end:]
+
+    def _stepped(self, wanted: Mapping[str, int]) -> float:
+        """Return where the steps written so far lead in step mode, in shaft ticks."""
+        start = self.drive.goal if self.drive is not None and self._mode is Mode.STEP else self.plant.position
+        return start + wanted.get("goal_position", 0)
+
+    def _torque_written(self, value: int, locked: bool) -> None:
+        """Do what else a write to torque enable does."""
+        return
+
+    def _set_registered(self, write: tuple[int, bytes] | None) -> None:
+        self._registered = write
+        for name in _PENDING:
+            self._put(name, int(write is not None))
+
+    def _shut_down(self) -> bool:
+        return bool(self.fault_status & self._get("shutdown", self._get("unloading_condition")))
+
+    def _fail(self, bits: int) -> None:
+        self.fault_status |= bits
+        if self._shut_down():
+            self._put_role("torque_enable", 0)
+        self._settings()
+
+    def _watch_motor(self) -> None:
+        if self.plant.overloaded and not self.fault_status & self._bits["overload"]:
+            self._fail(self._bits["overload"])
+        if 0 < self._hottest_C < self.plant.temperature_C:
+            self._fail(self._bits["overheating"])
+
+    def _watch_supply(self) -> None:
+        low, high = self._volts("min_voltage_limit"), self._volts("max_voltage_limit")
+        if self._powered and high and not low <= self.supply_v <= high:
+            self._fail(self._bits["voltage"])
+        elif self.table.protocol == 1:
+            self.fault_status &= ~self._bits["voltage"]
+
+    def _power_up(self) -> None:
+        for field in self.table.fields.values():
+            if not field.eeprom:
+                self._put(field.name, field.initial)
+        self._put_role("torque_enable", 0)
+        self._put("goal_position", self.table.center_ticks)  # the least helpful goal: torque would be a jump
+        self._put_role("torque_limit", self._get("max_torque") or _FULL_TORQUE)
+        self._settings()
+        self._watch_supply()
+
+    def _reset_registers(self) -> None:
+        """Set all registers to their factory values."""
+        for field in self.table.fields.values():
+            self._put(field.name, field.initial)
+        self._put("model_number", self.table.model_number or 0)
+        self._put("firmware_version", self.firmware)
+        self._put("firmware_major", self.firmware)
+        self._put("endianness_flag", int(self.table.byte_order == "big"))
+
+    def _settings(self, stepped: float | None = None) -> None:
+        """Take over what the registers say now. `stepped`: as `_stepped`; None: no step was written."""
+        get = self._get
+        stepped = self._stepped({}) if stepped is None else stepped
+        self.id = self._role("id")
+        second = get("secondary_id", 255)
+        self.second_id = second if second <= dxl2.MAX_ID and second != self.id else None
+        self.baud = self.table.baud_codes.get(self._role("baud_rate"))
+        self.return_delay_s = _DELAY_TICK_S * self._role("return_delay")
+        self._level = self._role("status_level", 2) + self._is_feetech  # a Feetech answers reads at level 0 too
+        self.torque = self._role("torque_enable")
+        self._watchdog, self._hottest_C = get("bus_watchdog"), get("temperature_limit")
+        self._lowest, self._highest = angle_limits(self._memory)
+        # Drive mode (10) of Protocol 2.0; the others always switch torque on by a goal.
+        drive_mode = get("drive_mode") if self.table.protocol == 2 else TORQUE_ON_BY_GOAL
+        self._goal_enables, self._by_time = bool(drive_mode & TORQUE_ON_BY_GOAL), bool(drive_mode & 0x04)
+        self._mode = mode_of(self._memory)
+        self.frame = Frame(self._memory, self._mode)
+        self.drive = None
+        if self.torque == 1:
+            self.drive = motor_command(self._memory, self._mode, self.frame, self.plant.reference, stepped)
 
     def _volts(self, name: str) -> float:
         return self.table[name].to_unit(self._get(name))
 
-    def _role(self, role: str) -> int:
-        """Value of a role's register; a role that the model does not have reads as 1: it limits nothing."""
+    def _role(self, role: str, default: int = 0) -> int:
+        """Return the value of a role's register; `default` where the model has none."""
         field = self.table.role(role)
-        return 1 if field is None else self._get(field.name)
+        return default if field is None else self._get(field.name)
 
     def _put_role(self, role: str, value: int) -> None:
         field = self.table.role(role)
         if field is not None:
             self._put(field.name, value)
-
-
-# --- all servos of one wire that speak one protocol -----------------------------------------------------------------
-
-
-S = TypeVar("S", bound=RegisterServo)
-
-
-class ServoChain(ABC, Generic[S]):
-    """Implements `device.Device`: all emulated servos of one wire that speak one protocol.
-
-    Opens nothing. An instruction to an id that no servo has stays unanswered, and only servos set to the host's baud
-    rate hear it. Where several are asked at once each waits for the one before it: behind a silent id all are silent
-    (`chain_break`), or the chain goes on without it. What a packet means is the subclass's business.
-    """
-
-    _servo_class: ClassVar[Any]
-
-    def __init__(self, servos: Sequence[S], chain_break: bool = True) -> None:
-        self.servos = list(servos)
-        self.chain_break = chain_break
-        self._buffer = bytearray()
-        self._received_at_s = 0.0
-
-    @classmethod
-    def of(cls, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> Self:
-        """Of what is plugged in; `tables` by model."""
-        return cls([cls._servo_class(servo, tables[servo.model]) for servo in servos], chain_break)
-
-    def servo(self, servo_id: int) -> S | None:
-        return next((servo for servo in self.servos if servo.id == servo_id), None)
-
-    def advance(self, now_s: float) -> None:
-        for servo in self.servos:
-            servo.advance(now_s)
-
-    def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
-        """Take bytes that the host sent at `baud` (None = unknown) and give what the servos answer."""
-        return b"".join(reply.data for reply in self.replies(data, baud, now_s))
-
-    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
-        """The same, packet by packet."""
-        if now_s - self._received_at_s > _GAP_S:
-            self._buffer.clear()
-        self._received_at_s = now_s
-        self._buffer += data
-        return self._obey_all(baud, now_s)
-
-    @abstractmethod
-    def _obey_all(self, baud: int | None, now_s: float) -> list[Reply]:
-        """What is answered to the whole packets in the buffer, which are taken out of it."""
-
-
-def same_baud(servo: int | None, host: int | None) -> bool:
-    """Whether a servo understands a host."""
-    return servo is not None and host is not None and abs(servo - host) <= _BAUD_TOLERANCE * servo

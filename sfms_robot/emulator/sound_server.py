@@ -1,6 +1,6 @@
-"""An emulated microphone: a sound server of our own, PulseAudio with null sinks, which PortAudio reaches through ALSA.
+"""An emulated microphone: a PulseAudio server with null sinks, which PortAudio reaches through ALSA.
 
-What is played to a sink is what its monitor records. Unplugging is unloading the sink.
+The monitor of a sink records the sound that is played to it. Unplugging is unloading the sink.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ _LIMIT_S: Final = 60.0  # of one command to the server
 
 
 class SoundServer:
-    """A server in `folder`; `environment` is what programs need to find it, and no other. Linux only.
+    """A server in `folder`; with `environment` programs find it, and no other. Linux only.
 
-    Every method blocks until the server has done what it is asked, and raises CalledProcessError when it cannot.
+    Every method blocks until the server has done its work, and raises CalledProcessError when it cannot.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -32,10 +32,11 @@ class SoundServer:
 
     @staticmethod
     def missing() -> str | None:
-        """What has to be installed, or None."""
+        """Return the command that installs missing programs, or None."""
         return None if all(map(shutil.which, ("pulseaudio", "pactl", "paplay"))) else f"apt-get install {DEBIAN}"
 
     def start(self, *sinks: str) -> None:
+        """Start the server with these sinks."""
         modules = ["module-native-protocol-unix", *(f"module-null-sink sink_name={sink}" for sink in sinks)]
         self._run("pulseaudio", "-n", "--daemonize=yes", "--exit-idle-time=-1", *(f"--load={each}" for each in modules))
 
@@ -52,16 +53,17 @@ class SoundServer:
         self.load("module-null-sink", f"sink_name={sink}")
 
     def unplug(self, sink: str) -> None:
-        """Unload the sink: whoever records it gets nothing more, where there is no other one."""
+        """Unload the sink; a program that records it receives nothing more, where there is no other sink."""
         modules = self._run("pactl", "list", "short", "modules").splitlines()
         (module,) = [line.split()[0] for line in modules if f"sink_name={sink}" in line]
         self._run("pactl", "unload-module", module)
 
     def load(self, module: str, *settings: str) -> None:
+        """Load a module of the server."""
         self._run("pactl", "load-module", module, *settings)
 
     def play(self, sink: str, file: Path | str) -> subprocess.Popen[bytes]:
-        """A program that plays a sound file; to be ended by the caller."""
+        """Start a program that plays a sound file; the caller ends it."""
         words = ["paplay", f"--device={sink}", str(file)]
         return subprocess.Popen(words, env=self._environment(), stderr=subprocess.DEVNULL)
 

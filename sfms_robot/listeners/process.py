@@ -37,14 +37,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
-from sfms_robot.child_process import end_child, messages, start_child
-from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
-from sfms_robot.config.listener import Calmness
-from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 import numpy as np
 
-from sfms_robot.config.calmness import Calmness
+from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
+from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName

@@ -15,10 +15,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from sfms_robot.config.listener import Calmness
-from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.listeners.inbox import MOST_WAITING, Inbox, calmed
-from sfms_robot.listeners.process import CLOSE_LIMIT_S, HUNG_S, Lateness
-from sfms_robot.config.calmness import Calmness
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 from sfms_robot.processes import LIMITS

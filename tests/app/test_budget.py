@@ -1,10 +1,12 @@
 """The wire budget against packets that the codec builds, and against figures known from real chains."""
 
+from dataclasses import asdict
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.app.servo.budget import wire_budget
+from sfms_robot.app.servo.diagnosis import wire_budget
 from sfms_robot.servo.codecs import dxl2
 
 FACTORY = {"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}
@@ -60,6 +62,6 @@ def test_single_reads_of_twenty_five_servos():
     assert budget.plain.ms == pytest.approx(42, abs=0.8)
 
 
-def test_plain_data_is_rounded_and_complete():
-    plain = wire_budget("dynamixel2", 28, **TUNED, read_bytes=10).plain_data()
+def test_budget_is_rounded_and_complete():
+    plain = asdict(wire_budget("dynamixel2", 28, **TUNED, read_bytes=10))
     assert plain["plain"]["bytes"] == 14 + 28 * 5 + 14 + 28 + 28 * 21 and plain["fast"]["hz"] > plain["plain"]["hz"]

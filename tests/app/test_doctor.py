@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 import typer
 
-from sfms_robot.app.servo.budget import wire_budget
 from sfms_robot.app.servo.diagnosis import (
     Command,
     Finding,
@@ -22,12 +21,13 @@ from sfms_robot.app.servo.diagnosis import (
     judge_port,
     judge_rate,
     udev_rule,
+    wire_budget,
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.serial_line import Wire
-from sfms_robot.app.servo.single_servo import parse_ids, reboot, set_baud, write_register
+from sfms_robot.app.servo.single_servo import checked_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
-from sfms_robot.config import load_firmware_map, map_files
+from sfms_robot.config import Faults, Threshold, load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -55,7 +55,10 @@ class Patient:
 
     def __init__(self, chain: Chain, count: int, model: str, masked: Sequence[str]):
         number = load_firmware_map(model).model_number
-        self.wanted = {i: Wanted(f"joint{i}", model, number, frozenset(masked)) for i in range(1, count + 1)}
+        self.wanted = {
+            i: Wanted(joint=f"joint{i}", model=model, model_number=number, faults=Faults(mask=tuple(masked)))
+            for i in range(1, count + 1)
+        }
         self.chain, self.clock = chain, VirtualClock()
 
     def port(self, baud: int = BAUD) -> VirtualTimePort:
@@ -63,7 +66,15 @@ class Patient:
 
     def examined(self, rate_hz: float = 100.0, fix=None, port=None, **line) -> dict:
         """`line`: what else is known of the port than that it is a face's."""
-        usual = Line("face", self.chain.device, "/dev/ttyUSB0", "dynamixel2", BAUD, rate_hz, self.wanted)
+        usual = Line(
+            bus="face",
+            device=self.chain.device,
+            shown="/dev/ttyUSB0",
+            family="dynamixel2",
+            baud=BAUD,
+            rate_hz=rate_hz,
+            wanted=self.wanted,
+        )
         open_port = port or (lambda device, baud: self.port(baud))
         return examine_line(replace(usual, **line), self.clock, open_port, fix=fix)
 
@@ -77,7 +88,7 @@ class Patient:
 
     def set(self, servo: int, register: str, value: int) -> None:
         with self.wire() as wire:
-            write_register(wire, wire.find(servo), register, str(value), lambda question: True)
+            write_register(wire.find(servo), register, str(value), lambda question: True)
 
 
 @contextmanager
@@ -128,8 +139,8 @@ def test_servos_at_another_rate_are_found_there_and_the_fix_brings_them_home():
         assert told(report, "error") == ["ids 2-3: set to 57600 baud, the head says 1000000"]
         assert fix_of(report, "57600") == "sfms-robot servo set-baud 2-3 1000000 --port /dev/ttyUSB0 --baud 57600"
         with sick.wire() as wire:
-            for servo in parse_ids("2-3"):
-                set_baud(wire, wire.find(servo), BAUD, lambda question: True)
+            for servo in checked_ids("2-3"):
+                set_baud(wire.find(servo), BAUD, lambda question: True)
         assert sick.examined()["exit_code"] == 0
 
 
@@ -158,7 +169,7 @@ def test_a_hardware_error_is_named_and_the_reboot_cures_it():
         assert told(report, "error") == ["id 3 (joint3): hardware error: overheating, overload"]
         assert fix_of(report, "overload").startswith("sfms-robot servo reboot 3 --port")
         with sick.wire() as wire:
-            reboot(wire, wire.find(3), lambda question: True)
+            reboot(wire.find(3), lambda question: True)
         assert sick.examined()["exit_code"] == 0
 
 
@@ -228,7 +239,7 @@ def test_a_servo_that_only_answers_pings_gets_its_voice_back_by_the_fix():
 def test_a_fault_within_the_head_s_own_threshold_is_a_note_and_beyond_it_an_error():
     with patient() as sick:
         for servo, want in sick.wanted.items():
-            sick.wanted[servo] = replace(want, thresholds={"input voltage": (None, 7.5)})
+            sick.wanted[servo] = replace(want, faults=Faults(thresholds={"input voltage": Threshold(max=7.5)}))
         sick.chain.supply(7.2)
         sick.chain.fault(1, 0x01)
         assert sick.examined()["exit_code"] == 0
@@ -289,7 +300,10 @@ def test_every_model_that_has_a_map_can_be_examined(family):
     ]
     servos = [EmulatedServo(i, model, start_ticks=500) for i, model in enumerate(models, start=1)]
     with patient(*servos) as sick:
-        wanted = {i: Wanted(model, model, load_firmware_map(model).model_number) for i, model in enumerate(models, 1)}
+        wanted = {
+            i: Wanted(joint=model, model=model, model_number=load_firmware_map(model).model_number)
+            for i, model in enumerate(models, 1)
+        }
         report = sick.examined(10.0, family=family, wanted=wanted)
     assert told(report, "error") == []
     assert [row["model"] for row in report["servos"]] == models
@@ -335,7 +349,7 @@ def test_a_board_of_hobby_servos_is_opened_and_reckoned_with():
 
 
 def no_port(path: str) -> dict:
-    line = Line(None, path, path, "dynamixel2", BAUD, 100.0, {})
+    line = Line(device=path, shown=path, family="dynamixel2", baud=BAUD, rate_hz=100.0, wanted={})
     clock = RealClock()
     return examine_line(line, clock, lambda device, baud: SerialPort(device, baud, clock))
 
@@ -462,7 +476,7 @@ def test_findings_alike_are_one_and_the_worst_come_first():
 
 @pytest.mark.parametrize("ids", [[1], [1, 2, 3], [1, 3, 5], [9, 1, 2, 12, 11]])
 def test_ids_are_written_as_the_commands_take_them(ids):
-    assert parse_ids(ids_text(ids)) == sorted(ids)
+    assert checked_ids(ids_text(ids)) == sorted(ids)
 
 
 def test_every_command_that_is_proposed_is_one_that_the_program_has():
@@ -482,9 +496,9 @@ def test_every_command_that_is_proposed_is_one_that_the_program_has():
 
 def test_a_doctor_is_not_asked_about_unknown_things():
     with pytest.raises(ConfigError, match="dynamixel2"):
-        examine("/dev/null", None, "dynamixel9", None, RealClock())
+        examine("/dev/null", None, "dynamixel9", None)
     with pytest.raises(ConfigError, match="nobody"):
-        examine("sim", "nobody", None, None, RealClock())
+        examine("sim", "nobody", None, None)
 
 
 @pytest.mark.parametrize("where", [{"port": "sim", "head": None}, {"port": "/dev/null", "head": "reachy_mini"}])
@@ -492,11 +506,11 @@ def test_a_doctor_is_not_asked_about_unknown_things():
 def test_what_a_heads_file_says_is_not_said_once_more(where, flag, value):
     said = {"family": None, "baud": None, flag.removeprefix("--"): value}
     with pytest.raises(ConfigError, match=f"^{flag} {value}: head '{where['head'] or 'face28'}'"):
-        examine(**where, **said, clock=RealClock())
+        examine(**where, **said)
 
 
 @pytest.mark.parametrize("url", ["socket://nohost", "ftp://host:1"])
 def test_an_address_that_is_none_gets_no_advice_about_files(url):
-    report = examine(url, None, None, None, RealClock())
+    report = examine(url, None, None, None)
     (finding,) = report["findings"]
     assert report["exit_code"] == 3 and "://HOST:PORT" in finding["problem"] and "fuser" not in finding["fix"]

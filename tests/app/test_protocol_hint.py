@@ -3,7 +3,7 @@
 import pytest
 from test_single_servo import wire_on
 
-from sfms_robot.app.servo.protocol_hint import protocol_hint
+from sfms_robot.app.servo.serial_line import protocol_hint
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 

@@ -5,7 +5,7 @@ from test_single_servo import put, wire_on
 
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.servo.move import BEHIND_DEG, SILENT, SPEED_DEG_S, move, release, release_chain
-from sfms_robot.app.servo.single_servo import field_named, read, read_registers
+from sfms_robot.app.servo.single_servo import read_registers
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
@@ -44,12 +44,12 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
     with wire_on(at(model), family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)
         table = seen.registers()
-        speed, torque = table.role("moving_speed"), field_named(table, "torque_enable")
-        before = read(wire, seen, speed)
+        speed, torque = table.role("moving_speed"), seen.named("torque_enable")
+        before = seen.read(speed)
         wire.clock = watched = Watched(wire, chain)
-        result = move(wire, seen, None, str(by))
+        result = move(seen, None, str(by))
         assert abs(result["reached"] - (table.center_ticks + by)) <= table.ticks_per_revolution / 200
-        assert (read(wire, seen, torque), read(wire, seen, speed)) == (0, before)
+        assert (seen.read(torque), seen.read(speed)) == (0, before)
         degrees = 360.0 / table.ticks_per_revolution
         steps = zip(watched.seen, watched.seen[1:], strict=False)
         speeds = [abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s]
@@ -59,13 +59,13 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
 def test_a_servo_that_held_goes_on_holding():
     with wire_on(at("xl330-m288")) as (wire, _):
         put(wire, 1, "torque_enable", 1)
-        move(wire, wire.find(1), "2100", None)
-        assert read(wire, wire.find(1), wire.find(1).registers()["torque_enable"]) == 1
+        move(wire.find(1), "2100", None)
+        assert wire.find(1).read(wire.find(1).named("torque_enable")) == 1
 
 
 def test_degrees_are_those_of_the_shaft():
     with wire_on(at("xl330-m288")) as (wire, _):
-        assert move(wire, wire.find(1), None, "-9deg")["to"] == 2048 - 102
+        assert move(wire.find(1), None, "-9deg")["to"] == 2048 - 102
 
 
 @pytest.mark.parametrize(
@@ -74,13 +74,13 @@ def test_degrees_are_those_of_the_shaft():
         ("9999", None, "outside its limits"),
         (None, None, "one of them"),
         ("5", "5", "one of them"),
-        ("x", None, "no place"),
+        ("x", None, "not a place"),
     ],
 )
 def test_what_is_no_goal_is_refused_with_nothing_moved(to, by, problem):
     with wire_on(at("xl330-m288")) as (wire, chain):
         with pytest.raises(ConfigError, match=problem):
-            move(wire, wire.find(1), to, by)
+            move(wire.find(1), to, by)
         assert not chain.state(1)["torque"]
 
 
@@ -88,7 +88,7 @@ def test_its_own_limits_hold():
     registers = {"min_position_limit": 2000, "max_position_limit": 2100}
     with wire_on(at("xl330-m288", registers=registers)) as (wire, _):
         with pytest.raises(ConfigError, match="2000..2100"):
-            move(wire, wire.find(1), "2200", None)
+            move(wire.find(1), "2200", None)
 
 
 def outside(model, degrees=-12.0):
@@ -106,16 +106,16 @@ def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, cap
     servo, first, table = outside(model)
     with wire_on(servo, family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)
-        speed, torque = table.role("moving_speed"), field_named(table, "torque_enable")
-        before = read(wire, seen, speed)
+        speed, torque = table.role("moving_speed"), seen.named("torque_enable")
+        before = seen.read(speed)
         wire.clock = watched = Watched(wire, chain)
-        result = move(wire, seen, str(table.center_ticks), None)
+        result = move(seen, str(table.center_ticks), None)
         assert abs(result["reached"] - table.center_ticks) <= table.ticks_per_revolution / 200
-        assert (read(wire, seen, torque), read(wire, seen, speed)) == (0, before)
+        assert (seen.read(torque), seen.read(speed)) == (0, before)
         degrees = 360.0 / table.ticks_per_revolution
         steps = zip(watched.seen, watched.seen[1:], strict=False)
         assert max(abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s) <= 2.5 * SPEED_DEG_S
-    assert f"stands at {servo.start_ticks}, outside its limits {first}.." in caplog.text
+    assert f"stands at {servo.start_ticks}, outside its own limits {first}.." in caplog.text
     assert "moving it inside at 20 deg/s" in caplog.text
 
 
@@ -135,12 +135,12 @@ def test_one_that_does_not_come_in_has_no_torque_before_its_usual_profile_is_bac
     with wire_on(servo, family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)
         speed, clock = table.role("moving_speed"), wire.clock
-        before = read(wire, seen, speed)
+        before = seen.read(speed)
         wire.clock = Ended(wire, chain)
         with pytest.raises((ServoError, KeyboardInterrupt)):
-            move(wire, seen, str(table.center_ticks), None)
+            move(seen, str(table.center_ticks), None)
         wire.clock = clock
-        assert read(wire, seen, speed) == before and not chain.state(1)["torque"]
+        assert seen.read(speed) == before and not chain.state(1)["torque"]
         assert chain.state(1)["position"] < first
 
 
@@ -148,7 +148,7 @@ def test_a_goal_outside_its_limits_brings_nobody_in():
     servo, *_ = outside("xl330-m288")
     with wire_on(servo) as (wire, chain):
         with pytest.raises(ConfigError, match="outside its limits"):
-            move(wire, wire.find(1), None, "1")
+            move(wire.find(1), None, "1")
         assert not chain.state(1)["torque"] and chain.state(1)["position"] == servo.start_ticks
 
 
@@ -164,14 +164,14 @@ def test_something_in_the_way_ends_it_without_torque():
 
         wire.clock = Blocked(wire, chain)
         with pytest.raises(ServoError, match="something is in the way"):
-            move(wire, wire.find(1), None, "60deg")
+            move(wire.find(1), None, "60deg")
         assert not chain.state(1)["torque"] and abs(chain.state(1)["position"] - 2048) < BEHIND_DEG * 4096 / 360
 
 
 def test_another_mode_is_refused_with_what_to_type():
     with wire_on(at("xl330-m288", registers={"operating_mode": 1})) as (wire, _):
         with pytest.raises(ServoError, match="sfms-robot servo write 1 operating_mode 3"):
-            move(wire, wire.find(1), "2050", None)
+            move(wire.find(1), "2050", None)
 
 
 class Interrupted(Watched):
@@ -216,7 +216,7 @@ def test_after_an_interrupt_torque_is_off_or_named(more, ends):
         seen = wire.find(1)
         wire.clock = Interrupted(wire, chain, more)
         with pytest.raises(ends) as ended:
-            move(wire, seen, None, "200")
+            move(seen, None, "200")
         assert chain.state(1)["torque"] == (ends is TorqueError)
     assert ends is KeyboardInterrupt or str(ended.value).startswith("torque of id 1 could not be confirmed off")
 
@@ -302,7 +302,7 @@ def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, name
         live = ("present", "moving", "realtime", "torque_enable", "velocity_trajectory", "position_trajectory")
 
         def settings(servo):
-            values = read_registers(wire, wire.find(servo), ["all"])
+            values = read_registers(wire.find(servo), ["all"])
             return {value.field.name: value.raw for value in values if not value.field.name.startswith(live)}
 
         before = settings(1)

@@ -5,17 +5,18 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.register_view import read_all, watch
 from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire
 from sfms_robot.app.servo.single_servo import (
+    checked_ids,
     factory_reset,
-    parse_ids,
     parse_value,
+    read_all,
     read_registers,
     reboot,
     scan,
     set_baud,
     set_id,
+    watched,
     write_register,
 )
 from sfms_robot.config import load_firmware_map
@@ -57,7 +58,7 @@ def three() -> Iterator[tuple[Wire, Chain]]:
 
 
 def put(wire: Wire, servo: int, register: str, value: int) -> None:
-    write_register(wire, wire.find(servo), register, str(value), yes)
+    write_register(wire.find(servo), register, str(value), yes)
 
 
 # --- finding ----------------------------------------------------------------------------------------------------
@@ -94,18 +95,18 @@ def test_a_fixed_rate_is_the_only_one_looked_at():
 
 
 def test_ids_are_parsed_or_explained():
-    assert parse_ids("1,5,10-12") == [1, 5, 10, 11, 12]
+    assert checked_ids("1,5,10-12") == [1, 5, 10, 11, 12]
     for text in ("", "a", "3-1", "1,,2", "-4"):
         with pytest.raises(ConfigError, match="list of ids"):
-            parse_ids(text)
+            checked_ids(text)
 
 
 def test_a_model_without_a_number_is_read_when_somebody_says_what_it_is():
     with wire_on(EmulatedServo(1, "sts3032"), family="feetech") as (wire, _):
         with pytest.raises(ConfigError, match=r"no firmware map.*sts3032.*--model"):
-            read_registers(wire, wire.find(1), ["voltage"])
+            read_registers(wire.find(1), ["voltage"])
         told = Wire(wire.port, "feetech", wire.clock, wire.baud, model="sts3032")
-        assert read_registers(told, told.find(1), ["voltage"])[0].raw > 0
+        assert read_registers(told.find(1), ["voltage"])[0].raw > 0
 
 
 def test_an_id_out_of_range_is_refused_before_anything_is_sent(three):
@@ -121,14 +122,14 @@ def test_an_id_out_of_range_is_refused_before_anything_is_sent(three):
 
 def test_registers_are_read_by_name_in_raw_and_unit(three):
     wire, _ = three
-    (goal, volt) = read_registers(wire, wire.find(2), ["present_position", "voltage"])
+    (goal, volt) = read_registers(wire.find(2), ["present_position", "voltage"])
     assert goal.raw == 1500 and goal.row()["value"] == pytest.approx(1500 * 360 / 4096) and goal.row()["unit"] == "deg"
     assert volt.field.name == "present_input_voltage" and volt.row()["unit"] == "V"
 
 
 def test_all_registers_come_in_the_order_of_their_addresses(three):
     wire, _ = three
-    values = read_registers(wire, wire.find(1), ["all"])
+    values = read_registers(wire.find(1), ["all"])
     addresses = [each.field.address for each in values]
     assert addresses == sorted(addresses) and len(values) == len(load_firmware_map("xl330-m288").registers)
 
@@ -136,8 +137,8 @@ def test_all_registers_come_in_the_order_of_their_addresses(three):
 def test_the_whole_table_read_at_once_says_the_same_as_register_by_register(three):
     wire, _ = three
     seen = wire.find(7)
-    state = read_all(wire, seen)
-    for each in read_registers(wire, seen, ["all"]):
+    state = read_all(seen)
+    for each in read_registers(seen, ["all"]):
         if each.field.name != "realtime_tick":
             assert state.value(each.field.name) == each.raw
 
@@ -145,12 +146,12 @@ def test_the_whole_table_read_at_once_says_the_same_as_register_by_register(thre
 def test_an_unknown_register_lists_those_there_are(three):
     wire, _ = three
     with pytest.raises(ConfigError, match=r"goal_postion.*goal_position"):
-        read_registers(wire, wire.find(1), ["goal_postion"])
+        read_registers(wire.find(1), ["goal_postion"])
 
 
 def test_a_ram_register_is_written_unasked_and_read_back(three):
     wire, _ = three
-    before, after = write_register(wire, wire.find(1), "led", "1", no)
+    before, after = write_register(wire.find(1), "led", "1", no)
     assert before is not None and (before.raw, after.raw) == (0, 1)
 
 
@@ -181,7 +182,7 @@ def test_what_may_not_be_written_is_refused_before_anything_is_sent(three, regis
     seen = wire.find(1)
     before = chain.digest()
     with pytest.raises(ConfigError, match=problem):
-        write_register(wire, seen, register, value, yes)
+        write_register(seen, register, value, yes)
     assert chain.digest() == before
 
 
@@ -189,9 +190,9 @@ def test_eeprom_is_written_only_when_somebody_says_yes(three):
     wire, _ = three
     seen = wire.find(1)
     with pytest.raises(ConfigError, match="not confirmed"):
-        write_register(wire, seen, "return_delay_time", "0", no)
-    assert read_registers(wire, seen, ["return_delay_time"])[0].raw == 250
-    _, after = write_register(wire, seen, "return_delay_time", "0us", yes)
+        write_register(seen, "return_delay_time", "0", no)
+    assert read_registers(seen, ["return_delay_time"])[0].raw == 250
+    _, after = write_register(seen, "return_delay_time", "0us", yes)
     assert after.raw == 0
 
 
@@ -199,13 +200,13 @@ def test_eeprom_stays_closed_while_torque_is_on_and_the_way_out_is_told(three):
     wire, _ = three
     put(wire, 1, "torque_enable", 1)
     with pytest.raises(ServoError, match="servo write 1 torque_enable 0"):
-        write_register(wire, wire.find(1), "return_delay_time", "0", yes)
+        write_register(wire.find(1), "return_delay_time", "0", yes)
 
 
 def test_a_servo_that_acknowledges_nothing_is_written_all_the_same(three):
     wire, _ = three
     put(wire, 1, "status_return_level", 1)
-    _, after = write_register(wire, wire.find(1), "led", "1", yes)
+    _, after = write_register(wire.find(1), "led", "1", yes)
     assert after.raw == 1
 
 
@@ -215,9 +216,9 @@ def test_a_servo_that_answers_pings_only_is_said_to_be_one(three):
     field = seen.registers()["status_return_level"]
     wire.link.write(1, field.address, field.to_bytes(0))
     with pytest.raises(ServoError, match="status return level 0"):
-        read_registers(wire, seen, ["led"])
+        read_registers(seen, ["led"])
     put(wire, 1, "status_return_level", 2)
-    assert read_registers(wire, seen, ["led"])[0].raw == 0
+    assert read_registers(seen, ["led"])[0].raw == 0
 
 
 # --- id, rate, start over ---------------------------------------------------------------------------------------
@@ -225,7 +226,7 @@ def test_a_servo_that_answers_pings_only_is_said_to_be_one(three):
 
 def test_an_id_is_changed_on_a_wire_of_one():
     with wire_on(EmulatedServo(1, baud=57_600)) as (wire, _):
-        changed = set_id(wire, wire.find(1), 5, yes)
+        changed = set_id(wire.find(1), 5, yes)
         assert changed.id == 5 and changed.baud == 57_600
         assert [each.id for each in scan(wire)] == [5]
 
@@ -233,8 +234,8 @@ def test_an_id_is_changed_on_a_wire_of_one():
 def test_an_id_on_a_wire_of_several_needs_to_be_meant(three):
     wire, _ = three
     with pytest.raises(ConfigError, match="id 7.*--in-chain"):
-        set_id(wire, wire.find(1), 5, yes)
-    assert set_id(wire, wire.find(1), 5, yes, in_chain=True).id == 5
+        set_id(wire.find(1), 5, yes)
+    assert set_id(wire.find(1), 5, yes, in_chain=True).id == 5
     assert sorted(each.id for each in scan(wire, ids=range(10))) == [2, 5, 7]
 
 
@@ -244,7 +245,7 @@ def test_an_id_on_a_wire_of_several_needs_to_be_meant(three):
 def test_an_id_that_cannot_be_had_is_refused(three, new, problem):
     wire, _ = three
     with pytest.raises(ConfigError, match=problem):
-        set_id(wire, wire.find(1), new, yes, in_chain=True)
+        set_id(wire.find(1), new, yes, in_chain=True)
     assert wire.find(1).id == 1
 
 
@@ -252,7 +253,7 @@ def test_an_id_that_two_servos_seem_to_have_is_left_alone(three):
     wire, chain = three
     chain.inject("duplicate:1=1")
     with pytest.raises(ServoError, match="two servos seem to answer"):
-        set_id(wire, wire.find(1), 5, yes, in_chain=True)
+        set_id(wire.find(1), 5, yes, in_chain=True)
 
 
 def test_a_scan_says_where_two_servos_seem_to_have_one_id(three):
@@ -264,15 +265,15 @@ def test_a_scan_says_where_two_servos_seem_to_have_one_id(three):
 def test_a_wire_that_loses_answers_now_and_then_only_needs_patience(three):
     wire, chain = three
     chain.inject("drop=0.2")
-    assert [read_registers(wire, wire.find(7), ["present_position"])[0].raw for _ in range(20)] == [2300] * 20
+    assert [read_registers(wire.find(7), ["present_position"])[0].raw for _ in range(20)] == [2300] * 20
 
 
 def test_nothing_changes_when_the_answer_is_no():
     with wire_on(EmulatedServo(1)) as (wire, _):
         for change in (
-            lambda: set_id(wire, wire.find(1), 5, no),
-            lambda: set_baud(wire, wire.find(1), 57_600, no),
-            lambda: factory_reset(wire, wire.find(1), "all", no),
+            lambda: set_id(wire.find(1), 5, no),
+            lambda: set_baud(wire.find(1), 57_600, no),
+            lambda: factory_reset(wire.find(1), "all", no),
         ):
             with pytest.raises(ConfigError, match="not confirmed"):
                 change()
@@ -281,39 +282,39 @@ def test_nothing_changes_when_the_answer_is_no():
 
 def test_a_rate_is_changed_and_met_again(three):
     wire, _ = three
-    assert set_baud(wire, wire.find(2), 1_000_000, yes).baud == 1_000_000
+    assert set_baud(wire.find(2), 1_000_000, yes).baud == 1_000_000
     assert sorted(each.id for each in scan(wire) if each.baud == 1_000_000) == [1, 2, 7]
 
 
 def test_a_rate_the_servo_does_not_have_lists_those_it_has(three):
     wire, _ = three
     with pytest.raises(ConfigError, match=r"250000.*57600.*1000000"):
-        set_baud(wire, wire.find(1), 250_000, yes)
+        set_baud(wire.find(1), 250_000, yes)
 
 
 def test_a_reboot_forgets_a_fault_and_asks_before_it_lets_go(three):
     wire, chain = three
     put(wire, 1, "torque_enable", 1)
     with pytest.raises(ConfigError, match="lets go"):
-        reboot(wire, wire.find(1), no)
+        reboot(wire.find(1), no)
     chain.fault(1, 0x20)
-    assert watch(wire, [wire.find(1)])[0]["faults"] == "overload"
-    assert reboot(wire, wire.find(1), yes).id == 1
-    assert watch(wire, [wire.find(1)])[0]["faults"] == ""
+    assert watched(wire.find(1))["faults"] == "overload"
+    assert reboot(wire.find(1), yes).id == 1
+    assert watched(wire.find(1))["faults"] == ""
 
 
 @pytest.mark.parametrize(("keep", "servo", "baud"), [("all", 1, 57_600), ("keep-id", 7, 57_600),
                                                      ("keep-id-and-baud", 7, 1_000_000)])  # fmt: skip
 def test_a_factory_reset_ends_where_it_says(keep, servo, baud):
     with wire_on(EmulatedServo(7)) as (wire, _):
-        back = factory_reset(wire, wire.find(7), keep, yes)
+        back = factory_reset(wire.find(7), keep, yes)
         assert (back.id, back.baud) == (servo, baud)
 
 
 def test_a_factory_reset_does_not_make_two_servos_of_one_id():
     with wire_on(EmulatedServo(1, baud=57_600), EmulatedServo(7)) as (wire, _):
         with pytest.raises(ConfigError, match="id 1.*unplug"):
-            factory_reset(wire, wire.find(7), "all", yes)
+            factory_reset(wire.find(7), "all", yes)
         assert wire.find(7).baud == 1_000_000
 
 
@@ -325,7 +326,7 @@ def test_watching_shows_position_supply_and_who_fell_silent(three):
     servos = [wire.find(1), wire.find(7)]
     chain.kill(7)
     before = chain.digest()
-    one, seven = watch(wire, servos)
+    one, seven = (watched(seen) for seen in servos)
     assert one["position"] == 2048 and one["position_deg"] == 180.0 and one["torque"] is False
     assert 3.0 < one["voltage_V"] < 9.0 and one["temperature_degC"] > 0 and one["faults"] == ""
     assert seven["faults"] == "silent" and seven["position"] is None
@@ -338,7 +339,7 @@ def test_watching_shows_position_supply_and_who_fell_silent(three):
 def test_a_path_that_is_no_port_says_why(tmp_path):
     with pytest.raises(PortError, match="directory"):
         check_device(str(tmp_path))
-    with pytest.raises(PortError, match="no such device"), open_wire(str(tmp_path / "x"), "dynamixel2", None, "", None):
+    with pytest.raises(PortError, match="no such device"), open_wire(str(tmp_path / "x"), "dynamixel2", None, ""):
         pass
 
 
@@ -358,12 +359,12 @@ def test_rates_that_the_adapter_cannot_do_are_passed_over_and_never_set():
         wire = Wire(port, "dynamixel2", clock, 1_000_000)
         assert len(scan(wire)) == 3
         with pytest.raises(PortError, match="cannot do 4000000"):
-            set_baud(wire, wire.find(1), 4_000_000, yes)
+            set_baud(wire.find(1), 4_000_000, yes)
         assert wire.find(1).baud == 1_000_000
         port.close()
 
 
 def test_an_unknown_family_lists_the_known_ones():
     with pytest.raises(ConfigError, match="dynamixel3.*dynamixel2, dynamixel1, feetech"):
-        with open_wire("sim", "dynamixel3", None, "face28", VirtualClock()):
+        with open_wire("sim", "dynamixel3", None, "face28"):
             pass

@@ -9,7 +9,7 @@ import math
 
 import pytest
 
-from sfms_robot.app.servo.emulated_chains import EmulateOptions, emulators
+from sfms_robot.app.servo.emulated_chains import emulators
 
 controller = pytest.importorskip("reachy_mini_motor_controller")
 
@@ -20,7 +20,7 @@ IDS = range(10, 19)
 
 @pytest.fixture(params=[5.0, None])
 def robot(request):
-    with emulators(EmulateOptions(head="reachy_mini", voltage=request.param)) as chains:
+    with emulators(head="reachy_mini", voltage=request.param) as chains:
         [chain] = chains.values()
         alert = "" if request.param else "input voltage"
         assert [chain.state(i)["faults"] for i in IDS] == [alert] * 9

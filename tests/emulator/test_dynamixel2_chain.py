@@ -5,7 +5,7 @@ from emulated_devices import device_of, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, encode_instruction, maybe_packet
 
@@ -105,12 +105,6 @@ def test_without_torque_a_goal_moves_nothing(host):
     host.write(1, "goal_position", 3000)
     host.t = 2.0
     assert host.read(1, "present_position") == 2001
-
-
-def test_torque_before_a_goal_jumps_to_the_middle(host):
-    host.write(1, "torque_enable", 1)
-    host.t = 2.0
-    assert host.read(1, "present_position") == 2048
 
 
 def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):

@@ -3,9 +3,9 @@
 import pytest
 from emulated_devices import chain_of, device_of, servos_of
 
-from sfms_robot.emulator.device import EmulatedServo
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.device import Reply
+from sfms_robot.emulator.emulated_wire import Reply
 from sfms_robot.emulator.faults import KINDS, TO_SERVOS, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 
@@ -37,17 +37,17 @@ def test_spec_is_read(text, kind, ids, start_s, end_s, value):
     [
         ("dorp", "has no such kind as 'dorp' (drop, delay"),
         ("drop=1.5", "is out of range: fraction of replies of drop (0..1)"),
-        ("drop:9-3", "holds a number that is none"),
-        ("drop:1-999", "holds a number that is none"),
+        ("drop:9-3", "holds a bad number"),
+        ("drop:1-999", "holds a bad number"),
         ("drop@4-2", "ends at 2 s, before it starts"),
-        ("drop@1.2.3", "holds a number that is none"),
+        ("drop@1.2.3", "holds a bad number"),
         ("stuck:1=4", "takes no value"),
         ("noise:3", "cannot name ids"),
         ("request-drop:3", "cannot name ids: request-drop concerns the whole wire"),
         ("request-drop=2", "is out of range: fraction of requests of request-drop (0..1)"),
         ("voltage", "needs a value in volts"),
-        ("drop three", "is no fault"),
-        ("", "is no fault"),
+        ("drop three", "cannot be read"),
+        ("", "cannot be read"),
     ],
 )
 def test_bad_spec_is_one_clear_line(text, problem):

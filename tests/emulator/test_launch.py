@@ -1,3 +1,5 @@
+"""The emulator's process as a whole: control socket, terminal, virtual time, its end."""
+
 import os
 import signal
 import subprocess
@@ -5,14 +7,225 @@ import sys
 from pathlib import Path
 
 import pytest
+import serial
+from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.launch import EmulatedServo, launch, wait
-from sfms_robot.errors import BusError
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
+from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.servo.registers import Table
+
+POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
+BAUD = 1_000_000
+
+
+class Host:
+    """A host in virtual time."""
+
+    def __init__(self, chain: Chain):
+        self.clock = Time()
+        self.port = VirtualTimePort(chain.device, chain.control, BAUD, self.clock)
+
+    def ask(self, *ids: int, patience_s: float = 0.003) -> list[int]:
+        """Ids that answer a sync read within `patience_s`."""
+        self.port.discard_input()
+        self.port.write(encode_instruction(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + bytes(ids)))
+        buffer = bytearray()
+        while data := self.port.read(4096, self.clock.t + patience_s):
+            buffer += data
+        found = []
+        while (packet := maybe_packet(buffer)) is not None:
+            found.append(packet.servo)
+        return found
+
+
+@pytest.fixture
+def virtual():
+    """Start a chain in virtual time and a host on it."""
+    open_ = []
+
+    def start(*servos: EmulatedServo, **how):
+        chain = launch(servos or [EmulatedServo(i) for i in (1, 2, 3)], virtual=True, **how)
+        open_.append(chain)
+        host = Host(chain)
+        open_.append(host.port)
+        return chain, host
+
+    yield start
+    for each in reversed(open_):
+        each.close()
+
+
+def ping(device: str, servo: int, baud: int = BAUD) -> bytes:
+    with serial.Serial(device, baud, timeout=10) as port:
+        port.write(encode_instruction(servo, dxl2.PING))
+        return port.read(14)
+
+
+def test_reply_that_is_late_counts_as_silence_and_cannot_come_after_the_next_flush(virtual):
+    chain, host = virtual(faults=["delay:2=0.005"])
+    assert host.ask(1, 2, 3) == [1, 3]
+    host.clock.t = 0.01
+    assert host.ask(1) == [1]  # what came at 0.005 was thrown away
+    host.clock.t = 0.02
+    assert host.ask(1, 2, 3, patience_s=0.01) == [1, 3, 2]
+
+
+def test_reply_that_comes_just_after_the_flush_is_seen_among_the_next(virtual):
+    chain, host = virtual(faults=["delay:2@0-0.005=0.0105"])
+    assert host.ask(1, 2, 3) == [1, 3]
+    host.clock.t = 0.01
+    assert host.ask(1) == [1, 2]
+
+
+def test_on_the_wire_what_is_not_through_by_the_deadline_is_not_there(virtual):
+    chain, host = virtual(*[EmulatedServo(i, baud=57_600) for i in (1, 2, 3)], timing="wire")
+    host.port.set_baud(57_600)
+    assert host.ask(1, 2, 3, patience_s=0.005) == []
+    host.clock.t = 1.0
+    assert host.ask(1, 2, 3, patience_s=0.05) == [1, 2, 3]
+
+
+def test_faults_come_and_go_at_run_time(virtual):
+    chain, host = virtual()
+    chain.inject("silent:2")
+    assert host.ask(1, 2, 3) == [1] and chain.faults() == ["silent:2"]
+    chain.clear_faults()
+    host.clock.t = 0.01
+    assert host.ask(1, 2, 3) == [1, 2, 3] and chain.faults() == []
+
+
+def test_onlooker_sees_the_truth(virtual):
+    chain, host = virtual(EmulatedServo(1, registers={"homing_offset": 512}), EmulatedServo(2))
+    chain.turn(1, 1234)
+    state = chain.state(1)
+    assert (state["position"], state["torque"], state["faults"]) == (1234, False, "")
+    chain.supply(9.0)
+    assert chain.state(2)["faults"] == "input voltage"
+
+
+@pytest.mark.parametrize("request_", ["inject dorp", "inject drop:9", "turn 1 x", "turn", "supply", "state 9", "dance"])
+def test_request_that_makes_no_sense_is_refused_and_harms_nothing(virtual, request_):
+    chain, host = virtual()
+    with pytest.raises(BusError, match="refuses"):
+        chain.ask(request_)
+    assert host.ask(1, 2, 3) == [1, 2, 3]
+
+
+def test_hung_up_in_virtual_time_and_back(virtual):
+    chain, host = virtual(faults=["hangup@1-2"])
+    host.clock.t = 1.5
+    with pytest.raises(BusError):
+        host.ask(1)
+    host.port.close()
+    assert not os.path.lexists(chain.device)
+    chain.time_is(2.5)
+    again = Host(chain)
+    again.clock.t = 3.0
+    assert again.ask(1, 2, 3) == [1, 2, 3]
+    again.port.close()
+
+
+def test_unplugged_device_vanishes_and_comes_back_under_its_name():
+    with launch([EmulatedServo(1)]) as chain:
+        with serial.Serial(chain.device, BAUD, timeout=10) as port:
+            chain.hang_up()
+            with pytest.raises(OSError):
+                port.write(b"x" * 64)
+                port.read(1)
+        assert not os.path.lexists(chain.device)
+        chain.come_back()
+        assert len(ping(chain.device, 1)) == 14
+
+
+@pytest.mark.parametrize(("model", "baud"), [("xl430-w250", 4_500_000), ("xl330-m288", 57_600)])
+def test_odd_bauds_are_heard_and_others_are_not(model, baud):
+    with launch([EmulatedServo(1, model, baud)]) as chain:
+        assert len(ping(chain.device, 1, baud)) == 14
+        with serial.Serial(chain.device, 1_000_000, timeout=0) as port:
+            port.write(encode_instruction(1, dxl2.PING))
+            chain.digest()
+            assert port.read(14) == b""
+
+
+def test_wire_timing_tells_when_replies_were_due_and_when_they_left():
+    with launch([EmulatedServo(1)], timing="wire") as chain:
+        ping(chain.device, 1)
+        [stamp] = chain.stamps()
+        statistics = chain.statistics()
+    assert stamp["ids"] == [1] and stamp["sent_s"] >= stamp["due_s"]
+    assert statistics["replies"] == 1 and statistics["bytes_out"] == 14
+    assert statistics["busy_s"] == pytest.approx((10 + 14) * 10 / BAUD)
+
+
+def test_link_is_made_and_removed(tmp_path):
+    link = tmp_path / "servos"
+    with launch([EmulatedServo(1)], link=str(link)) as chain:
+        assert chain.device == str(link) and len(ping(str(link), 1)) == 14
+        with pytest.raises(ConfigError, match="is already there"):
+            launch([EmulatedServo(1)], link=str(link))
+    assert not os.path.lexists(link)
+
+
+def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
+    link = tmp_path / "servos"
+    link.symlink_to(tmp_path / "gone")
+    with launch([EmulatedServo(1)], link=str(link)):
+        assert len(ping(str(link), 1)) == 14
+
+
+@pytest.mark.parametrize(
+    ("servos", "how", "message"),
+    [
+        ([EmulatedServo(1), EmulatedServo(1)], {}, "id = 1 is used twice"),
+        ([EmulatedServo(253)], {}, "id = 253 is not a servo id"),
+        ([EmulatedServo(1, baud=12345)], {}, r"baud = 12345 is not a rate of xl330-m288 \(9600, 57600"),
+        ([EmulatedServo(1, model="xl999")], {}, "'xl999' has no firmware map"),
+        ([EmulatedServo(1, registers={"homing": 3})], {}, "register = 'homing' is not one of xl330-m288"),
+        (
+            [EmulatedServo(1, registers={"shutdown": 300})],
+            {},
+            r"shutdown = 300 is out of range of xl330-m288 \(0..255\)",
+        ),
+        (
+            [EmulatedServo(1, "maestro-24", supply_v=11.0)],
+            {},
+            "model = 'maestro-24' is a board of hobby servos: it has no registers",
+        ),
+        ([EmulatedServo(1, "ssc-32", registers={"crc": 1})], {}, "model = 'ssc-32' is a board of hobby servos"),
+        ([EmulatedServo(24, "maestro-24")], {}, r"id = 24 is not a servo id \(0..23\)"),
+        ([EmulatedServo(1)], {"faults": ["bang"]}, "has no such kind as 'bang'"),
+        ([EmulatedServo(1)], {"faults": ["drop:7"]}, "'drop:7' concerns no servo of this wire"),
+        ([EmulatedServo(1)], {"link": "/no/such/folder/x"}, "lies in a folder that does not exist"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(servos, how, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        launch(servos, **how)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_family_can_share_a_wire():
+    servos = [
+        EmulatedServo(1),
+        EmulatedServo(2, firmware=50),
+        EmulatedServo(20, "ax-12a", start_ticks=512),
+        EmulatedServo(30, "sts3215"),
+        EmulatedServo(40, "xl-320", start_ticks=512),
+    ]
+    with launch(servos) as chain:
+        assert [len(ping(chain.device, i)) for i in (1, 2, 40)] == [14] * 3
+        with serial.Serial(chain.device, BAUD, timeout=10) as port:
+            port.write(bytes.fromhex("ff ff 14 02 01 e8"))
+            assert port.read(6) == bytes.fromhex("ff ff 14 02 00 e9")
+
+
+# --- the end of the process -------------------------------------------------------------------------------------
 
 
 def test_process_ends_and_leaves_nothing_behind():
@@ -38,9 +251,9 @@ def test_process_ends_with_its_parent():
 
 
 def test_emulator_needs_no_heavy_library():
-    code = "import sys, sfms_robot.emulator.chain_process, sfms_robot.emulator.dynamixel2_chain; print(*sys.modules)"
+    code = "import sys, sfms_robot.emulator.chain_process, sfms_robot.emulator.servo_chains; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
-    assert "sfms_robot.emulator.dynamixel2_chain" in loaded
+    assert "sfms_robot.emulator.servo_chains" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}
 
 

@@ -71,7 +71,7 @@ class Time:
 
 @pytest.mark.parametrize("target", ["phone", "0", "host:", "70000"])
 def test_a_place_that_is_none_is_one_line(target):
-    with pytest.raises(ConfigError, match="is no place to send to"):
+    with pytest.raises(ConfigError, match="is not an address to send to"):
         main([target])
 
 

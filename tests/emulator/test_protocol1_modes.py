@@ -156,16 +156,6 @@ def test_scs_motor_mode_takes_pwm_from_running_time():
     assert bench.read(56) <= 1023
 
 
-@pytest.mark.parametrize("model", [MX, STS, SCS, AX])
-def test_whole_turns_are_forgotten_when_the_supply_fails(model):
-    bench = Bench(model)
-    servo = bench.device.servo(1)
-    servo.turn(TURN[model] * 2 + 700, 0.0)
-    servo.power_cycle(0.0)
-    assert bench.shaft == pytest.approx(700)
-    assert bench.read(56 if model in (STS, SCS) else 36) == 700
-
-
 @pytest.mark.parametrize(("model", "goal", "pending"), [(AX, 30, 44), (MX, 30, 44), (STS, 42, 64), (SCS, 42, 64)])
 def test_registered_write_is_pending_until_action(model, goal, pending):
     bench = Bench(model)

@@ -1,5 +1,5 @@
 import pytest
-from emulated_devices import chain_of, table_of
+from emulated_devices import chain_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,32 +35,11 @@ def put(device, servo, name, value, now_s=0.0) -> int:
     return answer.code
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_every_model_answers_a_ping_and_goes_where_it_is_told(model):
-    device = chain_of(model)
-    table = device.servo(1).table
-    assert ask(device, 1, protocol1.PING) == [Frame(1, 0, b"")]
-    assert get(device, 1, "model_number") == (table.model_number or 0)
-    goal = table.center_ticks + 100
-    assert put(device, 1, "goal_position", goal) == 0
-    assert put(device, 1, "torque_enable", 1) == 0
-    assert get(device, 1, "present_position", 0.02) < goal
-    assert get(device, 1, "present_position", 2.0) == goal
-
-
 @pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
 def test_goal_before_torque_switches_the_torque_on(model):
     device = chain_of(model)
     put(device, 1, "goal_position", 600)
     assert get(device, 1, "torque_enable") == 1
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_torque_without_a_goal_is_a_jump_to_the_middle(model):
-    table = table_of(model)
-    device = chain_of(model, start_ticks=table.center_ticks - 200)
-    put(device, 1, "torque_enable", 1)
-    assert get(device, 1, "present_position", 3.0) == table.center_ticks
 
 
 def test_speed_backwards_carries_its_sign_bit():
@@ -179,15 +158,6 @@ def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
     assert ask(device, 1, protocol1.PING)[0].code == 0
 
 
-def test_brown_out_is_silence_and_then_a_start_without_torque():
-    device = chain_of("scs0009")
-    put(device, 1, "goal_position", 600)
-    device.servo(1).set_supply(1.0, 0.5)
-    assert ask(device, 1, protocol1.PING, now_s=0.5) == []
-    device.servo(1).set_supply(6.0, 1.0)
-    assert (get(device, 1, "torque_enable", 1.0), get(device, 1, "goal_position", 1.0)) == (0, 512)
-
-
 @pytest.mark.parametrize("how", ["torque_enable := 128", "instruction 0x0B"])
 def test_sts_is_calibrated_where_it_stands(how):
     device = chain_of("sts3215", start_ticks=3000)
@@ -234,19 +204,6 @@ def test_two_servos_with_one_id_both_answer():
     assert len(ask(device, 1, protocol1.PING)) == 2
 
 
-def test_frame_of_the_other_protocol_is_rubbish():
-    device = chain_of("ax-12a")
-    other = bytes.fromhex("FF FF FD 00 01 03 00 01 19 4E")
-    assert device.receive(other, BAUD, 0.0) == b""
-    assert len(ask(device, 1, protocol1.PING)) == 1
-
-
-def test_unfinished_frame_is_forgotten_after_a_pause():
-    device = chain_of("ax-12a")
-    assert device.receive(encode(1, protocol1.READ, b"\x24\x02")[:-1], BAUD, 0.0) == b""
-    assert len(ask(device, 1, protocol1.PING, now_s=1.0)) == 1
-
-
 @given(st.lists(st.binary(max_size=80), max_size=10))
 def test_any_bytes_are_survived(chunks):
     device = chain_of("ax-12a", "sts3215", "scs0009")
@@ -254,11 +211,3 @@ def test_any_bytes_are_survived(chunks):
         device.receive(b"\xff\xff" + chunk, BAUD, 0.01 * k)
     device.advance(1.0)
     assert device.servo(1) is None or device.servo(1).state(1.0)["position"] >= -2048
-
-
-@given(st.sampled_from(MODELS), st.integers(0, 255), st.binary(min_size=1, max_size=12))
-def test_any_write_is_survived(model, address, data):
-    device = chain_of(model)
-    device.servos[0].write(address, data, 0.0)
-    device.advance(0.2)
-    device.servos[0].read(0, 60, 0.3)

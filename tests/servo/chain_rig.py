@@ -9,8 +9,6 @@ from emulated_devices import device_of, servos_of
 from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight, bus_servo
 
 from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmware_map
-from sfms_robot.servo.chain.chain_bus import ChainBus
-from sfms_robot.config import Bus, Faults, FirmwareMap, Safety, load_firmware_map
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.families import families
 from sfms_robot.servo.port import Port

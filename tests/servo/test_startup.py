@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import Safety, load_firmware_map
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.chain.link import Silent, finish
 from sfms_robot.servo.chain.startup import PATIENCE_S, needs_of
@@ -315,7 +315,7 @@ def test_a_geared_joint_whose_supply_failed_far_out_stays_without_torque():
     rig.start_up()
     servo = rig.servo(1)
     servo.turn(5150, rig.clock.t)
-    servo.reboot(rig.clock.t)
+    servo.power_cycle(rig.clock.t)
     rig.clock.t += 1.0
     with pytest.raises(ServoError, match="present_position is 1054.*count of turns"):
         finish(rig.startups[0].bring_back(reboot=False))

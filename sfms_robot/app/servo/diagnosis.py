@@ -1,20 +1,23 @@
-"""What is wrong with a port, a servo or a bus, and what to type against it: facts in, findings out. Opens nothing.
+"""Problems of a port, a servo or a bus, and what to type against them: facts in, findings out. Opens nothing.
 
 Three severities: an `error` stops the head from running, a `warning` makes it run worse or not for long, a `note` is
-good to know or is put right by the run itself.
+good to know or is corrected by the run itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from shlex import quote
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
-from sfms_robot.app.servo.budget import Budget
-from sfms_robot.app.servo.register_view import State
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
+from sfms_robot.app.servo.single_servo import State
+from sfms_robot.config import Faults
+from sfms_robot.config.overlay import Measured
+from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
+from sfms_robot.servo.policy import counts
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
 
@@ -22,9 +25,7 @@ Severity = Literal["error", "warning", "note"]
 
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 FAST_ENOUGH_MS: Final = 1
-UDEV_FILE: Final = "/etc/udev/rules.d/99-servos.rules"
 _ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
-_MEASURED: Final = {"input voltage": "voltage", "overheating": "temperature"}
 _POLOLU: Final = "1ffb"
 _BOARD_HELP: Final = {
     "maestro": "use the first of its two USB ports (command port) with serial mode USB Dual Port or USB Chained, or "
@@ -40,9 +41,9 @@ class Finding:
     """One thing found.
 
     Attributes:
-        about: what it concerns, as a person would say it.
-        fix: what to type or do, empty where there is nothing to do; `{id}` stands for the servo's id.
-        servo: id, for what concerns one servo.
+        about: The port, bus or servo it concerns, for people.
+        fix: What to type or do, empty where there is nothing to do; `{id}` stands for the servo's id.
+        servo: Its id, where it concerns one servo.
     """
 
     severity: Severity
@@ -52,36 +53,29 @@ class Finding:
     servo: int | None = None
 
     def plain(self) -> dict[str, Any]:
-        return {"severity": self.severity, "about": self.about, "problem": self.problem, "fix": self.fix}
+        """Return it for a report."""
+        return {key: value for key, value in asdict(self).items() if key != "servo"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """What the head says of one servo.
+    """One servo as the head's file describes it.
 
     Attributes:
         model_number: None where it cannot be checked.
-        masked: faults that the head lives with.
-        thresholds: fault -> (lowest, highest) reading with which the head lives with it; None is open.
-        needs: what its joint needs the servo to have stored.
+        faults: The faults that the head acts upon.
+        needs: The values that its joint needs the servo to have stored.
     """
 
     joint: str
     model: str
     model_number: int | None
-    masked: frozenset[str] = frozenset()
-    thresholds: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    faults: Faults = field(default_factory=Faults)
     needs: JointNeeds | None = None
 
     def lives_with(self, fault: str, state: State) -> bool:
-        """Whether the head's file says that this fault does not count."""
-        if fault in self.masked:
-            return True
-        reading = state.in_unit(_MEASURED.get(fault, ""))
-        if fault not in self.thresholds or reading is None:
-            return False
-        low, high = self.thresholds[fault]
-        return (low is None or reading >= low) and (high is None or reading <= high)
+        """Return whether the head's file says that this fault does not count."""
+        return not counts(fault, self.faults, Measured(state.in_unit("voltage"), state.in_unit("temperature")))
 
 
 @dataclass(frozen=True)
@@ -95,10 +89,11 @@ class Command:
 
     @property
     def fix(self) -> str:
-        """Return the command that mends what servos store against the head's file."""
+        """The command that mends stored values against the head's file."""
         return f"sfms-robot doctor --port {self.ports or self.port}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
+        """Return a `servo` command for this port."""
         rate = f" --baud {baud}" if baud is not None else ""
         # Which emulated servos there are, and at what rate, is their head's to say.
         which = self._of_head if self.port == SIM and self.head else f"{rate}{self._of_family}"
@@ -117,50 +112,47 @@ class Command:
 
 
 def judge_port(path: str, problem: str | None, group: str, ports: Sequence[SerialDevice]) -> Iterator[Finding]:
-    """Before opening: is it there, is it a port, may we."""
+    """Yield the problem of a path that cannot be opened as a port."""
     if problem is None:
-        return
-    if is_address(path):
-        yield Finding("error", path, problem, "correct --port")
-        return
-    if "permission" in problem:
-        yield Finding("error", path, problem, f"sudo usermod -aG {group} $USER, then log out and in again")
         return
     there = ", ".join(each.by_id or each.path for each in ports)
     fix = f"use one of: {there}" if there else "plug the adapter in; `dmesg | tail` says whether it was recognised"
+    if is_address(path):
+        fix = "correct --port"
+    elif "permission" in problem:
+        fix = f"sudo usermod -aG {group} $USER, then log out and in again"
     yield Finding("error", path, problem, fix)
 
 
 def judge_opening(path: str, failure: str, held_by: Sequence[Holder]) -> Iterator[Finding]:
-    """It could not be opened."""
+    """Yield the problems of a port whose opening failed."""
     problem = failure.removeprefix(f"{path}: ")
     if is_address(path):
-        yield Finding("error", path, problem, "is the address right, and does whoever serves it run?")
+        yield Finding("error", path, problem, "check the address, and that its server runs")
     elif not held_by:
         yield Finding("error", path, problem, f"see who has it open: sudo fuser -v {path}")
+    yield from _holders("error", path, held_by, "")
+
+
+def _holders(severity: Severity, path: str, held_by: Sequence[Holder], too: str) -> Iterator[Finding]:
     for holder in held_by:
-        yield Finding("error", path, f"is open in process {holder.pid} ({holder.command})", f"kill {holder.pid}")
+        problem = f"is open in process {holder.pid} ({holder.command}){too}"
+        yield Finding(severity, path, problem, f"kill {holder.pid}")
 
 
 def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[Finding]:
-    """It is open: who else talks there, and how long it holds bytes back."""
-    for holder in held_by:
-        yield Finding(
-            "warning", device.path, f"is open in process {holder.pid} ({holder.command}) too", f"kill {holder.pid}"
-        )
+    """Yield the problems of an open port: other programs that use it, and how long it holds bytes back."""
+    yield from _holders("warning", device.path, held_by, " too")
     if device.latency_ms is not None and device.latency_ms > FAST_ENOUGH_MS:
-        yield Finding(
-            "warning",
-            device.path,
-            f"the adapter holds every answer back for {device.latency_ms} ms",
-            f"echo 1 | sudo tee {device.latency_file}  (until it is unplugged; for good: the udev rule below)",
-        )
+        fix = f"echo 1 | sudo tee {device.latency_file}  (until it is unplugged; for good: the udev rule below)"
+        problem = f"the adapter holds every answer back for {device.latency_ms} ms"
+        yield Finding("warning", device.path, problem, fix)
 
 
 def udev_rule(device: SerialDevice) -> str | None:
-    """Lines for `UDEV_FILE` that outlive replugging: the latency timer, and a name of its own for this adapter.
+    """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
-    None for a port that is no USB adapter. An adapter without a serial number is told by the socket it is plugged
+    None for a port that is not a USB adapter. An adapter without a serial number is known by the socket it is plugged
     into, since two of a kind would share a name.
     """
     if device.vendor is None or device.product is None:
@@ -168,17 +160,14 @@ def udev_rule(device: SerialDevice) -> str | None:
     which = f'ATTRS{{idVendor}}=="{device.vendor}", ATTRS{{idProduct}}=="{device.product}"'
     if device.serial:
         which += f', ATTRS{{serial}}=="{device.serial}"'
-        name = f"servos-{device.serial}"
-    else:
-        name = "servos-%k"
-    lines = [f'SUBSYSTEM=="tty", {which}, SYMLINK+="{name}"']
+    lines = [f'SUBSYSTEM=="tty", {which}, SYMLINK+="servos-{device.serial or "%k"}"']
     if device.latency_file is not None:
         timer = f'ATTR{{latency_timer}}="{FAST_ENOUGH_MS}"'
         lines.insert(0, f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="{device.driver}", {timer}')
     return "\n".join(lines)
 
 
-# --- who is there -----------------------------------------------------------------------------------------------
+# --- which servos answer ----------------------------------------------------------------------------------------
 
 
 def judge_presence(
@@ -189,193 +178,248 @@ def judge_presence(
     command: Command,
     hint: str = "",
 ) -> Iterator[Finding]:
-    """Ids that the head wants and are not there, at another rate, or somebody else; and ids it does not know.
+    """Yield ids of the head that are silent, at another rate, or of another model; and ids that the head does not name.
 
     Args:
-        here: who answers at the head's rate, by id.
-        elsewhere: who answers at another one.
-        hint: who answers to another protocol.
+        here: Servos that answer at the head's rate, by id.
+        elsewhere: Servos that answer at another one.
+        hint: The protocol to which servos answer instead.
     """
     if wanted and not here and not elsewhere:
-        yield Finding(
-            "error",
-            "bus",
-            f"nobody answers, at any rate: none of {len(wanted)} servos{f'; {hint}' if hint else ''}",
-            "check power, cable, data direction of the adapter, and --port",
-        )
+        problem = f"no answer at any rate: none of {len(wanted)} servos{f'; {hint}' if hint else ''}"
+        yield Finding("error", "bus", problem, "check power, cable, data direction of the adapter, and --port")
         return
     for servo, want in wanted.items():
-        if servo in here:
-            yield from _judge_model(here[servo], want, command)
+        about, seen = _name(servo, want), here.get(servo)
+        if seen is not None:
+            if want.model_number is not None and seen.model_number not in (None, want.model_number):
+                said = f"the head says {want.model} ({want.model_number})"
+                fix = "two cables swapped, or the head's file names the wrong model or id"
+                yield Finding("error", about, f"{seen.model} ({seen.model_number}) answers, {said}", fix, servo)
         elif servo in elsewhere:
             rate = elsewhere[servo].baud
             fix = command.servo(f"set-baud {{id}} {baud}", rate)
-            problem = f"set to {rate} baud, the head says {baud}"
-            yield Finding("error", _name(servo, want), problem, fix, servo)
+            yield Finding("error", about, f"set to {rate} baud, the head says {baud}", fix, servo)
         else:
             look, change = command.servo("scan"), command.servo("set-id OLD NEW")
             fix = f"check its cable; if it has another id: {look}, then {change}"
-            yield Finding("error", _name(servo, want), "no answer, at any rate", fix, servo)
+            yield Finding("error", about, "no answer, at any rate", fix, servo)
     for servo, seen in sorted({**elsewhere, **here}.items()):
         if wanted and servo not in wanted:
-            yield Finding(
-                "warning", f"id {servo}", f"{seen.model} at {seen.baud} baud is not in the head's file", servo=servo
-            )
-
-
-def _judge_model(seen: FoundServo, want: Wanted, command: Command) -> Iterator[Finding]:
-    if want.model_number is not None and seen.model_number not in (None, want.model_number):
-        yield Finding(
-            "error",
-            _name(seen.id, want),
-            f"{seen.model} ({seen.model_number}) answers, the head says {want.model} ({want.model_number})",
-            "two cables swapped, or the head's file names the wrong model or id",
-            seen.id,
-        )
+            problem = f"{seen.model} at {seen.baud} baud is not in the head's file"
+            yield Finding("warning", f"id {servo}", problem, servo=servo)
 
 
 def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
-    """Ids to which two servos seem to answer."""
+    """Yield the ids to which two servos seem to answer."""
     for servo in ids:
-        yield Finding(
-            "error",
-            f"id {servo}",
-            "two servos seem to answer to this id (or the wire is disturbed)",
-            f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW",
-            servo,
-        )
+        problem = "two servos seem to answer to this id (or the wire is disturbed)"
+        fix = f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW"
+        yield Finding("error", f"id {servo}", problem, fix, servo)
 
 
 # --- one servo --------------------------------------------------------------------------------------------------
 
+Judged = Iterator[tuple[Severity, str, str]]  # severity, problem, fix
+
 
 def judge_servo(state: State, want: Wanted | None, command: Command) -> Iterator[Finding]:
-    """Settings and health of a servo whose registers were read."""
-    seen = state.seen
+    """Yield the problems of settings and health of a servo whose registers were read."""
+    seen, table = state.seen, state.seen.table
     about = _name(seen.id, want)
-    if seen.table is None:
+    if table is None:
         yield Finding("error" if want else "warning", about, f"model {seen.model} has no firmware map", servo=seen.id)
         return
-    yield from _judge_firmware(state, about)
-    yield from _judge_health(state, about, want, command)
-    yield from _judge_settings(state, about, command)
-    yield from judge_stored(state, want, command)
+    for judged in (
+        _firmware(seen, table),
+        _faults(state, table, want, command),
+        _measured(state, want),
+        _settings(state, table, command),
+        _stored(state, want, command),
+    ):
+        for severity, problem, fix in judged:
+            yield Finding(severity, about, problem, fix, seen.id)
 
 
-def _judge_firmware(state: State, about: str) -> Iterator[Finding]:
-    seen, table = state.seen, state.seen.table
-    if table is None or seen.firmware is None:
-        return
+def _firmware(seen: FoundServo, table: Table) -> Judged:
     first, last = table.firmware
-    if seen.firmware > 0 and not first <= seen.firmware <= last and table.family == "dynamixel":
-        yield Finding(
-            "warning", about, f"firmware {seen.firmware} has no map of its own, that of {first}..{last} is used",
-            "update it with ROBOTIS' DYNAMIXEL Wizard", seen.id,
-        )  # fmt: skip
-    if table.watchdog == "flags_only":
-        yield Finding(
-            "note",
-            about,
-            f"firmware {seen.firmware} of {seen.model}: its bus watchdog does not stop the motor if the computer dies",
-            servo=seen.id,
-        )
+    if seen.firmware and not first <= seen.firmware <= last and table.family == "dynamixel":
+        problem = f"firmware {seen.firmware} has no map of its own, that of {first}..{last} is used"
+        yield "warning", problem, "update it with ROBOTIS' DYNAMIXEL Wizard"
+    if seen.firmware is not None and table.watchdog == "flags_only":
+        why = "its bus watchdog does not stop the motor if the computer dies"
+        yield "note", f"firmware {seen.firmware} of {seen.model}: {why}", ""
 
 
-def _judge_health(state: State, about: str, want: Wanted | None, command: Command) -> Iterator[Finding]:
-    seen = state.seen
+def _faults(state: State, table: Table, want: Wanted | None, command: Command) -> Judged:
     names = [name for name in state.faults().split(", ") if name]
     masked = [name for name in names if want and want.lives_with(name, state)]
-    named = ", ".join(name for name in names if name not in masked)
     if masked:
-        yield Finding("note", about, f"{', '.join(masked)}: the head's file says to live with it", servo=seen.id)
-    if named:
-        fix = command.servo("reboot {id}", seen.baud)
-        if state.seen.table is None or state.seen.table.protocol != 2:
-            fix = "remove the cause, then switch its supply off and on"
-        yield Finding("error", about, f"hardware error: {named}", fix, seen.id)
+        yield "note", f"{', '.join(masked)}: the head's file says to live with it", ""
+    if named := ", ".join(name for name in names if name not in masked):
+        power = "remove the cause, then switch its supply off and on"
+        fix = command.servo("reboot {id}", state.seen.baud) if table.protocol == 2 else power
+        yield "error", f"hardware error: {named}", fix
+
+
+def _measured(state: State, want: Wanted | None) -> Judged:
     volt, low, high = (state.in_unit(name) for name in ("voltage", "min_voltage_limit", "max_voltage_limit"))
     tolerated = want is not None and want.lives_with("input voltage", state)
     if volt is not None and low is not None and high is not None and not (low <= volt <= high or tolerated):
-        yield Finding(
-            "warning", about, f"supply {volt:.1f} V is outside its limits {low:.1f}..{high:.1f} V",
-            "measure the supply under load" if volt < low else "lower the supply before the servo is damaged", seen.id,
-        )  # fmt: skip
+        fix = "measure the supply under load" if volt < low else "lower the supply before the servo is damaged"
+        yield "warning", f"supply {volt:.1f} V is outside its limits {low:.1f}..{high:.1f} V", fix
     warm, limit = state.in_unit("temperature"), state.in_unit("temperature_limit")
     if warm is not None and limit is not None and warm > limit - _HOT_C:
-        yield Finding("warning", about, f"{warm:.0f} degC, it switches off at {limit:.0f}", "let it cool down", seen.id)
+        yield "warning", f"{warm:.0f} degC, it switches off at {limit:.0f}", "let it cool down"
 
 
-def _judge_settings(state: State, about: str, command: Command) -> Iterator[Finding]:
-    seen, table = state.seen, state.seen.table
-    assert table is not None
+def _settings(state: State, table: Table, command: Command) -> Judged:
     delay, level = table.role("return_delay"), table.role("status_level")
-    waits, torque = state.in_unit("return_delay"), state.value("torque_enable")
-    if delay is not None and waits:
-        fix = command.servo(f"write {{id}} {delay.name} 0", seen.baud)
-        yield Finding(
-            "note", about, f"return delay of {waits:.0f} us before every answer (a run sets it to 0)", fix, seen.id
-        )
+    if delay is not None and (waits := state.in_unit("return_delay")):
+        fix = command.servo(f"write {{id}} {delay.name} 0", state.seen.baud)
+        yield "note", f"return delay of {waits:.0f} us before every answer (a run sets it to 0)", fix
     if level is not None and (now := state.value("status_level")) is not None and now < 1:
-        fix = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud)
-        yield Finding("warning", about, f"status return level {now}: answers pings only", fix, seen.id)
-    if torque:
-        yield Finding("note", about, "torque is on", servo=seen.id)
+        fix = command.servo(f"write {{id}} {level.name} {level.high}", state.seen.baud)
+        yield "warning", f"status return level {now}: answers pings only", fix
+    if state.torque():
+        yield "note", "torque is on", ""
 
 
-def judge_stored(state: State, want: Wanted | None, command: Command) -> Iterator[Finding]:
-    """Yield a finding for each stored value that is not what its joint needs; without a head, against itself."""
-    seen = state.seen
-    about, torque = _name(seen.id, want), state.value("torque_enable")
+def _stored(state: State, want: Wanted | None, command: Command) -> Judged:
+    """Yield each stored value that is not what its joint needs; without a head, against itself."""
+    seen, severities = state.seen, {"refused": "error", "set": "note", "told": "warning"}
     for each in stored_contradictions(state, want):
-        severity: Severity = "error" if each.then == "refused" else "note" if each.then == "set" else "warning"
-        fix = ""
+        severity, fix = cast(Severity, severities[each.then]), ""
         if each.in_file and want is None:  # no head's file that it could contradict
             severity = "warning"
         elif each.fixable and not each.in_file and seen.registers()[each.register].writable:
             fix = command.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
-            if torque:
+            if state.torque():
                 severity = "error" if each.then == "set" else severity
                 fix = f"{command.servo('write {id} torque_enable 0', seen.baud)}, then {fix}"
         elif each.fixable:
             fix = command.fix
-        yield Finding(severity, about, str(each), fix, seen.id)
+        yield severity, str(each), fix
 
 
 def stored_contradictions(state: State, want: Wanted | None) -> list[Contradiction]:
-    """As startup sees them, and with the faults that the head's file says to live with."""
+    """Return the contradictions that startup would find, with the faults that the head's file says to live with."""
     table = state.seen.table
-    if table is None or not state.table:
+    if table is None or not state.values:
         return []
-    values = state.values()
-    needs = want.needs if want is not None and want.needs is not None else _as_it_is(values, table)
+    if want is not None and want.needs is not None:
+        needs = want.needs
+    else:  # a servo that is not a joint of a head has to stay within its own limits
+        low, high = (state.values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
+        needs = JointNeeds(*((low, high) if low < high else (table.center_ticks, table.center_ticks)))
     if want is not None:
-        needs = replace(needs, allowed_faults=want.masked)
-    return contradictions(values, table, needs)
-
-
-def _as_it_is(values: Mapping[str, int], table: Table) -> JointNeeds:
-    """What a servo that is no joint of a head needs: to stay within its own limits."""
-    low, high = (values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
-    return JointNeeds(low, high) if low < high else JointNeeds(table.center_ticks, table.center_ticks)
+        needs = replace(needs, allowed_faults=frozenset(want.faults.mask))
+    return contradictions(state.values, table, needs)
 
 
 # --- the bus ----------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class TickCost:
+    """Cost of one tick, rounded. `hz`: how often that fits into a second."""
+
+    bytes: int
+    ms: float
+    hz: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Wire budget of a bus at one baud; data per servo and tick in bytes.
+
+    Attributes:
+        write_only: Goals alone.
+        plain: Goals, and every servo read: one sync read, or one by one where the family has none; None of a board.
+        fast: Goals, and every servo read by one fast sync read; None where there is no such thing.
+    """
+
+    servos: int
+    baud: int
+    return_delay_us: float
+    latency_ms: float
+    write_bytes_per_servo: int
+    read_bytes_per_servo: int
+    write_only: TickCost
+    plain: TickCost | None
+    fast: TickCost | None
+
+    @property
+    def usual(self) -> TickCost:
+        """The cost of a tick of a run."""
+        return self.plain or self.write_only
+
+
+def wire_budget(
+    family: str,
+    servos: int,
+    baud: int,
+    return_delay_us: float = 0.0,
+    latency_ms: float = 0.0,
+    read_bytes: int = 0,
+    write_bytes: int | None = None,
+    *,
+    together: bool = True,
+    crc: bool = False,
+) -> Budget:
+    """Return the budget of a bus.
+
+        tick = 10 bits x bytes / baud + return delay of every answer + latency of the adapter of every request answered
+
+    Servos that cannot be read together are asked one by one, and each request costs the adapter's latency again: that
+    is what makes factory settings slow.
+
+    Args:
+        servos: Their number; of a board the channels, every one written every tick.
+        return_delay_us: The pause of a servo before it answers.
+        latency_ms: How long the adapter holds bytes back from the host.
+        read_bytes, write_bytes: Data per servo and tick; by default no reads, and a goal of the family.
+        together: False where the servos cannot answer one sync read.
+        crc: One more byte for every channel of a board.
+    """
+    framing = FRAMINGS[family]
+    goals = framing.goals(servos, write_bytes) + crc * servos
+    way: Way = "together" if together and family != "dynamixel1" else "one by one"  # AX cannot be read together
+
+    def tick(size: int, answers: int = 0, waits: int = 0) -> TickCost:
+        ms = size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms
+        return TickCost(size, round(ms, 3), round(1e3 / ms, 1))
+
+    reads = goals + framing.reads(servos, read_bytes, way)
+    return Budget(
+        servos=servos,
+        baud=baud,
+        return_delay_us=return_delay_us,
+        latency_ms=latency_ms,
+        write_bytes_per_servo=(framing.goal if write_bytes is None else write_bytes)
+        if framing.read
+        else goals // servos,
+        read_bytes_per_servo=read_bytes,
+        write_only=tick(goals),
+        plain=tick(reads, servos, 1 if way == "together" else servos) if framing.read else None,
+        fast=tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1) if together and framing.fast else None,
+    )
+
+
 def judge_rate(budget: Budget, rate_hz: float, fast_works: bool | None, command: Command) -> Iterator[Finding]:
-    """Whether goals and answers of all servos fit into a tick."""
+    """Yield a finding where goals and answers of all servos do not fit into a tick."""
     if budget.usual.hz >= _ROUND * rate_hz:
         return
     hertz = f"{budget.usual.hz:.0f} Hz"
     if budget.fast is not None and fast_works and budget.fast.hz >= _ROUND * rate_hz:
         yield Finding("note", "bus", f"plain reads reach {hertz} of {rate_hz:g}, fast sync read {budget.fast.hz:.0f}")
         return
-    slow = max(
-        ("return delay", budget.servos * budget.return_delay_us / 1e3),
-        ("adapter latency", budget.latency_ms),
-        ("baud", budget.usual.bytes * 10e3 / budget.baud),
-        key=lambda cause: cause[1],
-    )[0]
+    causes = {
+        "return delay": budget.servos * budget.return_delay_us / 1e3,
+        "adapter latency": budget.latency_ms,
+        "baud": budget.usual.bytes * 10e3 / budget.baud,
+    }
+    slow = max(causes, key=causes.__getitem__)
     fix = {
         "return delay": "set every return delay to 0 (see the notes)",
         "adapter latency": "set the adapter's latency timer to 1 ms (see above)",
@@ -384,23 +428,25 @@ def judge_rate(budget: Budget, rate_hz: float, fast_works: bool | None, command:
     }[slow]
     if budget.plain is None:
         fix = "lower rate_hz in the head's file, or set board and head file to a higher baud"
-    what = "every servo read" if budget.plain else "every channel written"
-    yield Finding("warning", "bus", f"reaches {hertz} of {rate_hz:g} with {what} ({slow} takes most)", fix)
+    done = "every servo read" if budget.plain else "every channel written"
+    yield Finding("warning", "bus", f"reaches {hertz} of {rate_hz:g} with {done} ({slow} takes most)", fix)
 
 
-def judge_board(family: str, channels: int, answers: bool | None, device: SerialDevice) -> Iterator[Finding]:
-    """A bus of hobby servos: there is little to ask. `answers`: whether the board did; None where it was not asked."""
-    if answers is False:
+def judge_board(family: str, channels: int, answers: bool, device: SerialDevice) -> Iterator[Finding]:
+    """Yield what can be said of a bus of hobby servos. `answers`: whether the board did."""
+    if not answers:
         yield Finding("error", "bus", f"no {family} board answers", _BOARD_HELP[family])
     elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
         yield Finding("note", "bus", "a Maestro on USB has two ports: the first takes commands, the second is its TTL")
-    yield Finding(
-        "note", "bus", f"a {family} board does not tell which of its {channels} servos are there, nor where they stand"
-    )
+    unknown = f"which of its {channels} servos are there, nor where they stand"
+    yield Finding("note", "bus", f"a {family} board does not report {unknown}")
+
+
+# --- all together -----------------------------------------------------------------------------------------------
 
 
 def grouped(findings: Sequence[Finding]) -> list[Finding]:
-    """Worst first; what holds for several servos alike is one finding, and its fix one command."""
+    """Return findings, worst first; the same problem of several servos is one finding, and its fix one command."""
     same: dict[object, list[Finding]] = {}
     for finding in findings:
         alike = (finding.severity, finding.problem, finding.fix) if finding.servo is not None else id(finding)
@@ -414,7 +460,7 @@ def grouped(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def ids_text(ids: Sequence[int]) -> str:
-    """`1,5-9`, as the servo commands take it."""
+    """Return ids as the servo commands take them: `1,5-9`."""
     runs: list[list[int]] = []
     for servo in sorted(set(ids)):
         if runs and servo == runs[-1][-1] + 1:
@@ -428,6 +474,6 @@ def _name(servo: int, want: Wanted | None) -> str:
     return f"id {servo} ({want.joint})" if want else f"id {servo}"
 
 
-def summary(findings: Sequence[Finding]) -> dict[str, Any]:
-    """How many of each severity."""
+def summary(findings: Sequence[Finding]) -> dict[str, int]:
+    """Return the number of findings of each severity."""
     return {name: sum(each.severity == name for each in findings) for name in SEVERITIES}

@@ -1,6 +1,6 @@
-"""The firmware maps as a whole: what is at hand, and whether the files agree with one another.
+"""The firmware maps as a whole: a list, and a check that the files agree with one another.
 
-A single map refuses itself on loading (`config.firmware`); what only shows when several lie side by side is here.
+Mistakes within a map are found when it is loaded (`config.firmware`); this check compares several maps.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from sfms_robot.config import FirmwareMap, load, map_files
 from sfms_robot.errors import ConfigError
 
 
-class Finding(NamedTuple):
-    """One thing that is wrong with a firmware map."""
+class MapProblem(NamedTuple):
+    """One mistake of a firmware map."""
 
     file: str
     problem: str
@@ -24,14 +24,14 @@ class Finding(NamedTuple):
 Loaded = dict[Path, FirmwareMap]
 
 
-def check_maps(more: Iterable[Path] = ()) -> list[Finding]:
-    """What is wrong with the shipped maps, and with the files and folders of `more` beside them."""
+def check_maps(more: Iterable[Path] = ()) -> list[MapProblem]:
+    """Return the mistakes of the shipped maps, and of the files and folders of `more`."""
     loaded, findings = _load([*map_files(), *_expand(more)])
     return [*findings, *_names(loaded), *_references(loaded), *_collisions(loaded)]
 
 
 def list_maps(more: Iterable[Path] = ()) -> list[dict[str, Any]]:
-    """One row per model: what `servo maps` shows. Raises ConfigError for a map that does not load."""
+    """Return one row per model for `servo maps`. Raises ConfigError for a map that does not load."""
     return [_row(load(FirmwareMap, file)) for file in [*map_files(), *_expand(more)]]
 
 
@@ -52,7 +52,7 @@ def _row(each: FirmwareMap) -> dict[str, Any]:
 
 
 def _expand(more: Iterable[Path]) -> list[Path]:
-    """Files, and those in folders. Raises ConfigError for a folder without any: nothing looked at is not sound."""
+    """Return files, and those in folders. Raises ConfigError for a folder without any."""
     files = []
     for path in more:
         found = sorted(path.glob("**/*.yaml")) if path.is_dir() else [path]
@@ -62,46 +62,46 @@ def _expand(more: Iterable[Path]) -> list[Path]:
     return files
 
 
-def _load(files: Sequence[Path]) -> tuple[Loaded, list[Finding]]:
+def _load(files: Sequence[Path]) -> tuple[Loaded, list[MapProblem]]:
     loaded, findings = {}, []
     for file in files:
         try:
             loaded[file] = load(FirmwareMap, file)
         except ConfigError as error:
-            findings.append(Finding(str(file), str(error).removeprefix(f"{file}: ")))
+            findings.append(MapProblem(str(file), str(error).removeprefix(f"{file}: ")))
     return loaded, findings
 
 
-def _names(loaded: Loaded) -> Iterator[Finding]:
-    """A map is found by its file's name."""
+def _names(loaded: Loaded) -> Iterator[MapProblem]:
+    """Yield maps whose model is not their file's name, by which they are found, or is that of another map."""
     first: dict[str, Path] = {}
     for file, each in loaded.items():
         if each.model != file.stem:
-            yield Finding(str(file), f"model = {each.model!r} is not the file's name ({file.stem})")
+            yield MapProblem(str(file), f"model = {each.model!r} is not the file's name ({file.stem})")
         if each.model in first:
-            yield Finding(str(file), f"model = {each.model!r} is also {first[each.model]}")
+            yield MapProblem(str(file), f"model = {each.model!r} is also {first[each.model]}")
         first.setdefault(each.model, file)
 
 
-def _references(loaded: Loaded) -> Iterator[Finding]:
+def _references(loaded: Loaded) -> Iterator[MapProblem]:
     by_name = {each.model: each for each in loaded.values()}
     for file, each in loaded.items():
         for key, name in (("variant_of", each.variant_of), ("same_number_as", each.same_number_as)):
             other = by_name.get(name) if name else None
             if name and other is None:
-                yield Finding(str(file), f"{key} = {name!r} has no map")
+                yield MapProblem(str(file), f"{key} = {name!r} has no map")
             elif other and _identity(other) != _identity(each):
-                yield Finding(str(file), f"{key} = {name!r} has another family, protocol or model number")
+                yield MapProblem(str(file), f"{key} = {name!r} has another family, protocol or model number")
 
 
-def _collisions(loaded: Loaded) -> Iterator[Finding]:
-    """A servo says its number and firmware: together they must lead to one map."""
+def _collisions(loaded: Loaded) -> Iterator[MapProblem]:
+    """Yield maps that share number and firmware, by which a servo is recognised."""
     for (_, one), (file, two) in combinations(loaded.items(), 2):
         if one.model_number is None or _identity(one) != _identity(two) or not one.firmware.overlaps(two.firmware):
             continue
         if one.model not in (two.same_number_as, two.model) and two.model != one.same_number_as:
             problem = f"model_number = {two.model_number} is also {one.model}, for some of the same firmware"
-            yield Finding(str(file), problem)
+            yield MapProblem(str(file), problem)
 
 
 def _identity(each: FirmwareMap) -> tuple[str, int | None, int | None]:

@@ -1,37 +1,46 @@
-"""One serial line as the servo tools see it: any family, any rate, servos known by what they say of themselves.
+"""One serial line as the servo tools see it: any family, any rate, servos known by what they report.
 
-The tools meet servos of which nothing is certain, neither rate nor id nor model. So a `Wire` can change its rate,
+Of the servos that the tools meet nothing is certain, neither rate nor id nor model. So a `Wire` can change its rate,
 looks for a servo at every rate its family has, and picks the firmware map by the model number it reads.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
 from sfms_robot.emulator.launch import launch
-from sfms_robot.errors import BusError, ConfigError, PortError
+from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.chain.link import Found, RegisterLink
+from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, ping_replies, verified_write
+from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.discovery import access_problem, is_address, list_ports
 from sfms_robot.servo.families import BusFamily, family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Field, Table
+
+Confirm = Callable[[str], bool]
 
 SIM: Final = "sim"
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
 TRIES: Final = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FoundServo:
-    """A servo that answered. `table` is None for a model without a firmware map; `twice`: there seem to be two."""
+    """A servo that answered.
+
+    Attributes:
+        table: Its control table; None for a model without a firmware map.
+        twice: Two servos seem to have its id.
+        wire: Where it answered. Its methods use the wire at its present rate.
+    """
 
     id: int
     baud: int
@@ -39,43 +48,83 @@ class FoundServo:
     firmware: int | None
     table: Table | None
     twice: bool = False
+    wire: Wire = field(repr=False, compare=False)
 
     @property
     def model(self) -> str:
         return self.table.model if self.table else f"unknown ({self.model_number})"
 
     def registers(self) -> Table:
-        """Its control table. Raises ConfigError for a model without a firmware map."""
+        """Return its control table. Raises ConfigError for a model without a firmware map."""
         if self.table is None:
-            known = sorted(file.stem for file in map_files())
-            raise ConfigError.at(
-                f"servo {self.id}",
-                "model number",
-                self.model_number,
-                "has no firmware map",
-                [*known, "or --model MODEL"],
-            )
+            known = [*sorted(file.stem for file in map_files()), "or --model MODEL"]
+            raise ConfigError.at(f"servo {self.id}", "model number", self.model_number, "has no firmware map", known)
         return self.table
 
+    def named(self, name: str) -> Field:
+        """Return a register by its name or its role. Raises ConfigError with the names there are."""
+        table = self.registers()
+        found = table.fields.get(name) or table.role(name)
+        if found is None:
+            raise ConfigError.at(table.model, "register", name, "is unknown", table.fields)
+        return found
+
     def row(self) -> dict[str, Any]:
+        """Return the row of a report."""
+        note = "two servos with one id?" if self.twice else ""
         return {
             "id": self.id,
             "model": self.model,
             "model_number": self.model_number,
             "firmware": self.firmware,
             "baud": self.baud,
-            "note": "two servos with one id?" if self.twice else "",
+            "note": note,
         }
+
+    def block(self, address: int, length: int, what: str) -> Answer:
+        """Read a block of the control table. Raises ServoError where the servo is silent or refuses."""
+        for _ in range(TRIES):
+            answer = self.wire.link.read(self.id, address, length)
+            if answer is not None:
+                if refusal := self.wire.link.refusal(answer):
+                    raise ServoError(f"id {self.id}: reading {what} was refused: {refusal}")
+                return answer
+        raise ServoError(f"id {self.id} does not answer when asked for {what} (status return level 0?)")
+
+    def read(self, register: Field) -> int:
+        """Read a register, raw. Raises ServoError where the servo is silent or refuses."""
+        return register.from_bytes(self.block(register.address, register.size, register.name).data)
+
+    def put(self, register: Field, raw: int) -> None:
+        """Write a register and read it back, through the lock of the EEPROM where there is one. Raises ServoError."""
+        lock = self.registers().role("lock")
+        finish(verified_write(self.wire.link, self.id, register, raw, lock=lock, tries=TRIES))
+
+    def guard(self, what: str, confirm: Confirm, mute: bool = False) -> None:
+        """Check, before EEPROM is written, that torque is off (which a `mute` servo cannot say), and ask.
+
+        Raises ServoError where torque is on, ConfigError where the answer is no.
+        """
+        torque = None if mute else self.registers().role("torque_enable")
+        if torque is not None and self.read(torque):
+            cure = f"sfms-robot servo write {self.id} {torque.name} 0"
+            raise ServoError(f"id {self.id} has torque on, its EEPROM is closed: {cure}")
+        ask(f"id {self.id} ({self.model}): {what}", confirm)
+
+
+def ask(question: str, confirm: Confirm) -> None:
+    """Raise ConfigError unless `confirm` says yes."""
+    if not confirm(question):
+        raise ConfigError(f"nothing was written: {question} (not confirmed)")
 
 
 class Wire:
-    """A port and whoever hangs on it.
+    """A port and the servos behind it. The port belongs to the caller.
 
     Args:
-        port: owned by whoever made it.
-        family: a name of `servo_families`.
-        baud: the port's rate now; with `fixed` no other rate is looked at.
-        model: what every servo is taken for, whatever its number; None goes by the number.
+        family: A name of `servo_families`.
+        baud: The port's rate now; with `fixed` no other rate is looked at.
+        model: The model of every servo, whatever its number; None goes by the number.
     """
 
     def __init__(
@@ -85,13 +134,14 @@ class Wire:
         self.family = family
         self.kind = _family(family)
         self.clock = clock
-        self._taken_for = None if model is None else Table.of(load_firmware_map(model))
+        self.model = model
+        self._table = None if model is None else Table.of(load_firmware_map(model))
         self.bauds = (baud,) if fixed else (baud, *(each for each in self.kind.bauds if each != baud))
         self.baud = baud
         self.link = self._link(baud)
 
     def at(self, baud: int) -> RegisterLink:
-        """The link at another rate. Raises PortError when the adapter cannot do it."""
+        """Change to another rate; return the link. Raises PortError when the adapter cannot do it."""
         if baud != self.baud:
             self.port.set_baud(baud)
             self.port.discard_input()
@@ -100,15 +150,27 @@ class Wire:
         return self.link
 
     def ping(self, servo: int, tries: int = TRIES) -> FoundServo | None:
-        """The servo at the rate of now, or None."""
+        """Return the servo of an id at the present rate, or None."""
         for _ in range(tries):
             found = self.link.ping(servo)
             if found is not None:
-                return self.identified(servo, found)
+                return self._identified(servo, found)
         return None
 
+    def answering(self, ids: Iterable[int] | None = None) -> Iterator[FoundServo]:
+        """Yield the servos of `ids` that answer at the present rate, asked once each.
+
+        None asks all servos: with one broadcast where the family has it, else id by id.
+        """
+        if ids is None and self.kind.broadcast:
+            yield from (self._identified(servo, each) for servo, each in sorted(self.link.broadcast_ping().items()))
+            return
+        for servo in range(self.kind.max_id + 1) if ids is None else ids:
+            if (seen := self.ping(servo, tries=1)) is not None:
+                yield seen
+
     def find(self, servo: int) -> FoundServo:
-        """The servo, at whatever rate it answers; the wire stays at that rate. Raises BusError."""
+        """Return a servo, at whatever rate it answers; the wire stays at that rate. Raises BusError."""
         self.check_id(servo)
         for _ in self.reachable():
             seen = self.ping(servo, TRIES if len(self.bauds) == 1 else 2)
@@ -118,7 +180,7 @@ class Wire:
         raise BusError(f"{self.port.name}: no answer from id {servo} at {rates} baud (look: sfms-robot servo scan)")
 
     def reachable(self) -> Iterator[int]:
-        """Every rate to look at, the wire set to it; rates that the adapter cannot do are passed over."""
+        """Yield every rate to look at, the wire set to it. Rates that the adapter cannot do are skipped."""
         for baud in self.bauds:
             try:
                 self.at(baud)
@@ -128,14 +190,20 @@ class Wire:
                 continue
             yield baud
 
-    def identified(self, servo: int, found: Found) -> FoundServo:
-        """What answered, with its firmware map."""
-        table = self._taken_for or table_of(self.family, found.model_number, found.firmware)
-        return FoundServo(servo, self.baud, found.model_number, found.firmware, table)
+    def has_duplicate(self, servo: int) -> bool:
+        """Return whether two servos seem to have one id: each of several pings brings more than one clean answer."""
+        protocol = self.kind.protocol
+        return all(ping_replies(self.port, protocol, servo, PATIENCE_S).duplicate for _ in range(TRIES))
 
     def check_id(self, servo: int, what: str = "id") -> None:
+        """Raise ConfigError for an id that no servo of the family can have."""
         if not 0 <= servo <= self.kind.max_id:
             raise ConfigError.at("servo", what, servo, "is not a servo id", [f"0..{self.kind.max_id}"])
+
+    def _identified(self, servo: int, found: Found) -> FoundServo:
+        number, firmware = found
+        table = self._table or table_of(self.family, number, firmware)
+        return FoundServo(id=servo, baud=self.baud, model_number=number, firmware=firmware, table=table, wire=self)
 
     def _link(self, baud: int) -> RegisterLink:
         link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S)
@@ -143,25 +211,21 @@ class Wire:
 
 
 @contextmanager
-def open_wire(
-    port: str | None, family: str, baud: int | None, head: str, clock: Clock, model: str | None = None
-) -> Iterator[Wire]:
-    """A wire on a device, or on emulated servos for `sim`; the only serial port there is when `port` is None.
+def open_wire(port: str | None, family: str, baud: int | None, head: str, model: str | None = None) -> Iterator[Wire]:
+    """Open a wire on a device, or on the emulated servos of `head` for `sim`; None is the only serial port there is.
 
-    `baud` None means: look at every rate. Raises PortError, ConfigError.
+    `baud` None: look at every rate. Raises PortError, ConfigError.
     """
-    kind = _family(family)
+    kind, clock = _family(family), RealClock()
     check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
             from sfms_robot.app.wiring import plugged_in  # its numerics take longer to load than most tools to run
 
             described = load_head(head)
-            hangs_on = family_named(next(iter(described.buses.values())).family)
-            if hangs_on.board:
-                raise ConfigError(
-                    f"--head {head}: its servos hang on a {hangs_on.title}: no ids or registers to look at"
-                )
+            board = family_named(next(iter(described.buses.values())).family)
+            if board.board:
+                raise ConfigError(f"--head {head}: its servos are on a {board.title}, which has no ids or registers")
             servos = next(iter(plugged_in(head, described).values()))
             device, first = stack.enter_context(launch(servos)).device, servos[0].baud
         else:
@@ -173,30 +237,24 @@ def open_wire(
 
 
 def check_baud(family: str, baud: int | None) -> None:
-    """Raises ConfigError for a rate beyond those of the family: at 5 baud a question takes minutes."""
+    """Raise ConfigError for a rate beyond those of the family: at 5 baud a question takes minutes."""
     kind = _family(family)
     if baud is not None and kind.bauds and not min(kind.bauds) <= baud <= max(kind.bauds):
         rates = ", ".join(str(each) for each in sorted(kind.bauds))
-        raise ConfigError(f"--baud {baud}: no rate of {kind.title} servos ({rates})")
-
-
-def real_clock() -> Clock:
-    """Time as it passes."""
-    return RealClock()
+        raise ConfigError(f"--baud {baud}: not a rate of {kind.title} servos ({rates})")
 
 
 def only_port() -> str:
-    """The serial port of a computer that has one. Raises ConfigError naming those it has."""
-    ports = list_ports()
-    if len(ports) == 1:
-        return ports[0].by_id or ports[0].path
-    names = [each.by_id or each.path for each in ports]
+    """Return the serial port of a computer that has one. Raises ConfigError naming those it has."""
+    names = [each.by_id or each.path for each in list_ports()]
+    if len(names) == 1:
+        return names[0]
     there = "several serial ports" if names else "no serial port here"
     raise ConfigError(f"--port: {there}, say which ({', '.join([*names, SIM])})")
 
 
 def check_device(device: str) -> None:
-    """Raises PortError for a path that cannot be a serial port, before anything is opened."""
+    """Raise PortError for a path that cannot be a serial port, before anything is opened."""
     problem = access_problem(device)
     if problem is not None and is_address(device):
         raise PortError(f"{device}: {problem}")
@@ -206,7 +264,7 @@ def check_device(device: str) -> None:
 
 
 def table_of(family: str, number: int | None, firmware: int | None, model: str | None = None) -> Table | None:
-    """Control table of a model number; `model` is preferred where several share it. None when no map has it."""
+    """Return the control table of a model number, or None; `model` is preferred where several share the number."""
     models = _models(family).get(number, ()) if number is not None else ()
     if not models:
         return None
@@ -219,7 +277,7 @@ def table_of(family: str, number: int | None, firmware: int | None, model: str |
 
 @cache
 def _models(family: str) -> Mapping[int, Sequence[str]]:
-    """Model number -> models. Reads only the heads of the files: loading all of them takes a second."""
+    """Return the models of each number. Reads only the heads of the files: loading all of them takes a second."""
     wanted, protocol = _family(family).maps
     found: dict[int, list[tuple[bool, str]]] = {}
     for file in map_files():
@@ -235,3 +293,65 @@ def _family(name: str) -> BusFamily:
     if name not in servo_families():
         raise ConfigError.at("servo tools", "family", name, "is unknown", servo_families())
     return servo_families()[name]
+
+
+# --- another protocol -----------------------------------------------------------------------------------------------
+
+_LISTEN_S: Final = 0.08  # answers come by id, 3 ms apart: those of the first two dozen ids
+_FIRST_IDS: Final = 20
+_ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
+_RATES: Final = 3  # of each family, those met most often
+_DXL2_HEADER: Final = b"\xff\xff\xfd\x00"
+
+
+def protocol_hint(wire: Wire) -> str:
+    """Return the `--family` to type where servos answer to another protocol, or nothing.
+
+    One broadcast ping per rate and frame, and a short listen: Dynamixel 2.0 and Feetech answer it. Dynamixel 1.0 does
+    not, so there the first twenty ids are asked. Takes at most 3 s on a silent wire, and leaves it at its rate.
+    """
+    before = wire.baud
+    try:
+        for baud in dict.fromkeys(baud for family in servo_families().values() for baud in family.bauds[:_RATES]):
+            try:
+                wire.at(baud)
+            except PortError:
+                continue
+            family = _spoken(wire, baud)
+            if family == wire.family:
+                return ""
+            if family is not None:
+                return f"these servos answer {servo_families()[family].title} at {baud} baud: --family {family}"
+    finally:
+        wire.at(before)
+    return ""
+
+
+def _spoken(wire: Wire, baud: int) -> str | None:
+    """Return the family that answers at the port's rate."""
+    if _DXL2_HEADER in _reply(wire.port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
+        return "dynamixel2"
+    frames = protocol1.salvage(bytearray(_reply(wire.port, protocol1.encode(protocol1.BROADCAST, protocol1.PING))))
+    if not frames and baud in servo_families()["dynamixel1"].bauds[:2]:  # these answer only to their own id
+        link = Wire(wire.port, "dynamixel1", wire.clock, baud, fixed=True).link
+        link.silence_s = _ID_S
+        if any(link.ping(servo) is not None for servo in range(1, _FIRST_IDS + 1)):
+            return "dynamixel1"
+    for servo in {frame.servo for frame in frames}:
+        for family in ("feetech", "dynamixel1"):
+            found = Wire(wire.port, family, wire.clock, baud, fixed=True).ping(servo, tries=1)
+            if found is not None and found.table is not None:
+                return family
+    return None
+
+
+def _reply(port: Port, request: bytes) -> bytes:
+    """Return what comes within `_LISTEN_S`, without the echo of an adapter that hears itself."""
+    port.discard_input()
+    port.write(request)
+    data, end_s = bytearray(), port.now_s() + _LISTEN_S
+    while part := port.read(4096, end_s):
+        data += part
+        if port.now_s() >= end_s:
+            break
+    return bytes(data).removeprefix(request)

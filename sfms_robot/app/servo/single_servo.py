@@ -1,28 +1,173 @@
-"""What `sfms-robot servo` does to single servos: find, look, write, set id and rate, start over.
+"""The tools of `sfms-robot servo` for single servos: find, look, write, set id and rate, start over.
 
-Nothing is written to EEPROM unasked, unchecked or unread: a question first (`confirm`), torque off, the lock register
-opened where there is one, and afterwards the servo is asked whether it took it.
+EEPROM is written in steps that can be trusted: a question first (`confirm`), torque off, the lock register opened where
+there is one, and afterwards the value is read back.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Literal
 
-from sfms_robot.app.servo.serial_line import PATIENCE_S, TRIES, FoundServo, Wire
+import yaml
+
+from sfms_robot.app.out_files import checked_file
+from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
+from sfms_robot.config.base import Model, load
+from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
-from sfms_robot.ports import Clock
-from sfms_robot.servo.chain.link import finish, ping_replies, verified_write
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.codecs.dxl2 import ALERT
+from sfms_robot.servo.registers import Field
 
-Confirm = Callable[[str], bool]
 Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is looked at
 
 BACK_S: Final = 2.0  # a servo that restarts is back by then
 _STEP_S: Final = 0.1
 _RESETS: Final = {"all": 0xFF, "keep-id": 1, "keep-id-and-baud": 2}
+_LONGEST: Final = 128  # bytes of one read
+_WATCHED: Final = (
+    "torque_enable", "error_status", "present_position", "present_speed", "present_load", "present_current", "voltage",
+    "temperature",
+)  # fmt: skip
+
+
+def no_progress(done: int, total: int, what: str) -> None:
+    """Show no progress."""
+
+
+# --- finding ----------------------------------------------------------------------------------------------------
+
+
+def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_progress) -> list[FoundServo]:
+    """Return all servos that answer at any of the wire's rates, by rate and id.
+
+    `ids` are asked one by one; None asks all at once where the family can, else every id there is.
+    """
+    for servo in ids or ():
+        wire.check_id(servo)
+    asked: list[list[int] | None] = [[servo] for servo in (range(wire.kind.max_id + 1) if ids is None else ids)]
+    asked = [None] if ids is None and wire.kind.broadcast else asked
+    found: list[FoundServo] = []
+    total = len(wire.bauds) * len(asked)
+    for baud in wire.reachable():
+        for step, some in enumerate(asked):
+            progress(wire.bauds.index(baud) * len(asked) + step, total, f"{baud} baud, {len(found)} found")
+            found += [replace(seen, twice=wire.has_duplicate(seen.id)) for seen in wire.answering(some)]
+    progress(total, total, f"{len(found)} found")
+    return found
+
+
+def checked_ids(text: str) -> list[int]:
+    """Read `1,5,10-18`; return the ids in order. Raises ConfigError."""
+    try:
+        return parse_ids(text)
+    except ValueError:
+        raise ConfigError.at("servo tools", "ids", text, "is not a list of ids", ["5", "1-9", "1,5,10-18"]) from None
+
+
+# --- looking ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class State:
+    """A servo and its registers as read.
+
+    Attributes:
+        values: Raw values by name of all registers that were read.
+        error: Error byte of the answer.
+    """
+
+    seen: FoundServo
+    values: dict[str, int]
+    error: int = 0
+
+    @classmethod
+    def of(cls, seen: FoundServo, start: int, data: bytes, error: int) -> State:
+        """Return the state of a servo whose table holds `data` from address `start` on."""
+        fields = seen.registers().fields.values()
+        inside = [each for each in fields if start <= each.address and each.address + each.size <= start + len(data)]
+        return cls(seen, {each.name: each.from_bytes(data[each.address - start :]) for each in inside}, error)
+
+    def _field(self, name: str) -> Field | None:
+        table = self.seen.table
+        return None if table is None else table.role(name) or table.fields.get(name)
+
+    def value(self, name: str) -> int | None:
+        """Return the raw value of a role, or of a register by name; None when it was not read."""
+        field = self._field(name)
+        return None if field is None else self.values.get(field.name)
+
+    def in_unit(self, name: str) -> float | None:
+        """Return the same in the unit of the firmware map."""
+        field, raw = self._field(name), self.value(name)
+        return None if field is None or raw is None else field.to_unit(raw)
+
+    def faults(self) -> str:
+        """Return the faults of the servo in words; empty when there are none."""
+        table = self.seen.table
+        if table is None:
+            return ""
+        named = table.fault_names(self.value("error_status") or 0) or table.status_fault_names(self.error)
+        return named or ("hardware error" if table.protocol == 2 and self.error & ALERT else "")
+
+    def torque(self) -> bool | None:
+        """Return whether torque is on; None when it was not read."""
+        value = self.value("torque_enable")
+        return None if value is None else bool(value)
+
+    def row(self, faults: str | None = None) -> dict[str, Any]:
+        """Return the row of `servo monitor`, with other `faults` for a servo that was not read."""
+        units = {
+            "position_deg": "present_position",
+            "current_mA": "present_current",
+            "load_percent": "present_load",
+            "voltage_V": "voltage",
+            "temperature_degC": "temperature",
+        }
+        measured = {key: None if (x := self.in_unit(role)) is None else round(x, 2) for key, role in units.items()}
+        who = {"id": self.seen.id, "model": self.seen.model, "position": self.value("present_position")}
+        return {**who, **measured, "torque": self.torque(), "faults": self.faults() if faults is None else faults}
+
+
+def read_all(seen: FoundServo) -> State:
+    """Read the whole table of a known model. Raises ServoError for a servo that only answers pings."""
+    if seen.table is None:
+        return State(seen, {})
+    ends = [field.address + field.size for field in seen.table.fields.values() if field.address < 2 * _LONGEST]
+    data, error = b"", 0
+    while len(data) < max(ends):
+        answer = seen.block(len(data), min(_LONGEST, max(ends) - len(data)), "its registers")
+        data, error = data + answer.data, answer.error
+    return State.of(seen, 0, data, error)
+
+
+def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[dict[str, Any]]]:
+    """Yield a row per servo (`watched`) every `period_s`, `count` times or without end."""
+    clock = servos[0].wire.clock
+    due_s = clock.now_s()
+    for _ in range(count) if count is not None else itertools.count():
+        clock.wait_until(due_s)
+        yield [watched(seen) for seen in servos]
+        due_s = max(due_s + period_s, clock.now_s())
+
+
+def watched(seen: FoundServo) -> dict[str, Any]:
+    """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
+    names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
+    if seen.table is None or not names:
+        return State(seen, {}).row("no firmware map")
+    start, length = seen.table.span(names)
+    answer = seen.wire.at(seen.baud).read(seen.id, start, length)
+    if answer is None or seen.wire.link.refusal(answer):
+        return State(seen, {}).row("silent")
+    return State.of(seen, start, answer.data, answer.error).row()
+
+
+# --- registers --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -33,6 +178,7 @@ class Value:
     raw: int
 
     def row(self) -> dict[str, Any]:
+        """Return the row of `servo read`."""
         field = self.field
         return {
             "register": field.name,
@@ -48,78 +194,23 @@ class Value:
         }
 
 
-# --- finding ----------------------------------------------------------------------------------------------------
-
-
-def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress | None = None) -> list[FoundServo]:
-    """Everybody who answers at any of the wire's rates, by rate and id.
-
-    `ids` are asked one by one; None asks all at once where the family can, else every id there is.
-    """
-    for servo in ids or ():
-        wire.check_id(servo)
-    asked = ids if ids is not None else None if wire.kind.broadcast else range(wire.kind.max_id + 1)
-    found: list[FoundServo] = []
-    total = len(wire.bauds) * (len(asked) if asked is not None else 1)
-    for baud in wire.reachable():
-        done = wire.bauds.index(baud) * (total // len(wire.bauds))
-        if asked is None:
-            if progress:
-                progress(done, total, f"{baud} baud, {len(found)} found")
-            here = [wire.identified(servo, each) for servo, each in sorted(wire.link.broadcast_ping().items())]
-            found += [replace(seen, twice=has_duplicate(wire, seen.id)) for seen in here]
-            continue
-        for step, servo in enumerate(asked):
-            if progress:
-                progress(done + step, total, f"{baud} baud, id {servo}, {len(found)} found")
-            seen = wire.ping(servo, tries=1)
-            found += [replace(seen, twice=has_duplicate(wire, servo))] if seen is not None else []
-    if progress:
-        progress(total, total, f"{len(found)} found")
-    return found
-
-
-def parse_ids(text: str) -> list[int]:
-    """`1,5,10-18` -> ids in order. Raises ConfigError."""
-    ids: list[int] = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d{1,3})\s*(?:-\s*(\d{1,3})\s*)?", part)
-        if match is None or (match[2] and int(match[2]) < int(match[1])):
-            raise ConfigError.at("servo tools", "ids", text, "is not a list of ids", ["5", "1-9", "1,5,10-18"])
-        ids += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return ids
-
-
-# --- registers --------------------------------------------------------------------------------------------------
-
-
-def field_named(table: Table, name: str) -> Field:
-    """A register by name, or by the role it plays. Raises ConfigError with the names there are."""
-    field = table.fields.get(name) or table.role(name)
-    if field is None:
-        raise ConfigError.at(table.model, "register", name, "is unknown", table.fields)
-    return field
-
-
-def read_registers(wire: Wire, seen: FoundServo, names: Sequence[str]) -> list[Value]:
-    """Registers by name, or `all` of them. Raises ServoError when the servo does not tell one."""
-    table = seen.registers()
+def read_registers(seen: FoundServo, names: Sequence[str]) -> list[Value]:
+    """Read registers by name, or `all` of them. Raises ServoError where one cannot be read."""
     if "all" in names:
-        fields = sorted(table.fields.values(), key=lambda each: each.address)
+        fields = sorted(seen.registers().fields.values(), key=lambda each: each.address)
     else:
-        fields = [field_named(table, name) for name in names]
-    return [Value(field, read(wire, seen, field)) for field in fields]
+        fields = [seen.named(name) for name in names]
+    return [Value(field, seen.read(field)) for field in fields]
 
 
-def write_register(wire: Wire, seen: FoundServo, name: str, text: str, confirm: Confirm) -> tuple[Value | None, Value]:
-    """Write one register; (before, after). `text` is a raw number, or one with the register's unit: 90deg.
+def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> tuple[Value | None, Value]:
+    """Write one register; return (before, after). `text` is a raw number, or one with the register's unit: 90deg.
 
-    The status return level is written without a look at what was there: a servo at level 0 does not tell.
+    The status return level is written without reading it first: a servo at level 0 answers no read.
 
-    Raises ConfigError for what the register does not take, ServoError when the servo refuses.
+    Raises ConfigError for a value that the register does not take, ServoError when the servo refuses.
     """
-    table = seen.registers()
-    field = field_named(table, name)
+    table, field = seen.registers(), seen.named(name)
     if field in (table.role("id"), table.role("baud_rate")):
         raise ConfigError(f"{field.name} is not written like this: sfms-robot servo set-id, sfms-robot servo set-baud")
     if not field.writable:
@@ -127,128 +218,106 @@ def write_register(wire: Wire, seen: FoundServo, name: str, text: str, confirm: 
         raise ConfigError.at(table.model, "register", name, "is read-only", writable)
     raw = parse_value(table.model, field, text)
     mute = field == table.role("status_level")
-    before = None if mute else Value(field, read(wire, seen, field))
+    before = None if mute else Value(field, seen.read(field))
     if field.eeprom:
         change = f"{field.name} := {raw}" if before is None else f"{field.name} {before.raw} -> {raw}"
-        guard(wire, seen, change, confirm, mute)
-    put(wire, seen, field, raw)
+        seen.guard(change, confirm, mute)
+    seen.put(field, raw)
     return before, Value(field, raw)
 
 
 def parse_value(model: str, field: Field, text: str) -> int:
-    """A raw value, or a number with the register's unit. Raises ConfigError outside the register's range."""
-    match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
-    if match is None or (match[2] is None and "." in match[1]) or match[2] not in (None, field.unit):
+    """Return the raw value of a number, or of one with the register's unit. Raises ConfigError outside its range."""
+    number, unit = parse_number(text) or ("", "")
+    if not number or (unit and unit != field.unit):
         forms = ["a raw number", *([f"a number with unit {field.unit}"] if field.unit else [])]
         raise ConfigError.at(model, field.name, text, "is not a value of this register", forms)
-    raw = int(match[1]) if match[2] is None else round(float(match[1]) / field.scale)
+    raw = round(float(number) / field.scale) if unit else int(number)
     if not field.low <= raw <= field.high:
         raise ConfigError.at(model, field.name, text, "is out of range", [f"raw {field.low}..{field.high}"])
     return raw
 
 
-def read(wire: Wire, seen: FoundServo, field: Field) -> int:
-    """One register. Raises ServoError when the servo refuses or stays silent."""
-    return field.from_bytes(read_block(wire, seen, field.address, field.size, field.name))
-
-
-def read_block(wire: Wire, seen: FoundServo, address: int, length: int, what: str) -> bytes:
-    """Bytes of the control table. Raises ServoError."""
-    for _ in range(TRIES):
-        answer = wire.link.read(seen.id, address, length)
-        if answer is not None:
-            if refusal := wire.link.refusal(answer):
-                raise ServoError(f"id {seen.id} does not tell {what}: {refusal}")
-            return answer.data
-    raise ServoError(f"id {seen.id} does not answer when asked for {what} (status return level 0?)")
-
-
-def put(wire: Wire, seen: FoundServo, field: Field, raw: int) -> None:
-    """A verified write, through the lock of the EEPROM where there is one. Raises ServoError."""
-    finish(verified_write(wire.link, seen.id, field, raw, lock=_lock(seen), tries=TRIES))
+def parse_number(text: str) -> tuple[str, str] | None:
+    """Split `12.5deg` into number and unit; None for text that is neither that nor a whole number without a unit."""
+    match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
+    return None if match is None or (not match[2] and "." in match[1]) else (match[1], match[2] or "")
 
 
 # --- id, rate, start over ---------------------------------------------------------------------------------------
 
 
-def set_id(wire: Wire, seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False) -> FoundServo:
+def set_id(seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False) -> FoundServo:
     """Give a servo another id. With other servos on the wire only when `in_chain` says that this is meant:
     two new servos with one id can look like one, and both would be changed.
 
     Raises ConfigError for an id that cannot be used, ServoError when the servo does not take it.
     """
+    wire = seen.wire
     wire.check_id(new, "new id")
     if new == seen.id:
         raise ConfigError.at("servo", "new id", new, "is the id it has")
     if wire.ping(new) is not None:
         raise ConfigError.at("servo", "new id", new, "is taken: another servo answers to it")
-    if has_duplicate(wire, seen.id):
+    if wire.has_duplicate(seen.id):
         raise ServoError(f"id {seen.id}: two servos seem to answer: unplug all but the one that you mean")
-    if not in_chain:
-        others = [each.id for each in _neighbours(wire) if each.id != seen.id]
-        if others:
-            raise ConfigError(
-                f"other servos are on the wire (id {', '.join(map(str, others))}): unplug them, or say --in-chain"
-            )
-    guard(wire, seen, f"id {seen.id} -> {new}", confirm)
-    _put_in_eeprom_and_go(wire, seen, _register(seen, "id"), new, new)
+    others = [] if in_chain else [str(each.id) for each in wire.answering() if each.id != seen.id]
+    if others:
+        raise ConfigError(f"other servos are on the wire (id {', '.join(others)}): unplug them, or say --in-chain")
+    seen.guard(f"id {seen.id} -> {new}", confirm)
+    _move_to(seen, "id", new, new_id=new)
     changed = wire.ping(new)
     if changed is None:
-        raise ServoError(f"id {seen.id} was told to be {new}, and nobody answers as {new}")
+        raise ServoError(f"id {seen.id} was set to {new}, and no servo answers as {new}")
     if wire.ping(seen.id) is not None:
         raise ServoError(f"id {new} answers, and so does {seen.id}: two servos had one id, unplug one and look again")
     return changed
 
 
-def set_baud(wire: Wire, seen: FoundServo, baud: int, confirm: Confirm) -> FoundServo:
-    """Give a servo another rate, and meet it there. Raises ConfigError, PortError, ServoError."""
-    codes = {rate: code for code, rate in seen.registers().baud_codes.items()}
+def set_baud(seen: FoundServo, baud: int, confirm: Confirm) -> FoundServo:
+    """Give a servo another rate, and find it there. Raises ConfigError, PortError, ServoError."""
+    wire, codes = seen.wire, {rate: code for code, rate in seen.registers().baud_codes.items()}
     if baud not in codes:
-        raise ConfigError.at(seen.model, "baud", baud, "is no rate of this servo", sorted(codes))
+        raise ConfigError.at(seen.model, "baud", baud, "is not a rate of this servo", sorted(codes))
     before = wire.baud
-    wire.at(baud)  # an adapter that cannot do it says so while the servo can still be reached
+    wire.at(baud)  # an adapter that cannot do it fails while the servo can still be reached
     wire.at(before)
-    guard(wire, seen, f"baud {before} -> {baud}", confirm)
-    _put_in_eeprom_and_go(wire, seen, _register(seen, "baud_rate"), codes[baud], seen.id, baud)
+    seen.guard(f"baud {before} -> {baud}", confirm)
+    _move_to(seen, "baud_rate", codes[baud], baud=baud)
     wire.at(baud)
     changed = wire.ping(seen.id)
     if changed is None:
         wire.at(before)
-        still = "it is still" if wire.ping(seen.id) else "nor is it"
-        raise ServoError(f"id {seen.id} was told {baud} baud and does not answer there; {still} at {before}")
+        still = "it still answers" if wire.ping(seen.id) else "it does not answer either"
+        raise ServoError(f"id {seen.id} was set to {baud} baud and does not answer there; at {before} {still}")
     return changed
 
 
-def reboot(wire: Wire, seen: FoundServo, confirm: Confirm) -> FoundServo:
-    """Start a servo over: torque goes off, hardware errors are forgotten. Back once it answers again."""
+def reboot(seen: FoundServo, confirm: Confirm) -> FoundServo:
+    """Start a servo over: torque goes off, hardware errors are cleared. Return it once it answers again."""
     torque = seen.table.role("torque_enable") if seen.table else None
-    if torque is not None and read(wire, seen, torque):
-        _ask(f"id {seen.id} has torque on; a reboot lets go of what it holds", confirm)
-    answer = wire.link.reboot(seen.id)
-    if answer is not None and (refusal := wire.link.refusal(answer)):
-        raise ServoError(f"id {seen.id} refuses to reboot: {refusal}")
-    back = _wait_for(wire, seen.id)
+    if torque is not None and seen.read(torque):
+        ask(f"id {seen.id} has torque on; a reboot lets go of what it holds", confirm)
+    _accepted(seen, seen.wire.link.reboot(seen.id), "to reboot")
+    back = _wait_for(seen.wire, seen.id)
     if back is None:
-        raise ServoError(f"id {seen.id} was told to reboot and does not answer after {BACK_S:g} s")
+        raise ServoError(f"id {seen.id} does not answer {BACK_S:g} s after the reboot")
     return back
 
 
-def factory_reset(wire: Wire, seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
-    """Back to what it was when new. `keep`: all (keeps nothing), keep-id, keep-id-and-baud."""
+def factory_reset(seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
+    """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud."""
     if keep not in _RESETS:
         raise ConfigError.at("servo", "factory reset", keep, "is unknown", _RESETS)
-    table = seen.registers()
-    identity, rate = table.role("id"), table.default_baud
+    wire, identity, rate = seen.wire, seen.registers().role("id"), seen.registers().default_baud
     new_id = seen.id if keep != "all" or identity is None else identity.initial
     if new_id != seen.id:
         home = wire.baud
         if rate is not None and wire.at(rate).ping(new_id) is not None:
             raise ConfigError(f"id {new_id}, which a new servo has, is taken by another one at {rate} baud: unplug it")
         wire.at(home)
-    guard(wire, seen, f"every setting of id {seen.id} to its factory value ({keep})", confirm)
-    answer = wire.link.factory_reset(seen.id, _RESETS[keep])
-    if answer is not None and (refusal := wire.link.refusal(answer)):
-        raise ServoError(f"id {seen.id} refuses the reset: {refusal}")
+    seen.guard(f"every setting of id {seen.id} to its factory value ({keep})", confirm)
+    _accepted(seen, wire.link.factory_reset(seen.id, _RESETS[keep]), "the reset")
     expected = wire.baud if keep == "keep-id-and-baud" or rate is None else rate
     for baud in dict.fromkeys((expected, wire.baud)):
         wire.at(baud)
@@ -258,75 +327,126 @@ def factory_reset(wire: Wire, seen: FoundServo, keep: str, confirm: Confirm) -> 
     raise ServoError(f"id {seen.id} was reset and does not answer as {new_id} at {expected} baud")
 
 
-# --- inside -----------------------------------------------------------------------------------------------------
+def _accepted(seen: FoundServo, answer: Any, what: str) -> None:
+    """Raise ServoError for an answer that refuses; silence is not a refusal."""
+    if answer is not None and (refusal := seen.wire.link.refusal(answer)):
+        raise ServoError(f"id {seen.id} refuses {what}: {refusal}")
 
 
-def has_duplicate(wire: Wire, servo: int) -> bool:
-    """Whether two servos seem to answer to one id: a ping brings more than one clean answer, again and again."""
-    return all(ping_replies(wire.port, wire.kind.protocol, servo, PATIENCE_S).duplicate for _ in range(TRIES))
-
-
-def _neighbours(wire: Wire) -> list[FoundServo]:
-    """Everybody at the rate of now, without the patience of a scan where all have to be asked one by one."""
-    if wire.kind.broadcast:
-        return [wire.identified(servo, found) for servo, found in wire.link.broadcast_ping().items()]
-    asked = (wire.ping(servo, tries=1) for servo in range(wire.kind.max_id + 1))
-    return [seen for seen in asked if seen is not None]
-
-
-def _register(seen: FoundServo, role: str) -> Field:
-    field = seen.registers().role(role)
+def _move_to(seen: FoundServo, role: str, raw: int, new_id: int | None = None, baud: int | None = None) -> None:
+    """Write a register after which the servo has another id or rate: the lock has to be closed there."""
+    wire, field, lock = seen.wire, seen.registers().role(role), seen.registers().role("lock")
     if field is None:
         raise ServoError(f"id {seen.id}: {seen.model} has no register for its {role}")
-    return field
-
-
-def _lock(seen: FoundServo) -> Field | None:
-    """The register that opens EEPROM. Not that of Dynamixel 1.0: closed once, it stays closed until power is off."""
-    return seen.registers().role("lock")
-
-
-def guard(wire: Wire, seen: FoundServo, what: str, confirm: Confirm, mute: bool = False) -> None:
-    """Before EEPROM: torque off (which a `mute` servo cannot say), and somebody wants it.
-
-    Raises ServoError, ConfigError.
-    """
-    torque = None if mute else seen.registers().role("torque_enable")
-    if torque is not None and read(wire, seen, torque):
-        raise ServoError(
-            f"id {seen.id} has torque on, its EEPROM is closed: sfms-robot servo write {seen.id} {torque.name} 0"
-        )
-    _ask(f"id {seen.id} ({seen.model}): {what}", confirm)
-
-
-def _ask(question: str, confirm: Confirm) -> None:
-    if not confirm(question):
-        raise ConfigError(f"nothing was written: {question} (not confirmed)")
-
-
-def _put_in_eeprom_and_go(
-    wire: Wire, seen: FoundServo, field: Field, raw: int, new_id: int, baud: int | None = None
-) -> None:
-    """As `put`, for a register after which the servo is elsewhere: the lock has to be closed there."""
-    lock = _lock(seen)
     if lock is not None:
         wire.link.write(seen.id, lock.address, lock.to_bytes(0))
-    answer = wire.link.write(seen.id, field.address, field.to_bytes(raw))
-    if answer is not None and (refusal := wire.link.refusal(answer)):
-        raise ServoError(f"id {seen.id} refuses {field.name} := {raw}: {refusal}")
+    _accepted(seen, wire.link.write(seen.id, field.address, field.to_bytes(raw)), f"{field.name} := {raw}")
     if lock is not None:
-        wire.at(baud or wire.baud).write(new_id, lock.address, lock.to_bytes(1))
+        wire.at(baud or wire.baud).write(seen.id if new_id is None else new_id, lock.address, lock.to_bytes(1))
 
 
 def _wait_for(wire: Wire, servo: int) -> FoundServo | None:
-    """The servo once it answers, within `BACK_S`."""
+    """Return the servo once it answers, within `BACK_S`; else None."""
     end_s = wire.clock.now_s() + BACK_S
     while True:
         seen = wire.ping(servo, tries=1)
         if seen is not None or wire.clock.now_s() >= end_s:
             return seen
-        _pause(wire.clock)
+        wire.clock.wait_until(wire.clock.now_s() + _STEP_S)
 
 
-def _pause(clock: Clock) -> None:
-    clock.wait_until(clock.now_s() + _STEP_S)
+# --- dump and restore -----------------------------------------------------------------------------------------------
+
+
+class DumpedServo(Model):
+    """One servo as it was: raw values by register name."""
+
+    id: int
+    model: str
+    model_number: int | None = None
+    firmware: int | None = None
+    registers: dict[str, int]
+
+
+class Dump(Model):
+    """The file that `servo dump` writes."""
+
+    version: Literal[1] = 1
+    servos: tuple[DumpedServo, ...]
+
+
+def dump(servos: Sequence[FoundServo]) -> Dump:
+    """Read every register of `servos`. Raises ConfigError for a model without a firmware map, ServoError."""
+    found = []
+    for seen in servos:
+        who = {"id": seen.id, "model": seen.registers().model, "model_number": seen.model_number}
+        seen.wire.at(seen.baud)
+        found.append(DumpedServo(**who, firmware=seen.firmware, registers=read_all(seen).values))
+    return Dump(servos=tuple(found))
+
+
+def check_new(file: Path) -> None:
+    """Raise ConfigError, as `save_dump` does, where a dump cannot be written, or a file is there already."""
+    if file.exists():
+        raise ConfigError(f"{file}: is there already, name another file")
+    checked_file(file, "servo dump")
+
+
+def save_dump(what: Dump, file: Path) -> None:
+    """Write a dump. Raises ConfigError for a file that exists: it may hold the only copy of a servo's settings."""
+    text = "# Registers of servos, raw; `sfms-robot servo restore` writes the lasting ones back.\n"
+    text += yaml.safe_dump(what.model_dump(mode="json"), sort_keys=False)
+    try:
+        with file.open("x", encoding="utf-8") as out:
+            out.write(text)
+    except FileExistsError:
+        raise ConfigError(f"{file}: is there already, name another file") from None
+
+
+def load_dump(file: Path) -> Dump:
+    """Read a dump. Raises ConfigError."""
+    return load(Dump, file)
+
+
+def differences(seen: FoundServo, was: DumpedServo) -> list[tuple[str, int, int]]:
+    """Return (register, value now, value then) of the EEPROM registers that differ, without id and rate.
+
+    Raises ConfigError for another model, ServoError.
+    """
+    table = seen.registers()
+    if table.model != was.model:
+        raise ConfigError.at(f"id {seen.id}", "model", seen.model, "is not the model of the file", [was.model])
+    apart = (table.role("id"), table.role("baud_rate"))
+    now, then = read_all(seen).values, was.registers
+    lasting = [f.name for f in table.fields.values() if f.eeprom and f.writable and f not in apart]
+    return [(n, now[n], then[n]) for n in lasting if n in then and now.get(n) != then[n]]
+
+
+def restore(seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool = False) -> list[dict[str, Any]]:
+    """Write the EEPROM of a dumped servo into `seen`, each register verified; return a row for each change.
+
+    The changes are shown in one question. With `identity` the servo gets id and rate of the file as well, last.
+
+    Raises ConfigError for another model or an answer of no, ServoError for a servo that has torque on or refuses.
+    """
+    wire, table, changes = seen.wire, seen.registers(), differences(seen, was)
+    if changes:
+        seen.guard(", ".join(f"{name} {now} -> {then}" for name, now, then in changes), confirm)
+    rows: list[dict[str, Any]] = []
+
+    def report(register: str, before: int, raw: int) -> None:
+        rows.append({"id": seen.id, "register": register, "before": before, "raw": raw})
+
+    for name, now, then in changes:
+        seen.put(table[name], then)
+        report(name, now, then)
+    if identity:
+        if was.id != seen.id:
+            report("id", seen.id, was.id)
+            seen = set_id(seen, was.id, confirm)
+        code = table.role("baud_rate")
+        rate = table.baud_codes.get(was.registers.get(code.name, -1)) if code is not None else None
+        if rate is not None and rate != wire.baud:
+            report("baud", wire.baud, rate)
+            set_baud(seen, rate, confirm)
+    return rows

@@ -45,7 +45,7 @@ from sfms_robot.listeners.events.evidence import (
 )
 from sfms_robot.listeners.lots import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
-from sfms_robot.signals.hats import log_time
+from sfms_robot.signals.phase import log_time
 
 STEP_FRAMES: Final = 2
 STEP_S: Final = 0.08

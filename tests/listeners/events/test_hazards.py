@@ -10,10 +10,8 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE, NUMBERS
-from sfms_robot.listeners.events.hazards import FILE, HazardBank, load_tables
-from sfms_robot.signals.phase import piecewise_linear_basis
 from sfms_robot.listeners.events.model import FILE, HazardBank, load_tables
-from sfms_robot.signals.hats import hats
+from sfms_robot.signals.phase import piecewise_linear_basis
 
 SHIPPED = data_dir("sim") / "listeners" / FILE
 

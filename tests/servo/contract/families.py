@@ -10,7 +10,7 @@ from chain_rig import bus_of
 from emulated_port import Straight
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.device import EmulatedServo
+from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.lab.bench import campaign_rig
 from sfms_robot.ports import Bus
 from sfms_robot.servo.port import Port

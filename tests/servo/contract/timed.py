@@ -15,7 +15,6 @@ from families import FAMILIES, LIMIT_RAD, Family
 from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.emulator.device import replies_of
 from sfms_robot.servo.families import family_named
 
 CHAINS = [name for name, family in FAMILIES.items() if not family_named(family.bus).board]
@@ -49,7 +48,7 @@ class TimedPort(EmulatedPort):
         if self.deaf:
             return
         due_s = self.clock.t + self.held_s
-        for servos, answer, pause_s in replies_of(self.device, data, self.baud, self.clock.t):
+        for servos, answer, pause_s in self.device.replies(data, self.baud, self.clock.t):
             if self.mute & set(servos):
                 if len(servos) > 1:  # a fast read: one packet that stops where somebody is silent
                     whole = (len(answer) - 8) // len(servos)

@@ -14,15 +14,11 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, Doubles, ListenerEvent
 from sfms_robot.lab.evaluation.phrase_timing import phrase_end_counts, phrase_ends, ratio_of
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
 from sfms_robot.lab.learning.events.event_trainer import Student
 from sfms_robot.lab.learning.events.labels import minutes, steps_of
-from sfms_robot.listeners.events.evidence import AT, COUNTED_S, DONE, HEARD, Bools, Ints
-from sfms_robot.listeners.events.hazards import STEP_S, HazardBank
-from sfms_robot.listeners.events.model import EventModel
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
 from sfms_robot.listeners.events.evidence import AT, COUNTED_S, DONE, HEARD
 from sfms_robot.listeners.events.model import STEP_S, EventModel, HazardBank
-from sfms_robot.signals.events import phrase_end_counts, phrase_ends, ratio_of
 
 STRETCH: Final = 400  # steps looked at together
 

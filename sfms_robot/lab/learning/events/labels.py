@@ -20,11 +20,8 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
 from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.corpora.meeting_evidence import MeetingEvidence
 from sfms_robot.lab.evaluation.phrase_timing import near
-from sfms_robot.listeners.events.evidence import Bools, Ints
-from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
 from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S
-from sfms_robot.signals.events import near
 
 LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
 REACTION_S: Final = 0.3  # of a smile to a laugh, of brows to a question

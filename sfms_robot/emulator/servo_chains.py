@@ -1,0 +1,390 @@
+"""Emulated servos of one wire that share a protocol: packets in, packets out. Opens nothing.
+
+An instruction to an id that no servo has stays unanswered, and only servos set to the host's baud rate receive it. On
+a sync or bulk read each servo waits for the one before it: behind a silent id all are silent, or, with `chain_break`
+False, the others answer. Two servos with one id obey both; Dynamixels of Protocol 2.0 then talk at the same time.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import reduce
+from typing import Any, Final, Generic, TypeVar
+
+from sfms_robot.emulator.control_table import Mode
+from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, Reply
+from sfms_robot.emulator.register_servo import RegisterServo
+from sfms_robot.servo.codecs import dxl2, protocol1
+from sfms_robot.servo.registers import Field, Table
+
+FAST_BULK_READ: Final = 0x9A
+_GAP_S: Final = 0.05  # an unfinished packet older than this is forgotten
+_SLOT_S: Final = 0.003  # a broadcast ping is answered in the order of ids, each in its own slot
+_FAST_FIRMWARE: Final = 45  # from here on a servo knows fast reads
+_CENTER_ON_STS: Final = 2048
+_LIMITED: Final = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
+_RESET_BY_MODE: Final = ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current")
+_CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"  # parameters of CLEAR
+_RESULT_FAIL: Final = 1
+_REBOOT_S: Final = 0.3  # a Dynamixel 2.0 neither listens nor answers after a reboot
+Request = tuple[int, int, int]  # id, address, length
+S = TypeVar("S", bound=RegisterServo)
+
+
+class ServoChain(Device, Generic[S]):
+    """The servos of one protocol. `tables` by model."""
+
+    _servo_class: type[S]
+    _width: int  # bytes of an address and of a length in the parameters of an instruction
+    _decode: Callable[[bytearray], Any]  # takes a whole packet off the front of a buffer, or returns None
+
+    def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> None:
+        self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
+        self.chain_break = chain_break
+        self._buffer = bytearray()
+        self._received_at_s = 0.0
+
+    def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
+        if now_s - self._received_at_s > _GAP_S:
+            self._buffer.clear()
+        self._received_at_s = now_s
+        self._buffer += data
+        return list(self._obey_all(baud, now_s))
+
+    def _listening(self, baud: int | None, now_s: float) -> dict[int, list[S]]:
+        """Return the servos that receive a packet now, by id; without any, the buffer holds noise of another baud."""
+        listening: dict[int, list[S]] = {}
+        for servo in self.servos:
+            if servo.hears(baud, now_s):
+                servo.feed_watchdog(now_s)
+                listening.setdefault(servo.id, []).append(servo)
+        if not listening:
+            self._buffer.clear()
+        return listening
+
+    def _obey_all(self, baud: int | None, now_s: float) -> Iterator[Reply]:
+        """Yield the answers to the whole packets in the buffer, which are taken out of it."""
+        while (packet := self._decode(self._buffer)) is not None:
+            listening = self._listening(baud, now_s)
+            try:
+                yield from self._answers(packet, listening, now_s)
+            except IndexError:
+                continue  # parameters are missing: no servo knows what was meant
+
+    @abstractmethod
+    def _answers(self, packet: Any, listening: dict[int, list[S]], now_s: float) -> Iterator[Reply]:
+        """Yield the answers to a packet of the servos that receive it, by id."""
+
+    def _number(self, params: bytes, index: int) -> int:
+        """Return an address or a length. Raises IndexError where it is missing."""
+        place = index * self._width
+        return sum(params[place + i] << 8 * i for i in range(self._width))
+
+    def _common(self, servo: S, code: int, params: bytes, now_s: float) -> tuple[int, bytes, int] | None:
+        """Return (error, data, status return level of the answer) of an instruction of every family; else None."""
+        if code == protocol1.READ:
+            return *servo.read(self._number(params, 0), self._number(params, 1), now_s), 1
+        if code == protocol1.WRITE:
+            return servo.write(self._number(params, 0), params[self._width :], now_s), b"", 2
+        if code == protocol1.REG_WRITE:
+            return servo.register(self._number(params, 0), params[self._width :]), b"", 2
+        return (servo.action(now_s), b"", 2) if code == protocol1.ACTION else None
+
+
+# --- Protocol 2.0 ---------------------------------------------------------------------------------------------------
+
+
+class Dynamixel2Servo(RegisterServo):
+    """A Dynamixel of Protocol 2.0. Errors are numbers; EEPROM is closed under torque; goals are held to limits."""
+
+    _beyond, _unknown = dxl2.DATA_RANGE_ERROR, dxl2.ACCESS_ERROR
+    _start_s = _REBOOT_S
+
+    def clear(self, params: bytes, now_s: float) -> int:
+        """Forget whole turns, only at rest; return the error."""
+        self.advance(now_s)
+        if params != _CLEAR_TURNS:
+            return dxl2.DATA_RANGE_ERROR
+        if self.plant.speed != 0.0:
+            return _RESULT_FAIL
+        self.forget_turns(now_s)
+        return 0
+
+    def _refusal(self, field: Field, value: int | None) -> int:
+        name = field.name
+        if not field.writable or (field.eeprom and self.torque):  # "EEPROM Area": only while Torque Enable (64) is 0
+            return dxl2.ACCESS_ERROR
+        if value is None:
+            return dxl2.DATA_LENGTH_ERROR
+        if not field.low <= value <= field.high or (name == "bus_watchdog" and value < 0):  # -1 only reports a trip
+            return dxl2.DATA_RANGE_ERROR
+        # "Bus Watchdog (98)": after a trip all goals are refused until it is set to 0.
+        if self._tripped and (name == "goal_position" or name in _LIMITED):
+            return dxl2.DATA_RANGE_ERROR
+        if name == "goal_position" and self._mode is Mode.JOINT:  # Min and Max Position Limit (52, 48)
+            return 0 if self._lowest <= value <= self._highest else dxl2.DATA_LIMIT_ERROR
+        if (limit := _LIMITED.get(name, "")) in self.table.fields and abs(value) > self._get(limit):
+            return dxl2.DATA_LIMIT_ERROR
+        # "Shutdown (63)": torque stays off until a reboot.
+        return dxl2.ACCESS_ERROR if name == "torque_enable" and value and self._shut_down() else 0
+
+    def _apply(self, wanted: Mapping[str, int]) -> None:
+        if "bus_watchdog" in wanted:
+            self._tripped = False
+        super()._apply(wanted)
+        if "operating_mode" in wanted:  # "Operating Mode (11)": a change resets gains, profile and goals
+            for name in _RESET_BY_MODE:
+                self._put(name, 0)
+            self._put("goal_position", round(self.frame.reported(self.plant.position)))
+            self._settings()
+
+
+class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
+    """Servos that speak Protocol 2.0."""
+
+    _servo_class, _width, _decode = Dynamixel2Servo, 2, staticmethod(dxl2.maybe_packet)
+
+    def _answers(
+        self, packet: dxl2.Packet, listening: dict[int, list[Dynamixel2Servo]], now_s: float
+    ) -> Iterator[Reply]:
+        code, params, number = packet.instruction, packet.params, self._number
+        if code == dxl2.STATUS:
+            return
+        followers: dict[int, list[Dynamixel2Servo]] = {}  # the second id of a servo obeys, and never answers
+        for servo in (servo for each in listening.values() for servo in each if servo.second_id is not None):
+            followers.setdefault(servo.second_id or 0, []).append(servo)
+        if code in (dxl2.SYNC_WRITE, dxl2.BULK_WRITE):  # nothing answers
+            parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
+            for servo_id, address, data in parts:
+                for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
+                    servo.write(address, data, now_s)
+        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):  # address (2), length (2), then ids
+            requests = [(servo_id, number(params, 0), number(params, 1)) for servo_id in params[4:]]
+            yield from self._reads(requests, code == dxl2.FAST_SYNC_READ, listening, now_s)
+        elif code in (dxl2.BULK_READ, FAST_BULK_READ):  # id, address (2), length (2) of each
+            starts = range(0, len(params), 5)
+            requests = [(params[i], number(params[i + 1 :], 0), number(params[i + 1 :], 1)) for i in starts]
+            yield from self._reads(requests, code == FAST_BULK_READ, listening, now_s)
+        elif packet.servo == dxl2.BROADCAST:
+            last = 0
+            for servo_id in sorted(listening):
+                for reply in self._together(listening[servo_id], code, params, now_s, broadcast=True):
+                    yield reply._replace(pause_s=reply.pause_s + _SLOT_S * (servo_id - last))
+                    last = servo_id
+        else:
+            for servo in followers.get(packet.servo, ()):
+                self._single(servo, code, params, now_s)
+            yield from self._together(listening.get(packet.servo, []), code, params, now_s)
+
+    def _sync_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (id, address, data) of a sync write."""
+        address, length = self._number(params, 0), self._number(params, 1)  # then id and data of each
+        for start in range(4, len(params) - length, length + 1):
+            yield params[start], address, params[start + 1 : start + 1 + length]
+
+    def _bulk_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (id, address, data) of a bulk write."""
+        while params:  # id, address (2), length (2), data
+            length = self._number(params[1:], 1)
+            yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
+            params = params[5 + length :]
+
+    def _reads(
+        self, requests: Sequence[Request], fast: bool, listening: dict[int, list[Dynamixel2Servo]], now_s: float
+    ) -> Iterator[Reply]:
+        """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
+
+        The one packet of a fast read is announced whole, and stops short at the first servo that is silent.
+        """
+        parts: list[tuple[int, int, bytes]] = []
+        pause_s = 0.0
+        for servo_id, address, length in requests:
+            there = [
+                servo for servo in listening.get(servo_id, ()) if servo.answers(1) and (_is_new(servo) or not fast)
+            ]
+            if not there and (self.chain_break or fast):
+                break
+            answers = [(servo, *servo.read(address, length, now_s)) for servo in there]
+            if fast:
+                servo, error, data = answers[0]
+                parts.append((servo_id, _alerted(servo, error), data or bytes(length)))
+                pause_s += servo.return_delay_s
+            elif there:
+                packets = [dxl2.encode_status(servo_id, _alerted(servo, error), data) for servo, error, data in answers]
+                yield Reply((servo_id,), _collided(packets), there[0].return_delay_s)
+        announced = 1 + sum(length + 4 for *_, length in requests)  # LEN: as far as the last servo of the list
+        if parts and announced < dxl2.MAX_PACKET + 1:
+            yield Reply(tuple(part[0] for part in parts), dxl2.encode_fast_status(parts, announced), pause_s)
+
+    def _together(
+        self, servos: list[Dynamixel2Servo], code: int, params: bytes, now_s: float, broadcast: bool = False
+    ) -> Iterator[Reply]:
+        """Let the servos of one id obey; yield their answer, under the id that they had."""
+        ids, pause_s = [servo.id for servo in servos], max((servo.return_delay_s for servo in servos), default=0.0)
+        answers = [self._single(servo, code, params, now_s, broadcast) for servo in servos]
+        if packets := [answer for answer in answers if answer is not None]:
+            yield Reply((ids[0],), _collided(packets), pause_s)
+
+    def _single(
+        self, servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool = False
+    ) -> bytes | None:
+        """Let one servo obey an instruction; return its answer, or None."""
+        servo_id, result = servo.id, (dxl2.INSTRUCTION_ERROR, b"", 2)
+        if code == dxl2.PING:  # answered at any status return level: model number (2), firmware (1)
+            servo.advance(now_s)
+            number = servo.table.model_number or 0
+            result = 0, number.to_bytes(2, "little") + bytes([servo.firmware]), 0
+        elif code == dxl2.READ and broadcast:
+            return None
+        elif code in (dxl2.REBOOT, dxl2.FACTORY_RESET):  # answered first, in the state that it is in
+            reply = dxl2.encode_status(servo_id, _alerted(servo, 0)) if servo.answers(2) and not broadcast else None
+            if code == dxl2.REBOOT:
+                servo.power_cycle(now_s)
+            elif not (broadcast and params[0] == 0xFF):  # ignored since firmware 42: all would have one id
+                servo.factory_reset(now_s, {1: ("id",), 2: ("id", "baud_rate")}.get(params[0], ()))
+            return reply
+        elif code == dxl2.CLEAR:
+            result = servo.clear(params, now_s), b"", 2
+        else:
+            result = self._common(servo, code, params, now_s) or result
+        error, data, level = result
+        if not servo.answers(level) or (broadcast and code != dxl2.PING):
+            return None
+        return dxl2.encode_status(servo_id, _alerted(servo, error), data)
+
+
+def _alerted(servo: Dynamixel2Servo, error: int) -> int:
+    return error | (dxl2.ALERT if servo.fault_status else 0)
+
+
+def _is_new(servo: Dynamixel2Servo) -> bool:
+    """Return whether a servo knows fast reads."""
+    return servo.firmware >= _FAST_FIRMWARE and "operating_mode" in servo.table.fields
+
+
+def _collided(packets: Sequence[bytes]) -> bytes:
+    """Return what the wire carries when several talk at once: low wins, bit by bit."""
+    length = max(map(len, packets))
+    wide = (int.from_bytes(packet.ljust(length, b"\xff"), "big") for packet in packets)
+    return reduce(int.__and__, wide).to_bytes(length, "big")
+
+
+# --- Protocol 1.0 and Feetech ---------------------------------------------------------------------------------------
+
+
+class Protocol1Servo(RegisterServo):
+    """A Dynamixel of Protocol 1.0, or a Feetech. Errors and `fault_status` are bits of every answer."""
+
+    _beyond = _unknown = protocol1.RANGE
+
+    def __init__(self, what: EmulatedServo, table: Table) -> None:
+        is_feetech = table.family == "feetech"
+        self._nothing_registered = 0 if is_feetech else protocol1.INSTRUCTION
+        # MX knows bulk read, AX does not; their tables differ in the multi-turn registers. STS knows sync read, the
+        # turn counter and the calibration of its middle, SCS does not.
+        self.is_sts = is_feetech and table.byte_order == "little"
+        self.group_reads = {protocol1.SYNC_READ} if self.is_sts else set()
+        if not is_feetech and "multi_turn_offset" in table.fields:
+            self.group_reads = {protocol1.BULK_READ}
+        super().__init__(what, table)
+
+    def _refusal(self, field: Field, value: int | None) -> int:
+        if value is None or not field.writable:
+            return protocol1.RANGE
+        # Register 44 of a Feetech is a time, and in PWM mode a duty with a sign bit.
+        signed_duty = field.name == "goal_time" and self._mode is Mode.PWM
+        if not (-field.high if signed_duty else field.low) <= value <= field.high:
+            return protocol1.RANGE
+        # A Feetech moves to the nearer limit instead; equal limits are wheel or multi-turn mode.
+        if field.name == "goal_position" and not self._is_feetech:
+            lowest, highest = self._lowest, self._highest
+            return 0 if lowest == highest or lowest <= value <= highest else protocol1.ANGLE_LIMIT
+        return 0
+
+    def _torque_written(self, value: int, locked: bool) -> None:
+        """Take the present position for the middle at 128 (Feetech); clear an overload when torque comes on."""
+        if value == protocol1.CALIBRATE_HERE and "homing_offset" in self.table.fields:
+            one_turn = round(self.plant.position % self.table.ticks_per_revolution)
+            self._put("homing_offset", one_turn - _CENTER_ON_STS)
+            if not locked:
+                self._keep(self.table["homing_offset"])
+            self._put_role("torque_enable", 0)
+        elif value == 1 and self._role("torque_limit", 1):  # "Shutdown (18)": first a torque limit, then torque
+            self.fault_status &= ~self._bits["overload"]
+            if self._shut_down():
+                self._put_role("torque_enable", 0)
+
+    def _fail(self, bits: int) -> None:
+        super()._fail(bits)
+        if self._shut_down() and not self._is_feetech:
+            self._put_role("torque_limit", 0)  # "Torque Limit (34)" is 0 after a shutdown, until a host sets it
+
+
+class Protocol1Chain(ServoChain[Protocol1Servo]):
+    """Servos that speak the FF FF frame. Frames of Protocol 2.0 on the same wire look like noise to them."""
+
+    _servo_class, _width, _decode = Protocol1Servo, 1, staticmethod(protocol1.maybe_frame)
+
+    def _answers(
+        self, packet: protocol1.Frame, listening: dict[int, list[Protocol1Servo]], now_s: float
+    ) -> Iterator[Reply]:
+        target, code, params = packet
+        if code == protocol1.SYNC_WRITE:
+            address, parts = protocol1.sync_write_parts(params)
+            for servo_id, data in parts:
+                for servo in listening.get(servo_id, ()):
+                    servo.write(address, data, now_s)
+        elif code == protocol1.SYNC_READ:
+            address, length, ids = protocol1.sync_read_parts(params)
+            yield from self._group([(servo_id, address, length) for servo_id in ids], code, listening, now_s)
+        elif code == protocol1.BULK_READ:
+            yield from self._group(protocol1.bulk_read_parts(params), code, listening, now_s)
+        elif target == protocol1.BROADCAST:
+            for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
+                answers = list(self._single(servo, code, params, now_s))
+                if code == protocol1.PING and servo.table.family == "feetech":
+                    yield from answers
+        else:
+            for servo in listening.get(target, ()):
+                yield from self._single(servo, code, params, now_s)
+
+    def _group(
+        self, requests: Sequence[Request], code: int, listening: dict[int, list[Protocol1Servo]], now_s: float
+    ) -> Iterator[Reply]:
+        for servo_id, address, length in requests:
+            there = [servo for servo in listening.get(servo_id, ()) if code in servo.group_reads and servo.answers(1)]
+            if there:
+                yield _status(there[0], servo_id, *there[0].read(address, length, now_s))
+            elif self.chain_break:
+                return
+
+    def _single(self, servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> Iterator[Reply]:
+        """Let one servo obey an instruction; yield its answer, under the id that it had."""
+        servo_id, is_feetech = servo.id, servo.table.family == "feetech"
+        answers = [servo.answers(level) for level in range(3)]  # as the request finds it
+        error, data, level = 0, b"", 2
+        if (result := self._common(servo, code, params, now_s)) is not None:
+            error, data, level = result
+            if is_feetech and code == protocol1.READ and not data:
+                return
+        elif code == protocol1.PING:
+            servo.advance(now_s)
+            level = 0
+        elif code == protocol1.FACTORY_RESET:
+            servo.factory_reset(now_s)
+        elif code == protocol1.CALIBRATE_OFFSET and servo.is_sts:
+            torque = servo.table["torque_enable"]
+            error = servo.write(torque.address, torque.to_bytes(protocol1.CALIBRATE_HERE), now_s)
+        elif code == protocol1.RESET_TURNS and servo.is_sts:
+            servo.forget_turns(now_s)
+        elif is_feetech:
+            return
+        else:
+            error = protocol1.INSTRUCTION
+        if answers[level]:
+            yield _status(servo, servo_id, error, data)
+
+
+def _status(servo: Protocol1Servo, servo_id: int, error: int, data: bytes) -> Reply:
+    return Reply((servo_id,), protocol1.encode(servo_id, error | servo.fault_status, data), servo.return_delay_s)
