@@ -6,8 +6,8 @@ import sys
 
 import typer
 
-from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.servo_wiring import Family, confirmation
+from sfms_robot.cli.show import print_json
 
 
 def doctor(

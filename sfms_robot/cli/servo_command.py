@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfms_robot.cli.json_line import print_json
 from sfms_robot.cli.servo_wiring import Wiring, confirmation, on_wire
+from sfms_robot.cli.show import print_json
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -133,15 +133,16 @@ def release(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")] = False,
 ) -> None:
     """Take torque off a head's servos, whatever state they are in; the head may fall."""
-    from sfms_robot.app.open_head import HeadOptions, open_wires
+    from sfms_robot.app.options import HeadOptions
     from sfms_robot.app.servo.move import release as let_go
     from sfms_robot.app.servo.serial_line import real_clock
+    from sfms_robot.app.wiring import open_wires
     from sfms_robot.config import load_head
 
     if everything and not confirmation(yes)(f"--all takes torque off every servo on {port}"):
         raise ConfigError("--all: not confirmed, nothing was written")
     found = load_head(head)
-    with open_wires(found, HeadOptions(head, port)) as opened:
+    with open_wires(found, HeadOptions(head=head, port=port)) as opened:
         rows = let_go(found, opened, real_clock(), everything)
     left = [row["joint"] or f"id {row['id']}" for row in rows if row["torque"] != "off"]
     _show(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.listen.preflight import can_open
+from sfms_robot.app.options import can_open
 
 
 @pytest.mark.parametrize(

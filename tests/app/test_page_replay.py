@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from sfms_robot.app.listen.preflight import begin_page
-from sfms_robot.app.replay.page_replay import pictures, show_recording
+from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.app.replay.playback import pictures, show_recording
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.session import run
 from sfms_robot.frames import MOTION_DIM, Reading
 from sfms_robot.ports import Tick
 from sfms_robot.runtime.recorder import Recorder

@@ -8,7 +8,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from sfms_robot.app.replay import plot, read_recording, sheet, summary
+from sfms_robot.app.replay.pictures import plot, sheet
+from sfms_robot.app.replay.run_file import read_recording, summary
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, FaceFrame, Plan, Reading, SpeakerFrame
 from sfms_robot.ports import Tick

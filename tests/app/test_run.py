@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from sfms_robot.app.replay import read_recording
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.app.session import run
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError, PortError
 
@@ -20,9 +21,10 @@ WATCHED = """
 import json, sys
 from pathlib import Path
 from sfms_robot.app import session
+from sfms_robot.app.options import RunOptions
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import PageRecorder
-from sfms_robot.app.listen.report import RunTeller
+from sfms_robot.app.listen.report import OutletObserver
 from sfms_robot.config import load_head
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.safety import Interrupt
@@ -57,8 +59,8 @@ recorder = PageRecorder(page, folder, joints, {})
 recorder.record(True)
 watcher = PageObserver(page, joints)
 watcher.document = lambda: shown[0]()
-options = session.RunOptions(listener=listener, duration_s=3.0, fast=True, record=folder / "run", status="0")
-observers = [watcher, recorder, RunTeller(Outlet()), looks]
+options = RunOptions(listener=listener, duration_s=3.0, fast=True, record=folder / "run", status="0")
+observers = [watcher, recorder, OutletObserver(Outlet()), looks]
 report = session.run(options, Shown, observers=observers, interrupt=looks)
 page.close()
 print(json.dumps([report["exit"], report["observers_detached"], sorted(looks.after - looks.before)]))

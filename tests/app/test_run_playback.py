@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.replay.playback import play_back, recorded_face
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.replay.run_playback import PlaybackOptions, RecordedFace, play_back
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.session import run
 from sfms_robot.runtime.recorder import RUN_FILE
 
 HEAD, SECONDS = "interbotix_wxxms", 4.0
@@ -22,7 +23,7 @@ def recorded(tmp_path_factory):
 
 def test_the_same_head_does_what_it_did(recorded):
     folder, report = recorded
-    played = play_back(folder, PlaybackOptions(fast=True))
+    played = play_back(folder, fast=True)
     assert (played["head"], played["exit"], played["error"]) == (HEAD, "done", None)
     assert played["duration_s"] == pytest.approx(SECONDS) and played["limits"]["violations"] == 0
     assert played["motion"] == report["motion"]
@@ -32,7 +33,7 @@ def test_the_same_head_does_what_it_did(recorded):
 
 
 def test_another_head_does_what_it_can(recorded):
-    played = play_back(recorded[0], PlaybackOptions("poppy_head", fast=True))
+    played = play_back(recorded[0], head="poppy_head", fast=True)
     assert played["head"] == "poppy_head" and played["exit"] == "done"
     assert played["limits"]["violations"] == 0
     assert any(joint["travel_rad"] > 0.01 for joint in played["joints"].values())
@@ -41,7 +42,7 @@ def test_another_head_does_what_it_can(recorded):
 def test_what_a_killed_run_left_plays_up_to_its_end(recorded, tmp_path):
     whole = (recorded[0] / RUN_FILE).read_bytes()
     (tmp_path / RUN_FILE).write_bytes(whole[: len(whole) // 2])
-    played = play_back(tmp_path, PlaybackOptions(fast=True))
+    played = play_back(tmp_path, fast=True)
     assert not played["whole"] and 0.5 < played["recorded_s"] < SECONDS
     assert played["duration_s"] == pytest.approx(played["recorded_s"], abs=0.02)
 
@@ -50,7 +51,7 @@ def test_a_face_is_that_of_its_tick_and_between_two_between_them(recorded):
     recording = read_recording(recorded[0])
     listened = recording.times_s <= recording.listened_s
     assert recording.listened_s == SECONDS and not listened.all()  # a head that plays it has a way to rest of its own
-    timeline, times_s, motion = RecordedFace(recording), recording.times_s[listened], recording.motion[listened]
+    timeline, times_s, motion = recorded_face(recording), recording.times_s[listened], recording.motion[listened]
     np.testing.assert_array_equal(timeline.sample(times_s, 0.0, None)[0], motion)
     between, _ = timeline.sample((times_s[1:] + times_s[:-1]) / 2, 0.0, None)
     np.testing.assert_allclose(between, (motion[1:] + motion[:-1]) / 2, atol=1e-6)
@@ -72,8 +73,8 @@ def test_the_seed_is_a_number_as_in_the_report(recorded, command_line):
 
 def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
     (tmp_path / "head.yaml").write_text(read_recording(recorded[0]).about["head_yaml"])
-    played = play_back(recorded[0], PlaybackOptions(str(tmp_path), fast=True))
-    assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], PlaybackOptions(fast=True))["joints"]
+    played = play_back(recorded[0], head=str(tmp_path), fast=True)
+    assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], fast=True)["joints"]
 
 
 def test_what_is_wrong_is_said_in_one_line(recorded, command_line):

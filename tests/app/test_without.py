@@ -2,7 +2,8 @@
 
 import pytest
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.errors import ConfigError
 
 

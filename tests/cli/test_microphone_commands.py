@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.cli.show import LevelMeter, meter_line
+from sfms_robot.app.listen.sound_check import LevelMeter, meter_line
 
 pytestmark = pytest.mark.realtime
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from motion_rows import motion
 
-from sfms_robot.face.human import load_human
-from sfms_robot.face.human_mesh import with_hair
+from sfms_robot.face.human import load_human, with_hair
 from sfms_robot.frames import BLENDSHAPES
 
 BALD = load_human()

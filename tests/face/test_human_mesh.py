@@ -6,8 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from sfms_robot.face.human import load_human
-from sfms_robot.face.human_mesh import PARTS, packed_human
+from sfms_robot.face.human import PARTS, load_human, packed_human
 from sfms_robot.frames import BLENDSHAPES
 
 HEAD = load_human()

@@ -6,9 +6,9 @@ from motion_rows import motion
 from PIL import Image
 
 from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.replay.pictures import pick_instants, render_sheet
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.contact_sheet import pick_instants, render_sheet
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX
 

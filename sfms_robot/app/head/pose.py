@@ -1,21 +1,20 @@
 """`head pose`: one expression, or a few channels, on a head that otherwise rests.
 
-It is a run without a listener: the face asked for rises, stays and falls on the timeline, and everything behind the
-timeline is what a run has, so the limits, the way in and the way to rest are the same.
+It is a run without a listener: the face rises, stays and falls on the timeline, and everything behind the timeline is
+that of a run, so the limits, the way in and the way to rest are the same.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.session import Programme, drive_head
-from sfms_robot.app.wiring import SIM
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
@@ -51,20 +50,8 @@ EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class PoseOptions:
-    """The flags of `sfms-robot head pose`."""
-
-    head: str
-    face: tuple[str, ...]
-    port: str = SIM
-    hold_s: float = 2.0
-    fast: bool = False
-    yes: bool = False
-
-
 def parse_face(words: Sequence[str]) -> Floats:
-    """Expressions and CHANNEL=VALUE, later ones over earlier ones -> motion (58,). Raises ConfigError."""
+    """Return motion (58,) of expressions and CHANNEL=VALUE; later words replace earlier ones. Raises ConfigError."""
     motion = np.zeros(MOTION_DIM, np.float32)
     for word in words:
         name, equals, text = word.partition("=")
@@ -92,25 +79,24 @@ def _value(channel: str, text: str) -> float:
     return value
 
 
-def pose_head(options: PoseOptions) -> dict[str, Any]:
-    """Rise to the face, hold it, return to rest. Reports how far each joint went, and torque not confirmed off.
+def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
+    """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
-    Raises any other RobotError, the head at rest.
+    Blocks until then. Raises any other RobotError, the head at rest.
     """
-    face = parse_face(options.face)
-    held = HeldFace(face, options.hold_s)
-    with open_head(HeadOptions(options.head, options.port, options.fast, options.yes)) as opened:
+    face = parse_face(words)
+    timeline = held_face(face, hold_s)
+    with open_head(options) as opened:
         motion = opened.motion
         furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        alone = NobodyThere()
-        drove = drive_head(opened, Programme(alone, alone, held.duration_s, held, observers=[furthest]), Interrupt())
+        drove = drive_head(opened, timeline.programme(furthest), Interrupt())
     if drove.error is not None and not isinstance(drove.error, TorqueError):
         raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
     return {
         "version": 1,
         "head": opened.config.name,
-        "face": list(options.face),
+        "face": list(words),
         "port": options.port,
         "exit": drove.outcome,
         "exit_code": drove.exit_code,
@@ -121,8 +107,24 @@ def pose_head(options: PoseOptions) -> dict[str, Any]:
     }
 
 
-class WholeTimeline:
-    """A `ports.Timeline` whose future is known: it takes no plans, and there is nothing to remember."""
+class FaceTrack:
+    """A `Timeline` through motion (K, 58) at rising times (K,), which takes no plans.
+
+    Between two times it is linear, or a smooth step; before the first and after the last it stays.
+    """
+
+    def __init__(self, times_s: Doubles, motion: Floats, *, smooth: bool = False) -> None:
+        self.duration_s = float(times_s[-1])
+        if len(times_s) == 1:
+            times_s, motion = times_s + np.arange(2.0), np.repeat(motion, 2, axis=0)
+        self._times_s, self._motion, self._smooth = times_s, motion, smooth
+
+    def programme(self, *observers: Observer, **more: Any) -> Programme:
+        """Return the programme that plays this track once, without a person or a listener."""
+        alone = NobodyThere()
+        return Programme(
+            source=alone, feed=alone, duration_s=self.duration_s, timeline=self, observers=observers, **more
+        )
 
     def start(self) -> None:
         return None
@@ -133,23 +135,25 @@ class WholeTimeline:
     def lead_limit_s(self, state: None) -> float:
         return float("inf")
 
-
-class HeldFace(WholeTimeline):
-    """A timeline of one face: torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
-
-    def __init__(self, face: Floats, hold_s: float) -> None:
-        self._face = face
-        self._falls_s = EASE_S + RISE_S + hold_s
-        self.duration_s = self._falls_s + RISE_S
-
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
-        """Motion (N, 58) at each of (N,) instants."""
-        share = ease((times_s - EASE_S) / RISE_S) - ease((times_s - self._falls_s) / RISE_S)
-        return (share[:, None] * self._face).astype(np.float32), None
+        """Return motion (N, 58) at each of (N,) instants."""
+        times_s = np.clip(times_s, self._times_s[0], self._times_s[-1])
+        after = np.clip(np.searchsorted(self._times_s, times_s), 1, len(self._times_s) - 1)
+        begins, ends = self._times_s[after - 1], self._times_s[after]
+        share = (times_s - begins) / (ends - begins)
+        share = (ease(share) if self._smooth else share)[:, None]
+        return ((1 - share) * self._motion[after - 1] + share * self._motion[after]).astype(np.float32), None
+
+
+def held_face(face: Floats, hold_s: float) -> FaceTrack:
+    """Return a track of one face (58,): torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
+    neutral = np.zeros_like(face)
+    times_s = np.cumsum([0.0, EASE_S, RISE_S, hold_s, RISE_S])
+    return FaceTrack(times_s, np.stack([neutral, neutral, face, face, neutral]), smooth=True)
 
 
 class NobodyThere(Source):
-    """The empty source and the empty feed: nobody speaks, nobody listens."""
+    """An empty source and an empty feed: no person, no listener."""
 
     lost = False
 
@@ -157,7 +161,7 @@ class NobodyThere(Source):
         return ()
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
-        """There is nobody to hear it."""
+        """Drop the frame."""
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         return ()
@@ -167,7 +171,7 @@ class NobodyThere(Source):
 
 
 class Furthest(Observer):
-    """How far from rest each joint was sent once the face began to rise, and how far it went."""
+    """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
 
     def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
         self._joints, self._rest_rad = tuple(joints), rest_rad
@@ -185,7 +189,7 @@ class Furthest(Observer):
                 self._reached[joint] = float(at - rest)
 
     def moved(self) -> dict[str, dict[str, float | None]]:
-        """Joints that were sent away from rest, in degrees from there; None where a servo does not tell."""
+        """Return the joints that were sent away from rest, in degrees; None where a servo reports no position."""
         rows: dict[str, dict[str, float | None]] = {}
         for joint, sent in zip(self._joints, np.degrees(self._sent), strict=True):
             if abs(sent) >= MOVED_DEG:

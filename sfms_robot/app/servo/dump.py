@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import yaml
 
-from sfms_robot.app.out_files import checked_file
+from sfms_robot.app.output_paths import checked_file
 from sfms_robot.app.servo.register_view import read_all
 from sfms_robot.app.servo.serial_line import FoundServo, Wire
 from sfms_robot.app.servo.single_servo import Confirm, guard, put, set_baud, set_id
