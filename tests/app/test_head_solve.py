@@ -62,13 +62,9 @@ def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(p
 
 def test_json_has_what_the_table_has_and_what_is_missing(poses, command_line):
     file = poses(f"{HEADER}\n0,0,0,0,0.2618,0\n0,0,0.1,0,0,0\n")
-    table, ended = (
-        solve_poses("reachy_mini", file),
-        command_line("head", "solve", "reachy_mini", "--poses", file, "--json"),
-    )
-    assert ended.code == 0 and ended.told["joints"] == list(table.joints) and ended.told["head"] == "reachy_mini"
+    ended = command_line("head", "solve", "reachy_mini", "--poses", file, "--json")
+    assert ended.code == 0 and ended.told == solve_poses("reachy_mini", file) and ended.told["head"] == "reachy_mini"
     near, far = ended.told["poses"]
-    assert [near["angles_rad"], far["angles_rad"]] == table.solved.angles_rad.tolist()
     assert near["reached"] is True and far["reached"] is False
     assert near["residual_m"] < 1e-6 and far["residual_m"] == pytest.approx(0.077, abs=1e-3)
 

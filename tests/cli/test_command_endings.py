@@ -49,7 +49,7 @@ def command(capsys, monkeypatch):
         (FileNotFoundError(2, "No such file", "x.yaml"), 2, "x.yaml: No such file"),
         (OSError(28, "No space left on device"), 1, "No space left on device"),
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero"),
-        (EOFError(), 1, "there is nobody to answer (stdin ended)"),
+        (EOFError(), 1, "no answer to the question: stdin ended"),
     ],
 )
 def test_a_failure_is_a_line_and_with_json_an_object(command, error, code, text):
