@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -25,14 +25,14 @@ from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
 from sfms_robot.app.loopback_server import status_server
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
-from sfms_robot.app.options import RunOptions
+from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.errors import ConfigError, RobotError, TorqueError
 from sfms_robot.frames import Doubles, Floats
-from sfms_robot.listeners.open_feed import NamedFeed, open_feed
+from sfms_robot.listeners.open_feed import NamedFeed
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Observer, PlanFeed, Retargeter, Source, Timeline
+from sfms_robot.ports import Observer, PlanFeed, Source
 from sfms_robot.realtime import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.feed import InlineFeed
@@ -57,40 +57,39 @@ Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], Abst
 # --- any motion on a head -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class Programme:
-    """What a head is to do: listen to a person, or play a timeline.
-
-    Attributes:
-        source, feed: the person, and the listener.
-        duration_s: None without an end.
-        timeline: None for that of plans.
-        retargeter: None for the head's own.
-        life: spontaneous motion; None for none.
-        knobs, overlay, answers, halt: see `Parts`.
-        observers: the caller closes them.
-    """
-
-    source: Source
-    feed: PlanFeed
-    duration_s: float | None = None
-    timeline: Timeline | None = None
-    retargeter: Retargeter | None = None
-    life: HeadLife | None = None
-    knobs: Callable[[], Any] | None = None
-    overlay: Callable[[Floats, Doubles], Floats] | None = None
-    answers: bool = False
-    halt: HaltLatch = field(default_factory=HaltLatch)
-    observers: Sequence[Observer] = ()
-
-
 def run_log(opened: OpenHead) -> RunLog:
     """Return an empty log for `drive_head`."""
     return RunLog(opened.motion.retargeter.joints, 1.0 / opened.rate_hz, opened.motion.audit)
 
 
+def parts_of(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
+    """Return the parts of a run on an open head: a person and a listener; `more` replaces parts of the head's own."""
+    motion = opened.motion
+    parts = Parts(
+        source=source,
+        feed=feed,
+        timeline=motion.timeline,
+        retargeter=motion.retargeter,
+        limiter=motion.limiter,
+        bus=opened.bus,
+        observers=(),
+        leads_s=motion.leads_s,
+        rest_rad=motion.rest_rad,
+        holds=motion.holds,
+        heat=motion.heat,
+        ignored=frozenset(opened.options.without),
+    )
+    return replace(parts, **more)
+
+
 def drive_head(
-    opened: OpenHead, programme: Programme, interrupt: Interrupt, *, signals: bool = True, log: RunLog | None = None
+    opened: OpenHead,
+    parts: Parts,
+    interrupt: Interrupt,
+    *,
+    duration_s: float | None = None,
+    signals: bool = True,
+    log: RunLog | None = None,
 ) -> Drove:
     """Switch torque on, run the loop, come to rest, switch torque off. Blocks until then.
 
@@ -98,40 +97,25 @@ def drive_head(
     would end as done or interrupted ends as failed, by TorqueError, where torque could not be confirmed off.
 
     Args:
+        duration_s: None without an end.
         signals: Ctrl-C and the like set `interrupt`; main thread only.
         log: is filled; other threads may read it meanwhile.
     """
-    motion = opened.motion
-    parts = Parts(
-        source=programme.source,
-        feed=programme.feed,
-        timeline=programme.timeline or motion.timeline,
-        retargeter=programme.retargeter or motion.retargeter,
-        limiter=motion.limiter,
-        bus=opened.bus,
-        observers=programme.observers,
-        leads_s=motion.leads_s,
-        rest_rad=motion.rest_rad,
-        life=programme.life,
-        knobs=programme.knobs,
-        overlay=programme.overlay,
-        answers=programme.answers,
-        halt=programme.halt,
-        holds=motion.holds,
-        heat=motion.heat,
-        ignored=frozenset(opened.options.without),
-    )
     log = run_log(opened) if log is None else log
-    duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast
     outcome, error = "failed", None
-    watched = programme.halt.watched(opened.bus) if real else nullcontext()
+    watched = parts.halt.watched(opened.bus) if real else nullcontext()
     with signals_to(interrupt) if signals else nullcontext(), watched, realtime_priority(wanted=real) as priority:
         interrupt.arm(opened.bus)
         began_s = time.monotonic()
         try:
             outcome = drive(
-                parts, opened.clock, log, rate_hz=opened.rate_hz, duration_s=duration_s, interrupted=interrupt
+                parts,
+                opened.clock,
+                log,
+                rate_hz=opened.rate_hz,
+                duration_s=math.inf if duration_s is None else duration_s,
+                interrupted=interrupt,
             )
         except KeyboardInterrupt:
             outcome = "interrupted"
@@ -174,7 +158,7 @@ def run(
         panel: a context manager of (status document, interrupt, halt latch, function that turns the intensity up),
             which shows the run and takes keys.
         source, feed, knobs: instead of those that the options name.
-        observers, overlay: see `Programme`.
+        observers, overlay: see `Parts`; the caller closes the observers.
         interrupt: ends the run from another thread.
         halt: closed and opened from other threads.
         more: further entries of the status and of the report.
@@ -209,10 +193,10 @@ def run(
         outlets = [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
         begin_status(status.document)
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
-        programme = Programme(
-            source=person,
-            feed=feed,
-            duration_s=duration_s,
+        parts = parts_of(
+            opened,
+            person,
+            feed,
             life=HeadLife(opened.config.life, options.seed, opened.config.camera),
             knobs=lambda: live.now,
             overlay=overlay,
@@ -220,7 +204,7 @@ def run(
             halt=halt,
             observers=[status, *watchers, *observers, *outlets, *([] if recorder is None else [recorder])],
         )
-        drove = drive_head(opened, programme, interrupt, signals=False, log=log)
+        drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
         status.ended(log.states[-1][1])
         report = run_report(opened, drove, feed, facts["listener"], options.seed)
         report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
@@ -305,7 +289,7 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         listener = load_listener(options.listener, calmness=options.calmness, engine=options.engine, threads=1)
         feed = InlineFeed(listener, options.seed, FAST_LATENCY_S, engine_name(listener))
     else:
-        feed = open_feed(options.listener, options.seed, options.calmness, options.router, options.engine)
+        feed = begin_listening(options)
     stack.callback(feed.close)
     return feed
 

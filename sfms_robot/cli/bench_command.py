@@ -9,7 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer import Argument, Exit, Option
 
 from sfms_robot.cli.show import JSON, print_rows, show
 from sfms_robot.lab.bench import ALL, BENCHES
@@ -31,25 +31,23 @@ def bench_names() -> list[str]:
 
 
 def bench(
-    name: str = typer.Argument(ALL, autocompletion=bench_names, help="What to measure; all: see below."),
-    head: str | None = typer.Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
-    frames: int | None = typer.Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
-    minutes: float | None = typer.Option(
+    name: str = Argument(ALL, autocompletion=bench_names, help="What to measure; all: see below."),
+    head: str | None = Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
+    frames: int | None = Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
+    minutes: float | None = Option(
         None, min=0.0, help="For 'fuzz' and 'live': so long; else a million bytes each, 10 min, 30 of torture."
     ),
-    audio: LiveAudio | None = typer.Option(None, help="For 'live': an emulated microphone (the default), or calls."),
-    torture: bool = typer.Option(
-        False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."
-    ),
-    against: Path | None = typer.Option(
+    audio: LiveAudio | None = Option(None, help="For 'live': an emulated microphone (the default), or calls."),
+    torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
+    against: Path | None = Option(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
     ),
-    hours: float | None = typer.Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
-    data: Path | None = typer.Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
-    budget: bool = typer.Option(
+    hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
+    data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
+    budget: bool = Option(
         False, "--budget", help="For 'listener': operations and bytes a frame, counted, and what small computers need."
     ),
-    write: Path | None = typer.Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
+    write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
     json: bool = JSON,
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: a figure misses its limit."""
@@ -87,4 +85,4 @@ def bench(
 
     show(found.figures, json, printed)
     if not found.passed:
-        raise typer.Exit(1)
+        raise Exit(1)

@@ -8,13 +8,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer import BadParameter, Option, Typer
 
 from sfms_robot.cli.run_command import MAX_SEED
 from sfms_robot.cli.show import JSON, print_report, print_rows, say, show
 from sfms_robot.cli.train_command import ORDER, Order, interruptible
 
-app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
+app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
 
 class Size(StrEnum):
@@ -40,25 +40,25 @@ class Part(StrEnum):
     test = "test"
 
 
-LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
-SEED = typer.Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
+LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
+SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "What computes the listener; its precision is that of its config.yaml."
-HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
+HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = typer.Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
-    data: Path | None = typer.Option(
+    table: str | None = Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
+    data: Path | None = Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
-    models: Path | None = typer.Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
-    train: bool = typer.Option(False, "--train", help="Train the table's tokenizers again, into --models."),
-    size: Size = typer.Option(Size.small, help="Of what is trained; paper: for a GPU."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the size's."),
-    jobs: int = typer.Option(1, min=1, help="Tokenizers trained at once."),
-    plots: Path | None = typer.Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
+    models: Path | None = Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
+    train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
+    size: Size = Option(Size.small, help="Of what is trained; paper: for a GPU."),
+    steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
+    jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
+    plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
@@ -68,7 +68,7 @@ def tokenizer(
         from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
 
         if data is None:
-            raise typer.BadParameter("--data is needed without --table")
+            raise BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
     from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
@@ -81,20 +81,20 @@ def tokenizer(
 
 @app.command("listener")
 def listener_(
-    listener: list[str] = typer.Option(
+    listener: list[str] = Option(
         [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
     ),
-    data: Path = typer.Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
-    table: Table | None = typer.Option(
+    data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
+    table: Table | None = Option(
         None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
     ),
-    samples: int = typer.Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, for --table; all of them."),
-    models: Path | None = typer.Option(
+    samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads, for --table; all of them."),
+    models: Path | None = Option(
         None, help="Folder of the papers' listeners as written, and of ablations; those missing are trained."
     ),
-    config: Path | None = typer.Option(None, help="How ablations are trained; configs/training/arig-as-written.yaml."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
+    config: Path | None = Option(None, help="How ablations are trained; configs/training/arig-as-written.yaml."),
+    steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = SEED,
     hop: int | None = HOP,
     order: Order | None = ORDER,
@@ -110,7 +110,7 @@ def listener_(
         return
     if of_arig:
         if order is not None or hop is not None:
-            raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
+            raise BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.lab.evaluate.arig_evaluation import AblationOptions, arig_table
 
         ablations = AblationOptions(models=models, training=config, steps=steps)
@@ -137,16 +137,16 @@ def listener_(
 
 @app.command()
 def papers(
-    data: Path = typer.Option(..., help="Composed dyads."),
-    models: Path | None = typer.Option(
+    data: Path = Option(..., help="Composed dyads."),
+    models: Path | None = Option(
         None, help="Folder of what only tables need; what is missing is trained: hours. Without it: said to be missing."
     ),
-    table: list[str] = typer.Option(
+    table: list[str] = Option(
         [], metavar="1|2|3|4|arig-1|arig-2|arig-4", help="May be given often; all of them if not."
     ),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads a table; all of them."),
-    samples: int = typer.Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of steps than the training files'."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads a table; all of them."),
+    samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
+    steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
@@ -163,19 +163,19 @@ def papers(
 @app.command()
 def timing(
     listener: str = LISTENER,
-    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    split: Part = typer.Option(Part.test, help="People of the meetings: test to report, validation to choose."),
-    allow_training: bool = typer.Option(False, "--allow-training", help="Play people that listeners learned from."),
-    meetings: int | None = typer.Option(None, min=1, help="At most this many, spread over the people; all of them."),
-    minutes: float = typer.Option(
+    data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    split: Part = Option(Part.test, help="People of the meetings: test to report, validation to choose."),
+    allow_training: bool = Option(False, "--allow-training", help="Play people that listeners learned from."),
+    meetings: int | None = Option(None, min=1, help="At most this many, spread over the people; all of them."),
+    minutes: float = Option(
         5.0, min=0.0, help="Of motion, from the middle of each meeting; 0: hazards and decisions alone, in minutes."
     ),
-    seeds: int = typer.Option(8, min=1, help="How often each meeting is played."),
+    seeds: int = Option(8, min=1, help="How often each meeting is played."),
     seed: int = SEED,
-    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
-    engine: str = typer.Option("torch", metavar="auto|onnx|torch", help=ENGINE_HELP),
-    own_voice: bool = typer.Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
+    engine: str = Option("torch", metavar="auto|onnx|torch", help=ENGINE_HELP),
+    own_voice: bool = Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
@@ -202,15 +202,15 @@ def timing(
 @app.command()
 def robustness(
     listener: str = LISTENER,
-    data: Path | None = typer.Option(
+    data: Path | None = Option(
         None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
     ),
-    split: Part = typer.Option(Part.test, help="People of the voices: test to report, validation to choose."),
-    speakers: int | None = typer.Option(None, min=1, help="At most this many; all of the part."),
-    minutes: float = typer.Option(1.0, min=0.1, help="Of each, in each way."),
-    seeds: int = typer.Option(8, min=1, help="How often each is played."),
+    split: Part = Option(Part.test, help="People of the voices: test to report, validation to choose."),
+    speakers: int | None = Option(None, min=1, help="At most this many; all of the part."),
+    minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
+    seeds: int = Option(8, min=1, help="How often each is played."),
     seed: int = SEED,
-    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     json: bool = JSON,
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
@@ -223,12 +223,12 @@ def robustness(
 @app.command()
 def naturalness(
     listener: str = LISTENER,
-    data: Path = typer.Option(..., help="Composed dyads (`sfms-robot data compose`)."),
-    split: str = typer.Option("test", metavar="validation|test", help="People whose motion it is compared with."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
-    drift: float = typer.Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
+    data: Path = Option(..., help="Composed dyads (`sfms-robot data compose`)."),
+    split: str = Option("test", metavar="validation|test", help="People whose motion it is compared with."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
+    drift: float = Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
     seed: int = SEED,
-    engine: str = typer.Option("auto", metavar="auto|onnx|torch", help=ENGINE_HELP),
+    engine: str = Option("auto", metavar="auto|onnx|torch", help=ENGINE_HELP),
     json: bool = JSON,
 ) -> None:
     """Compare a listener's motion with that of unseen people: nods, smiles, gaze, sway, and a network's guess."""
@@ -240,11 +240,11 @@ def naturalness(
 
 @app.command("metrics")
 def metrics_(
-    truth: Path = typer.Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
-    prediction: Path = typer.Option(..., help="Motion to score, likewise; an array may hold K answers, (N, K, T, D)."),
-    speaker: Path | None = typer.Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
-    space: str | None = typer.Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
-    frames: int | None = typer.Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
+    truth: Path = Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
+    prediction: Path = Option(..., help="Motion to score, likewise; an array may hold K answers, (N, K, T, D)."),
+    speaker: Path | None = Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
+    space: str | None = Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
+    frames: int | None = Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
@@ -261,9 +261,9 @@ def metrics_(
 
 @app.command()
 def interaction(
-    listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
-    data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    listener: str = Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    data: Path = Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads of each set; all of them."),
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
@@ -275,20 +275,20 @@ def interaction(
 
 @app.command()
 def people(
-    listener: list[str] = typer.Option(
+    listener: list[str] = Option(
         [], metavar="NAME|DIR|recorded", help="Two or more: listeners, and what the people of --data did."
     ),
-    data: Path | None = typer.Option(
+    data: Path | None = Option(
         None, help="Composed dyads, or any data set with voices; default: bundled voices nobody was trained on."
     ),
-    voices: int = typer.Option(8, min=1, help="Voices that each listens to."),
-    seconds: float = typer.Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
+    voices: int = Option(8, min=1, help="Voices that each listens to."),
+    seconds: float = Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
     seed: int = SEED,
-    out: Path = typer.Option(
+    out: Path = Option(
         Path("sfms-people"), metavar="DIR", help="The study: clips and answers; continued if it exists."
     ),
-    view: str = typer.Option("auto", metavar="[HOST:]PORT", help="Where the page is; default: this machine alone."),
-    results: Path | None = typer.Option(None, metavar="FILE.csv", help="Serve no page: the table of these answers."),
+    view: str = Option("auto", metavar="[HOST:]PORT", help="Where the page is; default: this machine alone."),
+    results: Path | None = Option(None, metavar="FILE.csv", help="Serve no page: the table of these answers."),
     json: bool = JSON,
 ) -> None:
     """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
@@ -314,8 +314,8 @@ def people(
 
 @app.command()
 def fidelity(
-    head: list[str] = typer.Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
-    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    head: list[str] = Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
+    data: Path | None = Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     json: bool = JSON,
 ) -> None:
     """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""

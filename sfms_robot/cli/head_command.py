@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+from typer import Argument, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, cell, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
@@ -17,16 +17,16 @@ from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
 if TYPE_CHECKING:
     from sfms_robot.app.head.fit import HeadFit
 
-PACKAGES = typer.Option(
+PACKAGES = Option(
     [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
 )
-NAME = typer.Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml.")
-YES = typer.Option(False, "--yes", help="Hobby servos may jump to rest when they come on.")
+NAME = Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml.")
+YES = Option(False, "--yes", help="Hobby servos may jump to rest when they come on.")
 
-app = typer.Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
-listener = typer.Typer(help="Listeners: list.", no_args_is_help=True)
-speaker = typer.Typer(help="Recorded people: list.", no_args_is_help=True)
-port = typer.Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
+app = Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_args_is_help=True)
+listener = Typer(help="Listeners: list.", no_args_is_help=True)
+speaker = Typer(help="Recorded people: list.", no_args_is_help=True)
+port = Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
 
 
 @listener.callback()
@@ -67,7 +67,7 @@ def list_ports(json: bool = JSON) -> None:
 
 @app.command("list")
 def list_heads(
-    urdf: Path | None = typer.Option(None, "--urdf", metavar="FILE.png", help="Draw them all."),
+    urdf: Path | None = Option(None, "--urdf", metavar="FILE.png", help="Draw them all."),
     json: bool = JSON,
 ) -> None:
     """Shipped heads, with joints and buses."""
@@ -84,9 +84,9 @@ def list_heads(
 @app.command("check")
 def check(
     name: str = NAME,
-    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
-    plot: Path | None = typer.Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
-    listener: str | None = typer.Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
+    data: Path | None = Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    plot: Path | None = Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
+    listener: str | None = Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
     packages: list[str] = PACKAGES,
     json: bool = JSON,
 ) -> None:
@@ -102,7 +102,7 @@ def check(
         draw(checked, plot)
     show(checked.as_dict(), json, _print_check)
     if checked.problems:
-        raise typer.Exit(ConfigError.exit_code)
+        raise Exit(ConfigError.exit_code)
 
 
 def _print_check(checked: Mapping[str, Any]) -> None:
@@ -147,8 +147,8 @@ def _print_check(checked: Mapping[str, Any]) -> None:
 @app.command("show")
 def show_head(
     name: str = NAME,
-    joint: str | None = typer.Option(None, "--joint", metavar="JOINT", help="Only this joint."),
-    urdf: Path | None = typer.Option(
+    joint: str | None = Option(None, "--joint", metavar="JOINT", help="Only this joint."),
+    urdf: Path | None = Option(
         None, "--urdf", metavar="FILE.png", help="Draw the robot, and list what its URDF's joints follow."
     ),
     packages: list[str] = PACKAGES,
@@ -183,9 +183,9 @@ def show_head(
 @app.command("calibrate")
 def calibrate(
     name: str = NAME,
-    port: str = typer.Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
-    joint: list[str] = typer.Option([], "--joint", metavar="JOINT", help="Only this joint; may be repeated."),
-    again: bool = typer.Option(False, "--again", help="Also joints that are measured already."),
+    port: str = Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
+    joint: list[str] = Option([], "--joint", metavar="JOINT", help="Only this joint; may be repeated."),
+    again: bool = Option(False, "--again", help="Also joints that are measured already."),
     json: bool = JSON,
 ) -> None:
     """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
@@ -197,11 +197,11 @@ def calibrate(
     if outcome.torque_unconfirmed:
         print(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}", file=sys.stderr)
     if outcome.problems:
-        raise typer.Exit(ConfigError.exit_code)
+        raise Exit(ConfigError.exit_code)
     if outcome.torque_unconfirmed:
-        raise typer.Exit(TorqueError.exit_code)
+        raise Exit(TorqueError.exit_code)
     if outcome.exit == "interrupted":
-        raise typer.Exit(INTERRUPTED)
+        raise Exit(INTERRUPTED)
 
 
 class _Terminal:
@@ -217,10 +217,10 @@ class _Terminal:
 @app.command("pose")
 def pose(
     name: str = NAME,
-    face: list[str] = typer.Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
-    port: str = typer.Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
-    hold: float = typer.Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
-    fast: bool = typer.Option(False, help="Virtual time, on emulated servos."),
+    face: list[str] = Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
+    port: str = Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
+    hold: float = Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
+    fast: bool = Option(False, help="Virtual time, on emulated servos."),
     yes: bool = YES,
     json: bool = JSON,
 ) -> None:
@@ -234,14 +234,14 @@ def pose(
 @app.command("fit")
 def fit(
     name: str = NAME,
-    recording: Path | None = typer.Option(
+    recording: Path | None = Option(
         None, "--recording", metavar="DIR", help="run.mcap of the joints, and face.csv: what a tracker saw of them."
     ),
-    babble: bool = typer.Option(False, "--babble", help="Move the face within its limits and record it."),
-    port: str = typer.Option("sim", help="For --babble: 'sim' (a virtual face), a device, or NAME=DEVICE per bus."),
-    record: Path | None = typer.Option(None, "--record", metavar="DIR", help="Where --babble writes to."),
-    minutes: float = typer.Option(2.0, "--minutes", min=0.1, max=60.0, help="Length of --babble."),
-    seed: int = typer.Option(0, min=0, help="Of the random faces of --babble."),
+    babble: bool = Option(False, "--babble", help="Move the face within its limits and record it."),
+    port: str = Option("sim", help="For --babble: 'sim' (a virtual face), a device, or NAME=DEVICE per bus."),
+    record: Path | None = Option(None, "--record", metavar="DIR", help="Where --babble writes to."),
+    minutes: float = Option(2.0, "--minutes", min=0.1, max=60.0, help="Length of --babble."),
+    seed: int = Option(0, min=0, help="Of the random faces of --babble."),
     yes: bool = YES,
     json: bool = JSON,
 ) -> None:
@@ -280,13 +280,13 @@ def fit(
 @app.command("solve")
 def solve(
     name: str = NAME,
-    poses: Path = typer.Option(
+    poses: Path = Option(
         ...,
         "--poses",
         metavar="FILE.csv",
         help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
     ),
-    residual: bool = typer.Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
+    residual: bool = Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
     json: bool = JSON,
 ) -> None:
     """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""

@@ -11,22 +11,22 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer import Argument, Context, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, print_json, show
 from sfms_robot.data import listener_names
 from sfms_robot.errors import ConfigError
 
-app = typer.Typer(help="Heads that run with --fleet: list, halt, resume, a page.", no_args_is_help=False)
+app = Typer(help="Heads that run with --fleet: list, halt, resume, a page.", no_args_is_help=False)
 
-_ZENOH = typer.Option(None, "--zenoh", metavar="FILE", help="zenoh's configuration. Default: tcp/127.0.0.1:7447.")
-_INSECURE = typer.Option(False, "--insecure", help="Allow endpoints of --zenoh beyond loopback without TLS.")
-_KEY = typer.Option(None, "--fleet-key", metavar="FILE", help="Key of the fleet. Default: fleet.key of this user.")
-_HEADS = typer.Argument(None, metavar="[NAME]...", help="Heads; default: all.")
+_ZENOH = Option(None, "--zenoh", metavar="FILE", help="zenoh's configuration. Default: tcp/127.0.0.1:7447.")
+_INSECURE = Option(False, "--insecure", help="Allow endpoints of --zenoh beyond loopback without TLS.")
+_KEY = Option(None, "--fleet-key", metavar="FILE", help="Key of the fleet. Default: fleet.key of this user.")
+_HEADS = Argument(None, metavar="[NAME]...", help="Heads; default: all.")
 
 
 @app.callback(invoke_without_command=True)
-def fleet(context: typer.Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
+def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
     """List the heads of the fleet, and their states."""
     if context.invoked_subcommand is not None:
         if zenoh is not None or json or insecure:
@@ -68,7 +68,7 @@ def resume(
 
 @app.command()
 def page(
-    port: int = typer.Option(8776, min=0, max=65535, help="TCP port on loopback; 0: any free one."),
+    port: int = Option(8776, min=0, max=65535, help="TCP port on loopback; 0: any free one."),
     zenoh: Path | None = _ZENOH,
     insecure: bool = _INSECURE,
     key: Path | None = _KEY,
@@ -92,32 +92,32 @@ def _show_answers(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], js
     if silent or not answers:
         if not answers and not silent:
             print("no head answers", file=sys.stderr)
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 # --- serve ------------------------------------------------------------------------------------------------------------
 
 
 def serve(
-    listener: str = typer.Option(
+    listener: str = Option(
         "sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml and weights."
     ),
-    name: str | None = typer.Option(None, help="The name for robots, zenoh/NAME. Default: the listener's name."),
-    zenoh: Path | None = typer.Option(
+    name: str | None = Option(None, help="The name for robots, zenoh/NAME. Default: the listener's name."),
+    zenoh: Path | None = Option(
         None, metavar="FILE", help="zenoh's configuration (JSON5: endpoints, TLS). Default: tcp/127.0.0.1:7447."
     ),
-    insecure: bool = typer.Option(
+    insecure: bool = Option(
         False, "--insecure", help="Allow endpoints beyond loopback without TLS: anyone on that network may listen in."
     ),
-    metrics: str | None = typer.Option(
+    metrics: str | None = Option(
         None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
     ),
-    hop: int | None = typer.Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
-    processes: int | None = typer.Option(
+    hop: int | None = Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
+    processes: int | None = Option(
         None, min=1, max=256, help="Processes, each with the listener in its memory. Default: one for each core."
     ),
-    everybody: bool = typer.Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
-    engine: str = typer.Option("auto", metavar="auto|onnx|torch", help="What computes the listener, as of `run`."),
+    everybody: bool = Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
+    engine: str = Option("auto", metavar="auto|onnx|torch", help="What computes the listener, as of `run`."),
     json: bool = JSON,
 ) -> None:
     """Serve a listener to robots elsewhere, `sfms-robot run --listener zenoh/NAME`, until Ctrl-C."""

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
 from sfms_robot.cli.show import JSON, cell, print_report, say, show
@@ -26,22 +26,22 @@ OPTIONAL = {
 
 
 def run(
-    head: str = typer.Option(
+    head: str = Option(
         "face28", autocompletion=head_names, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
     ),
-    port: str = typer.Option(
+    port: str = Option(
         "sim",
         rich_help_panel=HEAD,
         help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
     ),
     packages: list[str] = PACKAGES,
-    intensity: list[str] = typer.Option(
+    intensity: list[str] = Option(
         [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
     ),
-    style: list[str] = typer.Option(
+    style: list[str] = Option(
         [], metavar="REGION=V", rich_help_panel=HEAD, help="How much of its small motions shows, 0 to 2."
     ),
-    audio: str = typer.Option(
+    audio: str = Option(
         "default",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
@@ -49,14 +49,14 @@ def run(
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
         "yours, who is in front of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
     ),
-    face: str = typer.Option(
+    face: str = Option(
         "auto",
         rich_help_panel=PERSON,
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
         help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, who "
         "is in front of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
     ),
-    agent_audio: str = typer.Option(
+    agent_audio: str = Option(
         "none",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
@@ -64,114 +64,114 @@ def run(
         help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
         "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
-    play: str | None = typer.Option(
+    play: str | None = Option(
         None,
         metavar="[DEVICE]",
         rich_help_panel=PERSON,
         help="Play what the robot says, on a device (by number, name or part of it: `port list`; alone: the default).",
     ),
-    duration: float | None = typer.Option(
+    duration: float | None = Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
     ),
-    listener: str = typer.Option(
+    listener: str = Option(
         "sfms-small",
         autocompletion=listener_names,
         rich_help_panel=LISTENER,
         help="Shipped listener, a folder with config.yaml and weights, or zenoh/NAME on a machine that serves it.",
     ),
-    calmness: list[str] = typer.Option(
+    calmness: list[str] = Option(
         [],
         metavar="KIND=PER_MINUTE",
         rich_help_panel=LISTENER,
         help="How often it does something, as nod=2.2; may be repeated. Default: as often as people do.",
     ),
-    addressed: str = typer.Option(
+    addressed: str = Option(
         "sense",
         metavar="sense|assume|never",
         rich_help_panel=LISTENER,
         help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
     ),
-    engine: str = typer.Option(
+    engine: str = Option(
         "auto",
         metavar="auto|onnx|torch",
         rich_help_panel=LISTENER,
         help="What computes the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
     ),
-    seed: int = typer.Option(
+    seed: int = Option(
         0,
         min=0,
         max=MAX_SEED,
         rich_help_panel=LISTENER,
         help="Two seeds listen differently, one seed repeats (with --fast).",
     ),
-    fast: bool = typer.Option(
+    fast: bool = Option(
         False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
     ),
-    record: Path | None = typer.Option(
+    record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
     ),
-    overwrite: bool = typer.Option(
+    overwrite: bool = Option(
         False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
     ),
     json: bool = JSON,
-    check: bool = typer.Option(
+    check: bool = Option(
         False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
     ),
-    status: str | None = typer.Option(
+    status: str | None = Option(
         None,
         metavar="[PORT]",
         rich_help_panel=OUTPUT,
         help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
-    view: str | None = typer.Option(
+    view: str | None = Option(
         None,
         metavar="[[HOST:]PORT]",
         rich_help_panel=OUTPUT,
         help="Serve a page that shows the run, and works it (alone: 127.0.0.1:8780, or the next port that is free).",
     ),
-    view_cert: Path | None = typer.Option(
+    view_cert: Path | None = Option(
         None, metavar="FILE", rich_help_panel=OUTPUT, help="Serve it by https, which a phone's microphone needs: PEM."
     ),
-    view_key: Path | None = typer.Option(
+    view_key: Path | None = Option(
         None, metavar="FILE", rich_help_panel=OUTPUT, help="The key of that certificate: PEM."
     ),
-    fleet: str | None = typer.Option(
+    fleet: str | None = Option(
         None,
         metavar="NAME",
         rich_help_panel=OUTPUT,
         help="Tell a fleet how the run is, as NAME, and obey it: docs/remote.md.",
     ),
-    zenoh: Path | None = typer.Option(
+    zenoh: Path | None = Option(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
         help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
     ),
-    insecure: bool = typer.Option(
+    insecure: bool = Option(
         False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
     ),
-    fleet_key: Path | None = typer.Option(
+    fleet_key: Path | None = Option(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
         help="Key that --fleet asks of whoever resumes or ends the run; made where there is none yet.",
     ),
-    dry_run: bool = typer.Option(
+    dry_run: bool = Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
     ),
-    yes: bool = typer.Option(
+    yes: bool = Option(
         False,
         "--yes",
         rich_help_panel=SAFETY,
         help="Hobby servos may jump when they come on: they report no position to begin from.",
     ),
-    halt_on: str | None = typer.Option(
+    halt_on: str | None = Option(
         None,
         metavar="FILE|/dev/gpiochipN:LINE",
         rich_help_panel=SAFETY,
         help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
     ),
-    without: list[str] = typer.Option(
+    without: list[str] = Option(
         [],
         metavar="JOINT",
         rich_help_panel=SAFETY,
@@ -256,7 +256,7 @@ def _print_run(report: Mapping[str, Any]) -> None:
         f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
         "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
         "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": "{writes} writes, {reads} reads, {errors} errors, silent: {silent}".format(**bus),
+        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, silent: {cell(bus['silent'])}",
     }
     if "recording" in report:
         facts["recording"] = f"{report['recording']['bytes'] * 1e-6:.1f} MB"
@@ -271,26 +271,24 @@ def _print_run(report: Mapping[str, Any]) -> None:
 
 
 def demo(
-    head: str = typer.Option("face28", autocompletion=head_names, help="Shipped head, or a folder with a head.yaml."),
-    listener: str = typer.Option("sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder."),
-    seed: int = typer.Option(DEMO_SEED, min=0, max=MAX_SEED, help="Two seeds listen differently."),
-    duration: float | None = typer.Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
-    fast: bool = typer.Option(False, "--fast", help="Virtual time: as fast as it goes."),
-    out: Path | None = typer.Option(
+    head: str = Option("face28", autocompletion=head_names, help="Shipped head, or a folder with a head.yaml."),
+    listener: str = Option("sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder."),
+    seed: int = Option(DEMO_SEED, min=0, max=MAX_SEED, help="Two seeds listen differently."),
+    duration: float | None = Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
+    fast: bool = Option(False, "--fast", help="Virtual time: as fast as it goes."),
+    out: Path | None = Option(
         None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
     ),
-    overwrite: bool = typer.Option(False, "--overwrite", help="Replace the recording that --out holds."),
-    seeds: int | None = typer.Option(
+    overwrite: bool = Option(False, "--overwrite", help="Replace the recording that --out holds."),
+    seeds: int | None = Option(
         None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
     ),
-    view: str | None = typer.Option(
+    view: str | None = Option(
         None,
         metavar="[[HOST:]PORT]",
         help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
     ),
-    no_view: bool = typer.Option(
-        False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."
-    ),
+    no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
     json: bool = JSON,
 ) -> None:
     """A recorded person talks, an emulated head listens; a page shows it, or two pictures where nobody looks."""
@@ -341,20 +339,18 @@ def _line(seen: Mapping[str, Any]) -> str:
 
 
 def replay(
-    folder: Path = typer.Argument(..., metavar="DIR", help="Folder that `sfms-robot run --record` wrote."),
-    plot: Path | None = typer.Option(
+    folder: Path = Argument(..., metavar="DIR", help="Folder that `sfms-robot run --record` wrote."),
+    plot: Path | None = Option(
         None, help="PNG: states and events, voice, head pose, six face channels, joint angles over time."
     ),
-    sheet: Path | None = typer.Option(None, help="PNG: the virtual head and the robot at twelve instants of the run."),
-    port: str | None = typer.Option(
+    sheet: Path | None = Option(None, help="PNG: the virtual head and the robot at twelve instants of the run."),
+    port: str | None = Option(
         None, help="Drive a head with the recorded face: 'sim', 'auto', a device, or NAME=DEVICE per bus."
     ),
-    head: str | None = typer.Option(
-        None, autocompletion=head_names, help="With --port: another head than the recorded one."
-    ),
-    fast: bool = typer.Option(False, "--fast", help="With --port sim: virtual time."),
-    yes: bool = typer.Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
-    view: str | None = typer.Option(
+    head: str | None = Option(None, autocompletion=head_names, help="With --port: another head than the recorded one."),
+    fast: bool = Option(False, "--fast", help="With --port sim: virtual time."),
+    yes: bool = Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
+    view: str | None = Option(
         None, metavar="[[HOST:]PORT]", help="Put it on a page, to be played there (alone: 127.0.0.1:8780)."
     ),
     json: bool = JSON,

@@ -12,12 +12,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import typer
+from typer import Exit, Option
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-JSON = typer.Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
+JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
 
 
@@ -33,7 +33,7 @@ def show(result: Mapping[str, Any], json: bool, printed: Callable[[Mapping[str, 
     if result.get("error"):
         print(f"sfms-robot: {result['error']}", file=sys.stderr)
     if result.get("exit_code"):
-        raise typer.Exit(result["exit_code"])
+        raise Exit(result["exit_code"])
 
 
 def print_report(result: Mapping[str, Any]) -> None:
@@ -43,7 +43,7 @@ def print_report(result: Mapping[str, Any]) -> None:
         if isinstance(value, Mapping) and value and all(isinstance(each, Mapping) for each in value.values()):
             value = [{"": name, **each} for name, each in value.items()]
         if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            print_rows(value, title)
+            print_rows(value, None if key == "rows" else title)
         elif key not in ("version", "exit_code", "error"):
             say(f"{title}: {cell(value)}")
 
@@ -93,7 +93,7 @@ def print_rows(
         title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_header=any(key.strip() for key in rows[0])
     )
     for key in rows[0]:
-        numbers = not any(isinstance(row.get(key), str) for row in rows)
+        numbers = all(isinstance(row.get(key), int | float | None) for row in rows)
         table.add_column(key, justify="right" if numbers else "left", no_wrap=numbers, overflow="fold")
     for row in rows:
         cells = [Text(cell(row.get(key))) for key in rows[0]]

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
+from typer import Argument, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, cell, print_rows, say, show
 from sfms_robot.data import listener_names
@@ -18,8 +18,8 @@ from sfms_robot.errors import INTERRUPTED, ConfigError
 if TYPE_CHECKING:
     from sfms_robot.lab.train.train_runs import TrainOptions
 
-app = typer.Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
-data_app = typer.Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
+app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
+data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
 
 _SHOWN = 3  # names of a problem; --json has them all
 _LAYOUTS = (
@@ -46,20 +46,20 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
-CONFIG = typer.Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = typer.Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
-OUT = typer.Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
-RESUME = typer.Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
-OVERWRITE = typer.Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
-DEVICE = typer.Option(Device.auto, help="auto: the GPU if there is one.")
-STEPS = typer.Option(None, min=1, help="Another number of steps than the file's.")
-TENSORBOARD = typer.Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
-ORDER = typer.Option(None, help="Order of the channels in the files; default: the layout's own.")
-ACCUMULATE = typer.Option(
+CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
+DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
+OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
+RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
+OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
+DEVICE = Option(Device.auto, help="auto: the GPU if there is one.")
+STEPS = Option(None, min=1, help="Another number of steps than the file's.")
+TENSORBOARD = Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
+ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
+ACCUMULATE = Option(
     None, min=1, help="Pieces of a step's batch that each process takes one after the other; saves memory."
 )
-SCRATCH = typer.Option(None, help="Folder for frames that are read from disk as they are drawn, not held in memory.")
-DRY_RUN = typer.Option(
+SCRATCH = Option(None, help="Folder for frames that are read from disk as they are drawn, not held in memory.")
+DRY_RUN = Option(
     False, "--dry-run", help="One step of every stage on made-up frames, and what all of it would take; no data needed."
 )
 
@@ -76,7 +76,7 @@ def tokenizer(
     overwrite: bool = OVERWRITE,
     device: Device = DEVICE,
     steps: int | None = STEPS,
-    placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
+    placement: Placement | None = Option(None, help="Another keyframe placement than the file's, to compare."),
     tensorboard: bool | None = TENSORBOARD,
     order: Order | None = ORDER,
     accumulate: int | None = ACCUMULATE,
@@ -183,12 +183,12 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 @app.command()
 def events(
-    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    out: Path | None = typer.Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
-    all_series: bool = typer.Option(
+    data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    out: Path | None = Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
+    all_series: bool = Option(
         False, "--all-series", help="Learn from all people, to compare; the result has seen the test set."
     ),
-    seed: int = typer.Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
+    seed: int = Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
     json: bool = JSON,
 ) -> None:
     """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
@@ -199,10 +199,10 @@ def events(
 
 @app.command()
 def idle(
-    listener: str = typer.Option(..., metavar="NAME|DIR", help="One that follows events, trained."),
-    data: Path = typer.Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
-    clips: int = typer.Option(12, min=1, help="Dyads of training that it listens to."),
-    seed: int = typer.Option(1, min=0, help="Of what it draws."),
+    listener: str = Option(..., metavar="NAME|DIR", help="One that follows events, trained."),
+    data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
+    clips: int = Option(12, min=1, help="Dyads of training that it listens to."),
+    seed: int = Option(1, min=0, help="Of what it draws."),
     json: bool = JSON,
 ) -> None:
     """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
@@ -216,13 +216,13 @@ def idle(
 
 @data_app.command()
 def compose(
-    data: Path = typer.Option(..., help="Folder with ami_listener_annotations/ and, if at hand, more voices."),
-    out: Path = typer.Option(..., help="Folder to write train/, validation/ and test/ into."),
-    minutes: float = typer.Option(
+    data: Path = Option(..., help="Folder with ami_listener_annotations/ and, if at hand, more voices."),
+    out: Path = Option(..., help="Folder to write train/, validation/ and test/ into."),
+    minutes: float = Option(
         240.0, min=1.0, help="Minutes of training dyads; all that the tables give if they give less."
     ),
-    seed: int = typer.Option(1, min=0, help="One seed composes the same dyads."),
-    overwrite: bool = typer.Option(False, "--overwrite", help="Replace the dyads that --out holds."),
+    seed: int = Option(1, min=0, help="One seed composes the same dyads."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace the dyads that --out holds."),
     json: bool = JSON,
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
@@ -233,11 +233,11 @@ def compose(
 
 @data_app.command()
 def check(
-    folder: Path = typer.Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
-    layout: str = typer.Option("auto", help=_LAYOUTS),
+    folder: Path = Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
+    layout: str = Option("auto", help=_LAYOUTS),
     order: Order | None = ORDER,
-    window: int = typer.Option(0, min=0, help="Frames that a clip must have."),
-    channels: bool = typer.Option(False, "--channels", help="Show the range of every channel."),
+    window: int = Option(0, min=0, help="Frames that a clip must have."),
+    channels: bool = Option(False, "--channels", help="Show the range of every channel."),
     json: bool = JSON,
 ) -> None:
     """Read a whole data set once: its contents, and everything that is wrong with it."""
@@ -246,19 +246,19 @@ def check(
     report = check_data(folder, layout, order.value if order else None, window)
     show(report, json, partial(_print_data, channels=channels))
     if not report["usable"]:
-        raise typer.Exit(2)
+        raise Exit(2)
 
 
 @data_app.command()
 def convert(
-    folder: Path = typer.Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
-    out: Path = typer.Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
-    layout: str = typer.Option("auto", help=_LAYOUTS),
+    folder: Path = Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
+    out: Path = Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
+    layout: str = Option("auto", help=_LAYOUTS),
     order: Order | None = ORDER,
-    flame_matrix: Path | None = typer.Option(
+    flame_matrix: Path | None = Option(
         None, help="FLAME coefficients of every ARKit blendshape (.npy, .csv): shows the expression of deca56 data."
     ),
-    flame_order: str = typer.Option("alphabetical", help="Order of the matrix's rows: alphabetical, apple, ..."),
+    flame_order: str = Option("alphabetical", help="Order of the matrix's rows: alphabetical, apple, ..."),
     json: bool = JSON,
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
@@ -319,12 +319,12 @@ def _span(frames: Mapping[str, float] | None) -> str:
 
 
 def export(
-    listener: str = typer.Argument(
+    listener: str = Argument(
         ..., autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml."
     ),
-    out: Path | None = typer.Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
-    int8: bool = typer.Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
-    weight_bits: int | None = typer.Option(
+    out: Path | None = Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
+    int8: bool = Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
+    weight_bits: int | None = Option(
         None, "--weight-bits", metavar="8|16|32", help="Also write the weights, in so many bits. Default: leave them."
     ),
     json: bool = JSON,

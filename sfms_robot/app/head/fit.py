@@ -23,7 +23,6 @@ from sfms_robot.app.listen.report import Drove
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.session import drive_head
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.drives import drives
 from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
@@ -33,7 +32,7 @@ from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import Units
 from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
 from sfms_robot.runtime.recorder import Recorder
-from sfms_robot.runtime.safety import EASE_S, Interrupt
+from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.bounded import bounded_least_squares
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
@@ -68,7 +67,7 @@ def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: in
             about={"head": opened.config.name},
         )
         stack.callback(recorder.close)
-        drove = drive_head(opened, faces.programme(recorder), Interrupt())
+        drove = faces.play(opened, recorder)
     if drove.error is not None:
         raise drove.error
     return opened.config, drove

@@ -12,13 +12,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.listen.report import Drove, outcome
+from sfms_robot.app.open_head import OpenHead, open_head
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import Programme, drive_head
+from sfms_robot.app.session import drive_head, parts_of
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.feed import IDLE_FEED
+from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.safety import EASE_S, Interrupt
 from sfms_robot.signals.minimum_jerk import ease
 
@@ -89,19 +91,13 @@ def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -
     with open_head(options) as opened:
         motion = opened.motion
         furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        drove = drive_head(opened, timeline.programme(furthest), Interrupt())
+        drove = timeline.play(opened, furthest)
     if drove.error is not None and not isinstance(drove.error, TorqueError):
         raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
     return {
-        "version": 1,
-        "head": opened.config.name,
+        **outcome(opened, drove),
         "face": list(words),
-        "port": options.port,
-        "exit": drove.outcome,
-        "exit_code": drove.exit_code,
-        "error": drove.error and str(drove.error),
-        "torque_unconfirmed": drove.log.torque_unconfirmed,
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
     }
@@ -119,12 +115,21 @@ class FaceTrack:
             times_s, motion = times_s + np.arange(2.0), np.repeat(motion, 2, axis=0)
         self._times_s, self._motion, self._smooth = times_s, motion, smooth
 
-    def programme(self, *observers: Observer, **more: Any) -> Programme:
-        """Return the programme that plays this track once, without a person or a listener."""
+    def play(
+        self,
+        opened: OpenHead,
+        observer: Observer,
+        interrupt: Interrupt | None = None,
+        *,
+        signals: bool = True,
+        log: RunLog | None = None,
+        **more: Any,
+    ) -> Drove:
+        """Drive a head with this track once, without a person or a listener. `more`: see `parts_of`."""
         alone = NobodyThere()
-        return Programme(
-            source=alone, feed=alone, duration_s=self.duration_s, timeline=self, observers=observers, **more
-        )
+        parts = parts_of(opened, alone, alone, timeline=self, observers=[observer], **more)
+        duration_s = self.duration_s
+        return drive_head(opened, parts, interrupt or Interrupt(), duration_s=duration_s, signals=signals, log=log)
 
     def start(self) -> None:
         return None

@@ -22,6 +22,7 @@ from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = "sfms-demo"
 PLOT, SHEET = "run.png", "head.png"
+_KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "seed", "duration_s")
 
 
 def demo(
@@ -113,14 +114,7 @@ def _summary(options: RunOptions, report: dict[str, Any]) -> dict[str, Any]:
     neck = [retargeter.joints[int(column)] for column in retargeter.neck_columns]
     travel_rad = sum(report["joints"][joint]["travel_rad"] for joint in neck if joint in report["joints"])
     return {
-        "version": 1,
-        "exit": report["exit"],
-        "exit_code": report["exit_code"],
-        "error": report.get("error"),
-        "head": report["head"],
-        "listener": report["listener"],
-        "seed": options.seed,
-        "duration_s": report["duration_s"],
+        **{key: report[key] for key in _KEPT},
         **report["motion"],
         "neck_travel_deg": round(float(np.degrees(travel_rad)), 1),
     }

@@ -49,6 +49,19 @@ class Drove:
         return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
+def outcome(opened: OpenHead, drove: Drove) -> dict[str, Any]:
+    """Return the head, its port and the end of a drive, which begin every report."""
+    return {
+        "version": 1,
+        "head": opened.config.name,
+        "port": opened.options.port,
+        "exit": drove.outcome,
+        "exit_code": drove.exit_code,
+        "error": None if drove.error is None else str(drove.error),
+        "torque_unconfirmed": drove.log.torque_unconfirmed,
+    }
+
+
 def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
     """Return version 1 of the report. In virtual time wall-clock figures are null."""
     log = drove.log
@@ -56,15 +69,10 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
-        "version": 1,
-        "head": opened.config.name,
+        **outcome(opened, drove),
         "listener": listener,
-        "port": opened.options.port,
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
-        "exit": drove.outcome,
-        "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
         "tick": log.tick_report(opened.rate_hz, drove.elapsed_s),
@@ -86,7 +94,6 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
         "priority": drove.priority,
-        "exit_code": drove.exit_code,
     }
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_facts import page_facts
-from sfms_robot.app.listen.report import figures_so_far
+from sfms_robot.app.listen.report import figures_so_far, outcome
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
-from sfms_robot.app.session import Panel, drive_head, run_log
+from sfms_robot.app.session import Panel, run_log
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
@@ -75,21 +75,15 @@ def play_back(
 
         facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.listened_s}
         status = RunStatus(list(opened.config.joints), facts, figures)
-        programme = recorded_face(recording).programme(status, knobs=lambda: knobs.now, halt=halt)
+        face = recorded_face(recording)
         with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
-            drove = drive_head(opened, programme, interrupt, signals=False, log=log)
+            drove = face.play(opened, status, interrupt, signals=False, log=log, knobs=lambda: knobs.now, halt=halt)
             status.ended(log.states[-1][1])
     return {
-        "version": 1,
-        "head": opened.config.name,
-        "port": port,
+        **outcome(opened, drove),
         "recorded_s": round(recording.listened_s, 3),
         "duration_s": round(log.listened_s, 3),
         "whole": recording.whole,
-        "exit": drove.outcome,
-        "exit_code": drove.exit_code,
-        "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": log.torque_unconfirmed,
         "ticks": log.ticks,
         "limits": {"violations": log.audited.violations if log.audited else 0},
         "motion": log.motion_report(),
