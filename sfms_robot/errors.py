@@ -84,13 +84,13 @@ class TorqueError(BusError):
 
 
 class ServoError(RobotError):
-    """One servo is not what the head configuration says, or refused a command. The bus goes on."""
+    """One servo is not what the head configuration says, or refused a command. The bus continues."""
 
     exit_code = 4
 
 
 class PacketError(RobotError):
-    """Bytes that are not a packet: bad header, length or checksum. The bus goes on."""
+    """Bytes that are not a packet: bad header, length or checksum. The bus continues."""
 
     exit_code = 4
 

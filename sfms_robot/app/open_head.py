@@ -102,7 +102,9 @@ def prepare_head(options: HeadOptions) -> Head:
     head = load_head(options.head)
     for joint in options.without:
         if joint not in head.joints:
-            raise ConfigError(f"--without {joint!r} is no joint of head {head.name!r} ({', '.join(head.joints)})")
+            raise ConfigError(
+                f"--without: expected a joint of head {head.name!r}, got {joint!r} ({', '.join(head.joints)})"
+            )
     if options.port == SIM:
         return head
     where = devices(head, options.port)

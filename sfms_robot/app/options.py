@@ -53,7 +53,7 @@ class HeadOptions:
 
     @property
     def confirmed(self) -> bool:
-        """Whether hobby servos may be connected, which makes them jump."""
+        """True if hobby servos may be connected, which makes them jump."""
         return self.yes
 
 

@@ -98,7 +98,7 @@ def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
     stored = load_stored(name)
     for joint in stored.joints:
         if joint not in head.joints:
-            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
+            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is not a joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
         bus: [

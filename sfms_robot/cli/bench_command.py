@@ -31,7 +31,7 @@ def bench_names() -> list[str]:
 
 
 def bench(
-    name: str = Argument(ALL, autocompletion=bench_names, help="What to measure; all: see below."),
+    name: str = Argument(ALL, autocompletion=bench_names, help="The bench; all: see below."),
     head: str | None = Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
     frames: int | None = Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
     minutes: float | None = Option(

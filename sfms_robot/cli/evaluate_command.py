@@ -42,7 +42,7 @@ class Part(StrEnum):
 
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
-ENGINE_HELP = "What computes the listener; its precision is that of its config.yaml."
+ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
@@ -93,7 +93,7 @@ def listener_(
     models: Path | None = Option(
         None, help="Folder of the papers' listeners as written, and of ablations; those missing are trained."
     ),
-    config: Path | None = Option(None, help="How ablations are trained; configs/training/arig-as-written.yaml."),
+    config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
     seed: int = SEED,
     hop: int | None = HOP,
@@ -170,7 +170,7 @@ def timing(
     minutes: float = Option(
         5.0, min=0.0, help="Of motion, from the middle of each meeting; 0: hazards and decisions alone, in minutes."
     ),
-    seeds: int = Option(8, min=1, help="How often each meeting is played."),
+    seeds: int = Option(8, min=1, help="Number of times that each meeting is played."),
     seed: int = SEED,
     jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
@@ -208,7 +208,7 @@ def robustness(
     split: Part = Option(Part.test, help="People of the voices: test to report, validation to choose."),
     speakers: int | None = Option(None, min=1, help="At most this many; all of the part."),
     minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
-    seeds: int = Option(8, min=1, help="How often each is played."),
+    seeds: int = Option(8, min=1, help="Number of times that each is played."),
     seed: int = SEED,
     jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     json: bool = JSON,
@@ -241,7 +241,9 @@ def naturalness(
 @app.command("metrics")
 def metrics_(
     truth: Path = Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
-    prediction: Path = Option(..., help="Motion to score, likewise; an array may hold K answers, (N, K, T, D)."),
+    prediction: Path = Option(
+        ..., help="Motion to score, in the same form; an array may hold K answers, (N, K, T, D)."
+    ),
     speaker: Path | None = Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
     space: str | None = Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
     frames: int | None = Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
@@ -279,7 +281,8 @@ def people(
         [], metavar="NAME|DIR|recorded", help="Two or more: listeners, and what the people of --data did."
     ),
     data: Path | None = Option(
-        None, help="Composed dyads, or any data set with voices; default: bundled voices nobody was trained on."
+        None,
+        help="Composed dyads, or any data set with voices; default: bundled voices that no listener was trained on.",
     ),
     voices: int = Option(8, min=1, help="Voices that each listens to."),
     seconds: float = Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
@@ -329,7 +332,7 @@ def _quiet(*_: Any) -> None:
 
 
 def _print_paper(name: str, found: Mapping[str, Any]) -> None:
-    """Print one table of `evaluate papers` as soon as it is there."""
+    """Print one table of `evaluate papers` when it is finished."""
     say(f"ARIG, table {name.removeprefix('arig-')}" if name.startswith("arig") else f"SFMS, table {name}", "bold")
     print_report(found)
 

@@ -219,7 +219,7 @@ def pose(
     name: str = NAME,
     face: list[str] = Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
     port: str = Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
-    hold: float = Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="How long the pose is held."),
+    hold: float = Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="Seconds for which the pose is held."),
     fast: bool = Option(False, help="Virtual time, on emulated servos."),
     yes: bool = YES,
     json: bool = JSON,
@@ -235,7 +235,7 @@ def pose(
 def fit(
     name: str = NAME,
     recording: Path | None = Option(
-        None, "--recording", metavar="DIR", help="run.mcap of the joints, and face.csv: what a tracker saw of them."
+        None, "--recording", metavar="DIR", help="run.mcap of the joints, and face.csv: the track of a face tracker."
     ),
     babble: bool = Option(False, "--babble", help="Move the face within its limits and record it."),
     port: str = Option("sim", help="For --babble: 'sim' (a virtual face), a device, or NAME=DEVICE per bus."),
@@ -245,7 +245,7 @@ def fit(
     yes: bool = YES,
     json: bool = JSON,
 ) -> None:
-    """From joints and what a face tracker saw of them, learn the drives that make the face look as asked.
+    """Learn the drives of a face from its joints and the track of a face tracker before it.
 
     Written as the fit of this build, beside the shipped file. On a real port --babble records the joints alone: track
     the face with a camera of yours, put the track beside it as face.csv, and fit the recording.

@@ -185,7 +185,7 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 
 def _typed(words: Sequence[str]) -> str:
-    """Return the command that `words` begin with, as it is typed."""
+    """Return the command that `words` begin with, as the user typed it."""
     return " ".join([NAME, *takewhile(lambda word: not word.startswith("-"), words[:2])])
 
 

@@ -117,7 +117,7 @@ def serve(
         None, min=1, max=256, help="Processes, each with the listener in its memory. Default: one for each core."
     ),
     everybody: bool = Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
-    engine: str = Option("auto", metavar="auto|onnx|torch", help="What computes the listener, as of `run`."),
+    engine: str = Option("auto", metavar="auto|onnx|torch", help="Engine of the listener, as of `run`."),
     json: bool = JSON,
 ) -> None:
     """Serve a listener to robots elsewhere, `sfms-robot run --listener zenoh/NAME`, until Ctrl-C."""

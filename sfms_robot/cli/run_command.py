@@ -36,10 +36,10 @@ def run(
     ),
     packages: list[str] = PACKAGES,
     intensity: list[str] = Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of a region's motion, 0 to 2; may be repeated."
     ),
     style: list[str] = Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="How much of its small motions shows, 0 to 2."
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of its small motions, 0 to 2; may be repeated."
     ),
     audio: str = Option(
         "default",
@@ -47,21 +47,21 @@ def run(
         rich_help_panel=PERSON,
         metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, who is in front of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
+        "yours, the visitor of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
     ),
     face: str = Option(
         "auto",
         rich_help_panel=PERSON,
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
-        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, who "
-        "is in front of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
+        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, "
+        "the visitor of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
     ),
     agent_audio: str = Option(
         "none",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
-        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
+        help="The robot's own speech: a sound file, a device that records the loudspeaker, a shipped speaker, a "
         "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
     play: str | None = Option(
@@ -83,7 +83,7 @@ def run(
         [],
         metavar="KIND=PER_MINUTE",
         rich_help_panel=LISTENER,
-        help="How often it does something, as nod=2.2; may be repeated. Default: as often as people do.",
+        help="Events per minute, as nod=2.2; may be repeated. Default: the rates of people.",
     ),
     addressed: str = Option(
         "sense",
@@ -95,7 +95,7 @@ def run(
         "auto",
         metavar="auto|onnx|torch",
         rich_help_panel=LISTENER,
-        help="What computes the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
+        help="Engine of the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
     ),
     seed: int = Option(
         0,
@@ -115,13 +115,13 @@ def run(
     ),
     json: bool = JSON,
     check: bool = Option(
-        False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
+        False, "--check", rich_help_panel=PERSON, help="Judge the sound of --audio for 3 s; no servo moves."
     ),
     status: str | None = Option(
         None,
         metavar="[PORT]",
         rich_help_panel=OUTPUT,
-        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
+        help="Serve the status as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
     view: str | None = Option(
         None,
@@ -139,7 +139,7 @@ def run(
         None,
         metavar="NAME",
         rich_help_panel=OUTPUT,
-        help="Tell a fleet how the run is, as NAME, and obey it: docs/remote.md.",
+        help="Join a fleet as NAME, which sees the run and may halt it: docs/remote.md.",
     ),
     zenoh: Path | None = Option(
         None,
@@ -154,7 +154,7 @@ def run(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
-        help="Key that --fleet asks of whoever resumes or ends the run; made where there is none yet.",
+        help="Key of the fleet, needed to resume or end the run; made if there is none yet.",
     ),
     dry_run: bool = Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
@@ -291,7 +291,7 @@ def demo(
     no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
     json: bool = JSON,
 ) -> None:
-    """A recorded person talks, an emulated head listens; a page shows it, or two pictures where nobody looks."""
+    """A recorded person talks, an emulated head listens; a page shows it, or two pictures without a visitor."""
     from sfms_robot.app.options import RunOptions, begin_page, check_names
 
     options = RunOptions(
@@ -355,7 +355,7 @@ def replay(
     ),
     json: bool = JSON,
 ) -> None:
-    """Draw a recorded run, drive a head with it, or say what is in it."""
+    """Draw a recorded run, drive a head with it, or summarise it."""
     if view is not None and port is not None:
         raise ConfigError("--view shows a recording, --port drives a head with it: one at a time")
     if port is None and (head is not None or fast or yes):

@@ -242,7 +242,7 @@ def _cross(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64
 def packed_human(head: HumanHead) -> bytes:
     """Return the file for `head`. Raises ConfigError where the vertices' light in open_sky.npy does not fit the mesh.
 
-    Little-endian: uint32 length of the JSON, the JSON, then arrays, each from a multiple of 4 bytes on, in the order of
+    Little-endian: uint32 length of the JSON, the JSON, then arrays, each at a multiple of 4 bytes, in the order of
     `arrays` ([name, type, count]). Lengths are int16 steps of `step_m`; a morph's are int16 steps of its own `step_m`,
     only for the vertices that it moves. Axes are the robot's. The first `skinned` vertices are those of the mesh,
     before the brows, which the browser paints; hair and collar follow, and no morph moves them.

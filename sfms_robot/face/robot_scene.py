@@ -197,7 +197,7 @@ class _NeckPose:
         return np.asarray(table[self._order])
 
     def _home(self, angles: Doubles) -> Doubles:
-        """Return the start of the search for the pose: home on the body as it is turned, never the last pose.
+        """Return the start of the search for the pose: home on the turned body, never the last pose.
 
         Several poses fit the legs of a platform. After a gap in what is read the last pose may lead to one that the
         head can only reach by falling through, and from there it would never come back.

@@ -153,7 +153,7 @@ class _Reader:
             end = element.find(tag)
             link = "" if end is None else end.get("link", "")
             if link not in links:
-                raise self._wrong("joint", name, f"has as its {tag} {link!r}, which is no link of this file")
+                raise self._wrong("joint", name, f"has as its {tag} {link!r}, which is not a link of this file")
             ends.append(link)
         where = f"joint {name}"
         axis = np.array(self._floats(element.find("axis"), "xyz", where, 3, (1.0, 0.0, 0.0)))
@@ -207,7 +207,7 @@ class _Reader:
         seen, at = {joint.name}, joint
         while at.mimic is not None:
             if at.mimic.joint not in joints:
-                raise self._wrong("joint", at.name, f"mimics {at.mimic.joint!r}, which is no joint of this file")
+                raise self._wrong("joint", at.name, f"mimics {at.mimic.joint!r}, which is not a joint of this file")
             at = joints[at.mimic.joint]
             if at.name in seen:
                 raise self._wrong("joint", joint.name, "mimics itself")

@@ -59,7 +59,7 @@ def test_either_a_head_or_servos():
 @pytest.mark.parametrize(
     ("stored", "message"),
     [
-        ("joints: {nose: {shutdown: 52}}", "joints = 'nose' is no joint of this head"),
+        ("joints: {nose: {shutdown: 52}}", "joints = 'nose' is not a joint of this head"),
         ("registers: {homing: 3}", "register = 'homing' is none of xl330-m288"),
         ("supply_v: -1", "emulate.yaml: supply_v = -1"),
     ],

@@ -22,5 +22,5 @@ def test_a_bus_of_joints_that_are_all_left_out_is_not_opened():
 
 
 def test_a_joint_that_is_none_is_refused_by_name():
-    with pytest.raises(ConfigError, match="--without 'tail' is no joint of head 'face28'"):
+    with pytest.raises(ConfigError, match="--without: expected a joint of head 'face28', got 'tail'"):
         run(RunOptions(duration_s=1.0, fast=True, without=("tail",)))

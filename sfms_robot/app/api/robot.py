@@ -69,11 +69,11 @@ class Robot:
             `Listener`, which is then stepped in a thread of this process.
         audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
         face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
-        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: whoever
-            calls `say` plays it.
+        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: the
+            caller of `say` plays it.
         source: an object of a class derived from `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is
             called in the loop: it must not block.
-        duration_s: seconds after which it ends by itself; None for that of the source.
+        duration_s: seconds after which it ends; None for that of the source.
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
         seed: of everything that is drawn at random.
         record: folder for the recording; `overwrite` for one that has a recording already.
@@ -176,7 +176,7 @@ class Robot:
         return self._run is None or self._run.wait(limit_s)
 
     def stop(self) -> None:
-        """Come to rest, torque off. Blocks until then, 4 s at most once it has started; idempotent.
+        """Come to rest, switch torque off. Block until then, 4 s at most once it has started; idempotent.
 
         A joint that was found far outside its range takes what its limits need, up to a minute. Raises once,
         as RobotError, what ended the run before.
@@ -189,13 +189,15 @@ class Robot:
                 self._events.join(EVENTS_LIMIT_S)
 
     def release(self) -> None:
-        """Torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
+        """Switch torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
         if self._run is not None:
             self._run.release()
 
     def halt(self) -> None:
-        """Emergency stop: every joint brakes as fast as its limits allow, from the next tick on; those that bear weight
-        then hold, the others are released. Latched until `resume`. Does not wait, raises nothing.
+        """Stop in an emergency: from the next tick on every joint brakes as fast as its limits allow.
+
+        Joints that bear weight then hold, the others are released. Latched until `resume`. Does not wait,
+        raises nothing.
         """
         if self._run is not None:
             self._run.halt.close("Robot.halt()")
@@ -211,7 +213,7 @@ class Robot:
     # --- sound and sight of the robot ---
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
-        """The person's voice: the next piece of sound, of any length. Never blocks.
+        """Hand over the person's voice: the next piece of sound, of any length. Never blocks.
 
         (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
         this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
@@ -220,25 +222,26 @@ class Robot:
         self._pushed("hear").voice.hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | None) -> None:
-        """The person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms. Never blocks.
+        """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
 
-        Raises ConfigError for another shape.
+        Never blocks. Raises ConfigError for another shape.
         """
         self._pushed("see").sight.see(face)
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
-        """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
+        """Hand over the robot's own speech, as `hear`: the lips follow it, and it is not taken for the person.
 
-        With `play=` it is played here, as soon as it can be. Else play it yourself, one frame (40 ms) after it is
-        handed over, behind what still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
-        that replaces what was to be played from then on. Up to two minutes may wait. Never blocks. With a microphone
-        (`audio="mic"`) it is taken out of what is heard. Raises InputError beside another source.
+        With `play=` it is played here, as soon as possible. Else play it yourself, one frame (40 ms) after it is handed
+        over, after the speech that still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
+        that replaces the speech from then on. Up to two minutes may wait. Never blocks. With a microphone
+        (`audio="mic"`) it is removed from the sound. Raises InputError beside another source.
         """
         self._spoken("say").say(pcm, rate_hz, at_s)
 
     def hush(self) -> None:
-        """What it still had to say will not be played: you were interrupted. With `play=` what is on its way out of the
-        device is the last that is heard. Never blocks.
+        """Drop the speech that still waits, after an interruption. Never blocks.
+
+        With `play=` the buffer of the device is still played.
         """
         self._spoken("hush").hush()
 
@@ -255,17 +258,17 @@ class Robot:
     # --- the face ---
 
     def show(self, face58: Floats | Mapping[str, float], seconds: float = 0.5) -> None:
-        """A face (58,), or some channels by name, over what the listener asks for; for `seconds`, then it goes back.
+        """Show a face (58,), or some channels by name, over the plan of the listener, for `seconds`.
 
-        Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer one takes over where it is. Never
-        blocks. Raises InputError for what is no face.
+        Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer face starts from the present one.
+        Never blocks. Raises InputError for another shape, an unknown channel, or a value that is not finite.
         """
         self._puppet.show(face58, seconds)
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float = 2.0) -> None:
         """Look at a point for `seconds`, in metres from the middle of the head: x forward, y to its left, z up.
 
-        Eyes first, then the head with its share. Never blocks. Raises InputError for what is no point.
+        Eyes first, then the head with its share. Never blocks. Raises InputError for a point that is not finite.
         """
         self._puppet.look_at(x_m, y_m, z_m, seconds)
 
@@ -275,13 +278,13 @@ class Robot:
         return self._knobs
 
     def calm(self, addressed: str | None = None, **per_minute: float | None) -> None:
-        """How often it does what, from now on: `robot.calm(nod=2.2, addressed="assume")`; None: as people do.
+        """Set the rate of events per minute: `robot.calm(nod=2.2, addressed="assume")`; None: the rate of people.
 
-        What is not named stays as it is. A listener that decides no events takes no notice, and none does in virtual
-        time once it runs. Raises ConfigError for an unknown kind and a rate that cannot be.
+        Kinds that are not named keep their rate. It has no effect on a listener that decides no events, nor in virtual
+        time once it runs. Raises ConfigError for an unknown kind and an invalid rate.
         """
-        asked = {**(self._calmness.model_dump()), **per_minute}
-        self._calmness = parse(Calmness, asked if addressed is None else asked | {"addressed": addressed}, "calm")
+        rates = {**self._calmness.model_dump(), **per_minute}
+        self._calmness = parse(Calmness, rates if addressed is None else rates | {"addressed": addressed}, "calm")
         if self._feed is not None:
             self._feed.calm(self._calmness)
 
@@ -304,7 +307,7 @@ class Robot:
         return "stopped" if self._run is None else self._run.state
 
     def report(self) -> dict[str, Any]:
-        """The report of `run --json`; while it runs, those of its keys that are known, with "exit": "running"."""
+        """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
         if self._run is not None and self._run.report is not None:
             return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
         options, progress = self._options, Progress() if self._run is None else self._run.progress

@@ -1,7 +1,7 @@
-"""`head fit`: a recording of a head's joints, and a face tracker's track of it -> drives that look as wanted.
+"""`head fit`: a recording of a head's joints, and a face tracker's track of it -> drives that show each expression.
 
 A recording is a folder: `run.mcap` as `run --record` and `head fit --babble` write it, and beside it `face.csv` (or
-.csv.gz), the track of the robot's own face on the same clock. The delay of the tracker is found from the two.
+.csv.gz), the track of the robot's face on the same clock. The delay of the tracker is found from the two.
 
 `--babble` moves every channel that the head follows up and down once, alone; then several at a time, at random, as
 faces do. Poses of the head stay at rest, so that a camera in front of it sees the face throughout.
@@ -231,7 +231,7 @@ def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes:
 
 
 def see_virtual_face(head: Head, folder: Path, seed: int = 1) -> None:
-    """Write the track of a virtual face, with a skin of its own, beside a recorded run on emulated servos."""
+    """Write the track of a virtual face, with a random skin, beside a recorded run on emulated servos."""
     run = read_recording(folder)
     columns = [run.joints.index(joint) for joint in head.joints]
     step = max(1, round(0.04 / float(np.median(np.diff(run.times_s)))))
