@@ -1,15 +1,21 @@
-"""A recorded run drives a head again: the same one as it did, another one as that one can, and within its limits."""
+"""A recorded run again: on the same head and on another, within its limits; and on a page."""
 
 import json
+from contextlib import closing
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from websockets.sync.client import connect
 
-from sfms_robot.app.options import RunOptions
-from sfms_robot.app.replay.playback import play_back, recorded_face
+from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.app.replay.playback import pictures, play_back, recorded_face, show_recording
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import run
-from sfms_robot.runtime.recorder import RUN_FILE
+from sfms_robot.frames import MOTION_DIM, Reading
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder
+from sfms_robot.viewer.frame_record import frame_json
 
 HEAD, SECONDS = "interbotix_wxxms", 4.0
 
@@ -90,3 +96,44 @@ def test_what_is_wrong_is_said_in_one_line(recorded, command_line):
 def test_the_command_says_what_was_played(recorded, command_line):
     ended = command_line("replay", recorded[0], "--port", "sim", "--fast", "--json")
     assert ended.code == 0 and ended.told["exit"] == "done" and ended.told["recording"]["head"] == HEAD
+
+
+def test_twenty_five_pictures_a_second_are_what_was_recorded(recorded):
+    folder = recorded[0]
+    recording = read_recording(folder)
+    told = [json.loads(frame_json(record)) for record in pictures(recording)]
+    assert len(told) == pytest.approx(25 * recording.duration_s, abs=2)
+    middle = told[25]
+    row = int(np.argmin(np.abs(recording.times_s - middle["t"])))
+    assert np.allclose(middle["m"], recording.motion[row], atol=6e-5)
+    assert np.allclose(middle["j"], recording.goals_rad[row], atol=6e-5)
+    assert [told[0]["s"], told[-1]["s"]] == ["starting", "stopping"] and middle["db"] is not None
+
+
+def test_a_position_that_was_old_is_not_shown_as_read(tmp_path):
+    recorder = Recorder(tmp_path / "run", ("slow", "away"), when_full="wait")
+    for index in range(50):
+        readings = {"slow": Reading(0.11, 0.04 * (index % 25)), "away": Reading(0.12, 0.04 * index)}
+        recorder.tick(Tick(0.04 * index, np.zeros(MOTION_DIM, np.float32), np.array([0.1, 0.2]), readings))
+    recorder.close()
+    told = [json.loads(frame_json(record)) for record in pictures(read_recording(tmp_path / "run"))]
+    assert all(each["r"][0] == 0.11 for each in told)
+    assert told[20]["r"] == [0.11, 0.12] and told[-1]["r"] == [0.11, None] and told[-1]["u"] == [0.11, 0.2]
+
+
+def test_the_page_has_all_of_it(recorded):
+    folder = recorded[0]
+    page = begin_page("0")
+    with closing(page):
+        page.wait()
+        show_recording(folder, page)
+        with connect(page.url.replace("http", "ws", 1) + "ws") as visitor:  # the page's process may still be reading
+            told = json.loads(visitor.recv(timeout=30))
+            while not told.get("over") and told["type"] != "over":
+                told = json.loads(visitor.recv(timeout=30))
+        with urlopen(page.url + "runs/last", timeout=30) as answer:
+            lines = [json.loads(line) for line in answer.read().splitlines()]
+        assert lines[0]["head"] == HEAD and lines[0]["replay"] is True
+        count = sum(line["type"] == "frame" for line in lines)
+        assert count == len(list(pictures(read_recording(folder))))
+        assert lines[-1]["report"]["ticks"] > 200
