@@ -365,7 +365,7 @@ def replay(
     found = replay_run(folder, plot, sheet)
     if port is not None:
         from sfms_robot.app.listen.panel import live_panel
-        from sfms_robot.app.replay.playback import play_back
+        from sfms_robot.app.replay.play_back import play_back
 
         panel = None if json else live_panel
         found = {**play_back(folder, panel, head=head, port=port, fast=fast, yes=yes), "recording": found}
@@ -377,7 +377,7 @@ def replay(
 def _view(folder: Path, view: str) -> None:
     """Serve a recording on a page until all visitors have left, or Ctrl-C."""
     from sfms_robot.app.options import begin_page, open_browser
-    from sfms_robot.app.replay.playback import show_recording, wait_for_visitors
+    from sfms_robot.app.replay.play_back import show_recording, wait_for_visitors
 
     page = begin_page(view)
     assert page is not None

@@ -107,6 +107,18 @@ class HumanHead:
         out: Floats = (turned + self.share[:, None] * move).astype(np.float32)
         return out
 
+    def joined(
+        self, rest: Floats, deltas: Floats, share: Floats, triangles: NDArray[np.int64], colors: NDArray[np.uint8]
+    ) -> HumanHead:
+        """Return the head with more vertices; `triangles` count from the first of them."""
+        return HumanHead(
+            rest=np.concatenate([self.rest, rest]).astype(np.float32),
+            deltas=np.concatenate([self.deltas, deltas], axis=1).astype(np.float32),
+            share=np.concatenate([self.share, share]),
+            triangles=np.concatenate([self.triangles, triangles + len(self.rest)]),
+            colors=np.concatenate([self.colors, colors]),
+        )
+
 
 def load_human(folder: Path | None = None) -> HumanHead:
     """Load the shipped head, or the one in `folder`. Raises ConfigError when the file is not such a mesh."""
@@ -195,7 +207,7 @@ def _brow_outline(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def _with_ribbon(head: HumanHead, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> HumanHead:
-    count, first = len(lower), len(head.rest)
+    count = len(lower)
     corners, weights = _on_skin(head, np.concatenate([lower, upper]))
     rest = np.einsum("pc,pcd->pd", weights, head.rest[corners])
     rest[:, 0] += _BROW_LIFT_M
@@ -204,13 +216,8 @@ def _with_ribbon(head: HumanHead, lower: NDArray[np.float64], upper: NDArray[np.
     strips = np.concatenate(
         [np.stack([near, far, far + count], axis=1), np.stack([near, far + count, near + count], axis=1)]
     )
-    return HumanHead(
-        rest=np.concatenate([head.rest, rest]).astype(np.float32),
-        deltas=np.concatenate([head.deltas, deltas], axis=1).astype(np.float32),
-        share=np.concatenate([head.share, np.ones(2 * count, dtype=np.float32)]),
-        triangles=np.concatenate([head.triangles, strips + first]),
-        colors=np.concatenate([head.colors, np.full((2 * count, 3), _BROW, dtype=np.uint8)]),
-    )
+    share, colors = np.ones(2 * count, np.float32), np.full((2 * count, 3), _BROW, np.uint8)
+    return head.joined(rest, deltas, share, strips, colors)
 
 
 def _on_skin(head: HumanHead, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -319,13 +326,9 @@ def with_hair(head: HumanHead) -> HumanHead:
     shown = grown.triangles[(grown.open_sky[grown.triangles] > _UNDER_SKIN).any(axis=1)]
     vertices, light = grown.vertices.astype(np.float32), grown.open_sky[:, None] / 255
     colors = (1 - light) * np.array(_HAIR[0]) + light * np.array(_HAIR[1])
-    return HumanHead(
-        rest=np.concatenate([head.rest, vertices]),
-        deltas=np.pad(head.deltas, ((0, 0), (0, len(vertices)), (0, 0))),
-        share=np.concatenate([head.share, share_of_rotation(vertices)]),
-        triangles=np.concatenate([head.triangles, shown + len(head.rest)]),
-        colors=np.concatenate([head.colors, np.round(colors)]).astype(np.uint8),
-    )
+    deltas = np.zeros((len(BLENDSHAPES), len(vertices), 3), np.float32)
+    painted = np.round(colors).astype(np.uint8)
+    return head.joined(vertices, deltas, share_of_rotation(vertices), shown, painted)
 
 
 def hair(skin: Floats) -> Surface:

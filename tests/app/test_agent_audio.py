@@ -11,7 +11,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.app.options import RunOptions
-from sfms_robot.app.replay.playback import pictures, play_back
+from sfms_robot.app.replay.play_back import pictures, play_back
 from sfms_robot.app.replay.run_file import _records, read_recording
 from sfms_robot.app.session import run
 from sfms_robot.config.arig import STATES, paper_state

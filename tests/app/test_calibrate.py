@@ -16,7 +16,7 @@ import pytest
 import yaml
 from emulated_devices import device_of, servos_of
 
-from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
+from sfms_robot.app.head.calibrate import CalibrationOutcome, calibrate, calibrate_on
 from sfms_robot.app.open_head import calibrated_head, identify, open_head
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.wiring import emulated
@@ -103,7 +103,7 @@ def hand(chain: Chain, servo: int, ticks: int) -> Callable[[], str]:
     return turn
 
 
-def led(name: str, chain: Chain, person: Person, **more) -> Outcome:
+def led(name: str, chain: Chain, person: Person, **more) -> CalibrationOutcome:
     return calibrate_on(name, {"main": chain}, VirtualClock(), person, overlay_file("two"), DAY, **more)
 
 

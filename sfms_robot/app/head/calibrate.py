@@ -66,7 +66,7 @@ class AgainError(RobotError):
 
 
 @dataclass(kw_only=True)
-class Outcome:
+class CalibrationOutcome:
     """The result of a calibration.
 
     Attributes:
@@ -91,7 +91,7 @@ class Outcome:
         return {"version": 1, **vars(self), "file": str(self.file)}
 
 
-def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> Outcome:
+def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> CalibrationOutcome:
     """Lead through the joints of a head on `port`, or those named.
 
     Emulated servos (`sim`) are for practice: their measurements are kept apart and never used. `again`: also joints
@@ -113,14 +113,14 @@ def calibrate_on(
     *,
     joints: Sequence[str] = (),
     again: bool = False,
-) -> Outcome:
+) -> CalibrationOutcome:
     """Calibrate as `calibrate` does, on buses that are there, into `file`."""
     head, sha256 = load_head(name), head_hash(name)
     for joint in joints:
         if joint not in head.joints:
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", head.joints)
     wanted = list(joints or head.joints)
-    outcome = Outcome(head=head.name, file=file)
+    outcome = CalibrationOutcome(head=head.name, file=file)
     overlay = load_overlay(head, file)
     servos = identify(head, wanted, where, clock)
     guide = _Guide(talk, today)
@@ -182,7 +182,7 @@ class _Guide:
             return False
         return self._ask("  Enter: by hand, torque off; k: by keys; s: skip > ") != "k"
 
-    def measure_until_right(self, joint: Joint, identity: Identity, at: Probe, by_hand: bool) -> Measured:
+    def measure_until_right(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
         """Measure a joint until the measurement can be right. Raises SkippedError, BusError, ServoError."""
         while True:
             try:
@@ -190,7 +190,7 @@ class _Guide:
             except AgainError as reason:
                 self._talk.say(f"  {reason}; once more")
 
-    def _measure(self, joint: Joint, identity: Identity, at: Probe, by_hand: bool) -> Measured:
+    def _measure(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
         rests_at_end = joint.rest_deg in (joint.min_deg, joint.max_deg)
         low, high = (self._point(joint, point, at, by_hand) for point in ("min", "max"))
         rest = low if joint.rest_deg == joint.min_deg else high
@@ -214,7 +214,7 @@ class _Guide:
             **identity.model_dump(), date=self._today, min_ticks=low, center_ticks=rest, max_ticks=high, sign=sign
         )
 
-    def _point(self, joint: Joint, point: str, at: Probe, by_hand: bool) -> int:
+    def _point(self, joint: Joint, point: str, at: JointProbe, by_hand: bool) -> int:
         """Return the ticks at which the user says that the joint is at its end or its rest."""
         where = f"  {TITLES[point]} ({getattr(joint, f'{point}_deg'):g} deg in its file)"
         if by_hand:
@@ -231,7 +231,7 @@ class _Guide:
             except (ValueError, OverflowError):
                 self._talk.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
 
-    def _check_ends(self, low: int, high: int, rest: int, at: Probe) -> None:
+    def _check_ends(self, low: int, high: int, rest: int, at: JointProbe) -> None:
         """Move to the ends and to rest slowly, and ask whether that was right. Raises AgainError if not."""
         if self._ask("  Enter: check it, slowly to both ends and to rest; n: without a check > ") == "n":
             return
@@ -264,7 +264,7 @@ def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay
     return overlay.recorded(sha256, joint, found.stored) if overlay.stored is not None else overlay
 
 
-def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: Outcome) -> None:
+def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: CalibrationOutcome) -> None:
     """Read the file back, apply it to the head, and build the head's motion from it."""
     try:
         layers = layered(head, load_overlay(head, outcome.file), sha256, servos)
@@ -279,7 +279,7 @@ def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outco
 # --- one joint alone, in servo ticks --------------------------------------------------------------------------------
 
 
-class Probe:
+class JointProbe:
     """A joint on an open bus.
 
     The bus is opened with this joint alone and with the whole travel of its servo as its range, for its range has yet
@@ -350,7 +350,7 @@ class Probe:
 @contextmanager
 def probe(
     head: Head, name: str, where: Chain | str, clock: Clock, *, stored: Mapping[str, int], unconfirmed: list[str]
-) -> Iterator[Probe]:
+) -> Iterator[JointProbe]:
     """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
 
     `stored`: zero and direction as its servo stores them; a measurement may begin from any. Raises RobotError for a
@@ -365,7 +365,7 @@ def probe(
     bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True)
     try:
         bus.connect()
-        yield Probe(name, joint, bus, clock)
+        yield JointProbe(name, joint, bus, clock)
     finally:
         bus.stop("release")
         unconfirmed += bus.statistics()["torque_unconfirmed"]

@@ -106,7 +106,7 @@ def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> d
     return summary(recording)
 
 
-def sheet(recording: RunRecording, png: Path | str) -> list[Instant]:
+def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
     """Draw virtual head and robot at twelve instants: the face of the listener, the servos. Return the instants.
 
     A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
@@ -324,7 +324,7 @@ def _legend(axes: Axes) -> None:
 
 
 @dataclass(frozen=True)
-class Instant:
+class SheetInstant:
     """One picture of a sheet: row of the motion, time, what is happening."""
 
     row: int
@@ -335,7 +335,7 @@ class Instant:
 # --- contact sheet: the instants -------------------------------------------------------------------------------------
 
 
-def pick_instants(times_s: Doubles, motion: Floats, count: int = _INSTANTS) -> list[Instant]:
+def pick_instants(times_s: Doubles, motion: Floats, count: int = _INSTANTS) -> list[SheetInstant]:
     """Return `count` instants of a motion (N, 58) that show its events, in order. Raises ValueError when N = 0."""
     if not len(times_s):
         raise ValueError("a sheet needs at least one frame")
@@ -344,7 +344,7 @@ def pick_instants(times_s: Doubles, motion: Floats, count: int = _INSTANTS) -> l
     rows = list(dict.fromkeys([*nod, *_peaks(signals)]))[: min(count, len(times_s))]
     while len(rows) < min(count, len(times_s)):
         rows.append(_loneliest(times_s, rows))
-    return [Instant(row, float(times_s[row]), nod.get(row) or _label(signals, row)) for row in sorted(rows)]
+    return [SheetInstant(row, float(times_s[row]), nod.get(row) or _label(signals, row)) for row in sorted(rows)]
 
 
 def _signals(times_s: Doubles, motion: Floats) -> dict[str, Floats]:
@@ -430,7 +430,7 @@ def render_sheet(
     talking: NDArray[np.bool_] | None = None,
     title: str = "",
     robot: tuple[RobotScene, Doubles] | None = None,
-) -> list[Instant]:
+) -> list[SheetInstant]:
     """Draw twelve instants of a motion (N, 58) as one PNG, 4 x 3; return them.
 
     talking: (N,) whether the speaker talks, written under each picture. robot: its scene, and the angles (N, J) that it

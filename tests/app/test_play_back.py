@@ -9,7 +9,7 @@ import pytest
 from websockets.sync.client import connect
 
 from sfms_robot.app.options import RunOptions, begin_page
-from sfms_robot.app.replay.playback import pictures, play_back, recorded_face, show_recording
+from sfms_robot.app.replay.play_back import pictures, play_back, recorded_face, show_recording
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import run
 from sfms_robot.frames import MOTION_DIM, Reading
