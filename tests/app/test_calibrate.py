@@ -33,7 +33,6 @@ from sfms_robot.config.overlay import (
 )
 from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.port import Port
 
@@ -260,11 +259,6 @@ def test_every_family_tells_who_it_is(tmp_path, family, model, zero):
         gone = identify(load_head(name), ["brow"], {"main": chain}, VirtualClock())
     assert [each and (each.id, each.model) for each in servos.values()] == [(1, model), (2, model)]
     assert gone == {"brow": None}
-
-
-def test_a_joint_of_another_head_is_refused(name):
-    with pytest.raises(ConfigError, match=r"--joint = 'chin' is not a joint of this head \(jaw, brow\)"):
-        calibrate_on(name, {}, VirtualClock(), Person(), overlay_file("two"), DAY, joints=["chin"])
 
 
 def test_practice_on_emulated_servos_is_kept_apart(name):

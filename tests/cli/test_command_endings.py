@@ -111,11 +111,6 @@ def test_a_command_that_said_how_it_ended_is_not_spoken_for(command):
     assert command(None, "breaks", "--json") == (0, "", "")
 
 
-def test_a_flag_that_is_none_is_an_object_too(command):
-    ended, out, err = command(None, "breaks", "--json", "--nope")
-    assert ended == 2 and "--nope" in err and json.loads(out)["exit_code"] == 2
-
-
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
 def test_a_full_disk_behind_stdout_is_one_line():
     with open("/dev/full", "w") as full:
@@ -203,12 +198,6 @@ def test_a_slip_of_the_keyboard_is_found_before_anything_is_loaded(words, code):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr
     assert words[1] in done.stderr
-
-
-def test_a_head_that_is_not_there_is_named_as_it_was_given(command_line):
-    for words in (["head", "check", "nope"], ["run", "--head", "nope"]):
-        told = command_line(*words).err
-        assert told.startswith("sfms-robot: head 'nope' is neither a shipped name nor a folder")
 
 
 @pytest.mark.parametrize(

@@ -70,8 +70,6 @@ def test_calibrate_ends_with_4_when_torque_is_not_confirmed_off(command_line, mo
         (["calibrate", "face28", "--port", "/dev/nowhere"], 3, "/dev/nowhere: no such device"),
         (["calibrate", "face28", "--port", "sim", "--joint", "chin"], 2, "--joint = 'chin' is not a joint of this"),
         (["calibrate", "face29", "--port", "sim"], 2, "'face29' is neither a shipped name nor a folder"),
-        (["pose", "face28", "grin"], 2, "'grin' is not an expression (smile, "),
-        (["pose", "face28", "jawOpen=7"], 2, "jawOpen = '7' is not a number in its range (0..1)"),
     ],
 )
 def test_what_is_wrong_is_one_line_with_its_exit_code(run, words, code, message):

@@ -28,28 +28,23 @@ RISE_S: Final = 0.5
 MOVED_DEG: Final = 0.1
 _BOUNDS: Final = {"roll": 1.0, "pitch": 1.0, "yaw": 1.6, "x": 0.1, "y": 0.1, "z": 0.1}  # rad and m, either way
 
+
+def _both(**values: float) -> dict[str, float]:
+    """Return the values of pairs of channels, left and right."""
+    return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
+
+
 EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
-    "smile": {
-        "mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "cheekSquintLeft": 0.4, "cheekSquintRight": 0.4,
-        "eyeSquintLeft": 0.2, "eyeSquintRight": 0.2,
-    },
-    "frown": {"mouthFrownLeft": 0.8, "mouthFrownRight": 0.8, "browDownLeft": 0.6, "browDownRight": 0.6},
-    "surprise": {
-        "browInnerUp": 0.9, "browOuterUpLeft": 0.8, "browOuterUpRight": 0.8, "eyeWideLeft": 0.8, "eyeWideRight": 0.8,
-        "jawOpen": 0.4,
-    },
-    "anger": {
-        "browDownLeft": 1.0, "browDownRight": 1.0, "noseSneerLeft": 0.6, "noseSneerRight": 0.6,
-        "mouthPressLeft": 0.5, "mouthPressRight": 0.5,
-    },
-    "blink": {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
+    "smile": _both(mouthSmile=0.9, cheekSquint=0.4, eyeSquint=0.2),
+    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "surprise": {**_both(browOuterUp=0.8, eyeWide=0.8), "browInnerUp": 0.9, "jawOpen": 0.4},
+    "anger": _both(browDown=1.0, noseSneer=0.6, mouthPress=0.5),
+    "blink": _both(eyeBlink=1.0),
     "kiss": {"mouthPucker": 1.0, "mouthFunnel": 0.2},
     "nod": {"pitch": 0.2},
-    "look_left": {
-        "eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3,
-    },
+    "look_left": {"eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3},
     "look_right": {"eyeLookInLeft": 0.7, "eyeLookOutRight": 0.7, "yaw": -0.3},
-}  # fmt: skip
+}
 
 
 def parse_face(words: Sequence[str]) -> Floats:
