@@ -4,7 +4,7 @@
     Retargeter(head).angles(face58)                       faces to joint angles
     load_listener("sfms-small").stream(seed=0)            voice and face to plans
     with open_bus(head, "sim") as bus: ...                servos alone
-    with Robot("face28", port="sim") as robot: ...        all of it, in a thread of its own
+    with Robot("face28", port="sim") as robot: ...        all of it, in its own thread
 
 Every name is loaded when it is first used, so that importing this package costs nothing. docs/api.md has them all.
 """
@@ -87,7 +87,7 @@ _CALLED: Final = {"Retargeter": "HeadRetargeter"}
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a public name from its module (PEP 562)."""
+    """Load a public name from its module (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), _CALLED.get(name, name))

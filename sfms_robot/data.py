@@ -1,4 +1,4 @@
-"""Where the files that ship with the package lie. The only module that knows."""
+"""Paths of the files that ship with the package."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Shipped = Literal["configs", "firmware_maps", "sim"]
 
 
 def data_dir(name: Shipped) -> Path:
-    """Folder of shipped files: inside the installed package, else beside it in a checkout.
+    """Return the folder of shipped files: inside the installed package, else beside it in a checkout.
 
-    Raises FileNotFoundError when neither exists, which means a broken installation.
+    Raises FileNotFoundError when neither exists, after a broken installation.
     """
     installed = Path(str(files("sfms_robot"))) / name
     if installed.is_dir():
@@ -28,27 +28,27 @@ def data_dir(name: Shipped) -> Path:
 
 
 def shipped_names(folder: Path, marker: str) -> list[str]:
-    """Names of the folders in `folder` that hold a file called `marker`, sorted."""
+    """Return the names of the folders in `folder` that hold a file called `marker`, sorted."""
     return sorted(path.parent.name for path in folder.glob(f"*/{marker}"))
 
 
 def head_names() -> list[str]:
-    """Of the shipped heads."""
+    """Return the names of the shipped heads."""
     return shipped_names(data_dir("configs") / "heads", "head.yaml")
 
 
 def listener_names() -> list[str]:
-    """Of the shipped listeners."""
+    """Return the names of the shipped listeners."""
     return shipped_names(data_dir("configs") / "listeners", "config.yaml")
 
 
 def speaker_names() -> list[str]:
-    """Of the people who ship with the package."""
+    """Return the names of the shipped speakers."""
     return shipped_names(data_dir("sim") / "speakers", SPEAKER_VOICE)
 
 
 def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
-    """Folder of a shipped head or listener by name, or of anybody's by path. Raises ConfigError with the choices."""
+    """Return the folder of a shipped head or listener by name, or of another by path. Raises ConfigError."""
     root = data_dir("configs") / kind
     for folder in (root / name, Path(name)):
         if (folder / marker).is_file():

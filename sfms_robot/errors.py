@@ -1,4 +1,4 @@
-"""Everything that can go wrong, as one tree.
+"""The tree of errors, and the exit codes of the command line.
 
 RobotError                      base; `exit_code` is what the command line returns
 +-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
@@ -20,6 +20,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
+
+INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
 
 
 class RobotError(Exception):
@@ -82,13 +84,13 @@ class TorqueError(BusError):
 
 
 class ServoError(RobotError):
-    """One servo is not what the head configuration says, or refused a command. The bus goes on."""
+    """One servo is not what the head configuration says, or refused a command. The bus continues."""
 
     exit_code = 4
 
 
 class PacketError(RobotError):
-    """Bytes that are not a packet: bad header, length or checksum. The bus goes on."""
+    """Bytes that are not a packet: bad header, length or checksum. The bus continues."""
 
     exit_code = 4
 

@@ -1,21 +1,18 @@
-"""Heads, listeners, recorded people, serial ports, sound devices: what there is to choose from, a row with a name and a
-description each.
-"""
+"""Rows of the heads, listeners, recorded people, serial ports and sound devices at hand."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
 from sfms_robot.servo.discovery import ports_data
-from sfms_robot.sources.sound_devices import SoundDevice
 from sfms_robot.sources.speakers import shipped_speaker
 
 
 def shipped_heads() -> list[dict[str, Any]]:
-    """What `head list` shows."""
+    """Return the rows of `head list`."""
     heads = [load_head(name) for name in head_names()]
     return [
         {
@@ -30,7 +27,7 @@ def shipped_heads() -> list[dict[str, Any]]:
 
 
 def shipped_listeners() -> list[dict[str, Any]]:
-    """What `listener list` shows."""
+    """Return the rows of `listener list`."""
     folder = data_dir("configs") / "listeners"
     rows = []
     for name in listener_names():
@@ -47,7 +44,7 @@ def shipped_listeners() -> list[dict[str, Any]]:
 
 
 def shipped_speakers() -> list[dict[str, Any]]:
-    """What `speaker list` shows; the description is the title of SOURCE.md."""
+    """Return the rows of `speaker list`; the description is the title of SOURCE.md."""
     import soundfile
 
     rows = []
@@ -66,38 +63,28 @@ def shipped_speakers() -> list[dict[str, Any]]:
 
 
 def serial_ports() -> list[dict[str, Any]]:
-    """What `port list` shows. `name` is what to give to --port."""
+    """Return the rows of `port list`. `name` is the value for --port."""
     return ports_data()
 
 
-def microphones() -> list[dict[str, Any]]:
-    """What `port list` shows of sound; blocks for half a second. `name` is what to give to --audio mic:NAME.
+def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, Any]]:
+    """Return the sound devices of `port list`, whose descriptions name the option for each; block for half a second.
 
     Raises ConfigError without PortAudio.
     """
-    from sfms_robot.sources.microphone import sound_devices
+    from sfms_robot.sources import microphone
+
+    def option(monitor: bool) -> str:
+        return "--play " if direction == "playing" else "--agent-audio device:" if monitor else "--audio mic:"
 
     return [
         {
-            **_row(device),
-            "description": f"--agent-audio device:{device.name}" if device.monitor else f"--audio mic:{device.name}",
+            "name": device.name,
+            "number": None if device.server else str(device.number),
+            "default": device.default,
+            "channels": device.channels,
+            "rate_hz": round(device.rate_hz),
+            "description": f"{option(device.monitor)}{device.name}",
         }
-        for device in sound_devices("recording")
+        for device in microphone.sound_devices(direction)
     ]
-
-
-def loudspeakers() -> list[dict[str, Any]]:
-    """As `microphones`; `name` is what to give to --play NAME."""
-    from sfms_robot.sources.microphone import sound_devices
-
-    return [{**_row(device), "description": f"--play {device.name}"} for device in sound_devices("playing")]
-
-
-def _row(device: SoundDevice) -> dict[str, Any]:
-    return {
-        "name": device.name,
-        "number": None if device.server else str(device.number),
-        "default": device.default,
-        "channels": device.channels,
-        "rate_hz": round(device.rate_hz),
-    }

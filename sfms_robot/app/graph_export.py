@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast, get_args
 
-from sfms_robot.app.out_files import made_folder
+from sfms_robot.app.output_paths import made_folder
 from sfms_robot.config.listener import LISTENER_KINDS
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError

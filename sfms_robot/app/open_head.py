@@ -1,31 +1,35 @@
-"""A head and its servos: the half of the composition root that all commands which move one share.
+"""A head and its servos: the half of the composition root that all commands which move a head share.
 
     prepare_head    what can be checked before anything is opened: the head's file, its ports, what is confirmed
-    build_motion    what lies between a plan and the bus: timeline, retargeter, limiter, audit, heat
+    calibrated_head the head's file with the overlay of this build, for the servos that answer
+    build_motion    the parts between a plan and the bus: timeline, retargeter, limiter, audit, heat
     build_bus       every servo of the head behind one bus, emulated ones and real ones alike
-    open_head       all three: emulated servos started, ports opened, every servo identified; torque is untouched
+    open_head       all of them: emulated servos started, ports opened, every servo identified; torque is untouched
 
-What is played on it, and by whom, is `app.session`'s.
+`app.session` decides what is played on it.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from shlex import quote
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.app.calibrated_head import calibrated_head
-from sfms_robot.app.wiring import SIM, Opened, calibration_of, devices, firmware_maps, plugged_in, port_of
-from sfms_robot.config import FirmwareMap, Head, Joint, load_head
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.servo.serial_line import FoundServo, Wire
+from sfms_robot.app.wiring import Opened, calibration_of, devices, firmware_maps, open_wires, port_of
+from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.check import check_registers
-from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.config.head import held_back
+from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
+from sfms_robot.emulator.launch import Chain
+from sfms_robot.errors import ConfigError, PortError, ServoError
 from sfms_robot.frames import Doubles
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.calibration import Calibration
@@ -41,14 +45,17 @@ from sfms_robot.servo.discovery import access_problem
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo, tells_current, torque_register
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks
 
 log = logging.getLogger(__name__)
 
+_REVERSED: Final = 1  # bit of the drive mode: the direction in which ticks rise
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Motion:
-    """What lies between a plan and the bus. `holds` (J,): joints that keep their torque in an emergency stop."""
+    """The parts between a plan and the bus. `holds` (J,): joints that keep their torque in an emergency stop."""
 
     timeline: PlanTimeline
     retargeter: HeadRetargeter
@@ -60,55 +67,47 @@ class Motion:
     heat: HeatGuard
 
 
-@dataclass(frozen=True)
-class HeadOptions:
-    """Which head, on which servos.
-
-    Attributes:
-        head: shipped name, or a folder with a head.yaml.
-        port: "sim", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
-        fast: virtual time; needs emulated servos.
-        yes: hobby servos may jump when they come on.
-        without: joints left out: their servos are not addressed at all.
-    """
-
-    head: str = "face28"
-    port: str = SIM
-    fast: bool = False
-    yes: bool = False
-    without: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OpenHead:
-    """A head whose servos are connected; torque is untouched. `rate_hz` is that of its fastest bus."""
+    """A head whose servos are connected; torque is untouched. `opened`: where its buses are."""
 
     options: HeadOptions
     config: Head
     motion: Motion
     bus: Bus
     clock: Clock
-    rate_hz: float
     opened: Opened
 
+    @property
+    def rate_hz(self) -> float:
+        """Rate of the loop: that of the head's fastest bus."""
+        return fastest_hz(self.config)
+
     def digests(self) -> dict[str, Any]:
-        """What went over each emulated wire: two runs that say the same here sent the same bytes."""
+        """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
         digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}
         return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
 
 
+def fastest_hz(head: Head) -> float:
+    """Return the rate of the head's fastest bus."""
+    return max(bus.rate_hz for bus in head.buses.values())
+
+
 def prepare_head(options: HeadOptions) -> Head:
-    """All that can be wrong with a head and its ports before anything is opened. Raises ConfigError, PortError."""
+    """Check a head and its ports before anything is opened; return the head. Raises ConfigError, PortError."""
     if options.fast and options.port != SIM:
         raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
     head = load_head(options.head)
     for joint in options.without:
         if joint not in head.joints:
-            raise ConfigError(f"--without {joint!r} is no joint of head {head.name!r} ({', '.join(head.joints)})")
+            raise ConfigError(
+                f"--without: expected a joint of head {head.name!r}, got {joint!r} ({', '.join(head.joints)})"
+            )
     if options.port == SIM:
         return head
     where = devices(head, options.port)
-    if (jumping := on_boards(head)) and not options.yes:
+    if (jumping := on_boards(head)) and not options.confirmed:
         raise ConfigError(
             f"head {head.name!r}: hobby servos report no position, and each jumps to rest when it comes on "
             f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
@@ -120,44 +119,125 @@ def prepare_head(options: HeadOptions) -> Head:
 
 
 @contextmanager
-def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
-    """Where each bus of the head is: emulated servos, which live as long as this does, or devices. Opens no port."""
-    with ExitStack() as stack:
-        if options.port != SIM:
-            yield devices(head, options.port)
-            return
-        chains = plugged_in(options.head, head)
-        yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
-
-
-@contextmanager
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
     prepare_head(options)
     clock: Clock = VirtualClock() if options.fast else RealClock()
-    kept: dict[str, Port] = {}
+    kept: dict[str, Port] = {}  # by bus, open since their servos were identified
     with ExitStack() as stack:
-        stack.callback(_close, kept)
+        stack.callback(_close_all, kept)
         head = calibrated_head(options.head, options.port, clock, kept)
-        rate_hz = max(bus.rate_hz for bus in head.buses.values())
-        motion = build_motion(head, rate_hz)
+        motion = build_motion(head, fastest_hz(head))
         opened = stack.enter_context(open_wires(head, options))
         doctor = f"sfms-robot doctor --port {options.port} --head {quote(options.head)} --fix"
-        bus = build_bus(head, opened, clock, confirmed=options.yes, without=options.without, doctor=doctor, kept=kept)
+        confirmed = options.confirmed
+        bus = build_bus(head, opened, clock, confirmed=confirmed, without=options.without, doctor=doctor, kept=kept)
         stack.callback(bus.close)
         bus.connect()
         if weak := bus.statistics().get("stored_warnings"):
             log.warning("servos protect themselves less than usual: %s; mend it: %s", "; ".join(weak), doctor)
-        yield OpenHead(options, head, motion, bus, clock, rate_hz, opened)
+        yield OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
 
 
-def _close(kept: dict[str, Port]) -> None:
-    for port in kept.values():
+def _close_all(ports: Mapping[str, Port]) -> None:
+    for port in ports.values():
         port.close()
 
 
+# --- the head's file, the overlay of this build, and the servos that answer -----------------------------------------
+
+
+def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -> Head:
+    """Return the head as it may move on this port.
+
+    On emulated servos every head counts as calibrated. On real ones each measured servo is identified first; a joint
+    whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. The ports that
+    are opened for this stay open, by bus, in `kept`: some adapters reset their servos at every opening.
+
+    Raises ConfigError, PortError.
+    """
+    head = load_head(name)
+    overlay, sha256 = load_overlay(head), head_hash(name)
+    if port == SIM:
+        layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
+    else:
+        measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
+        servos = identify(head, measured, devices(head, port), clock, kept)
+        layers = layered(head, overlay, sha256, servos)
+    for joint, problem in layers.refused.items():
+        log.warning("head %s: the calibration of %s does not hold: %s", head.name, joint, problem)
+    for note in layers.notes:
+        log.warning("head %s: %s", head.name, note)
+    return ready(layers.head, real=port != SIM, calibrated=layers.calibrated, refused=layers.refused)
+
+
+def ready(head: Head, *, real: bool, calibrated: Collection[str] = (), refused: Collection[str] = ()) -> Head:
+    """Return the head; joints that are not measured, or whose measurement is `refused`, move little and slowly."""
+    held = [j for j in head.joints if j in refused or (head.calibrate_first and j not in calibrated)]
+    if not real or not held:
+        return head
+    which = "" if len(held) == len(head.joints) else f" in {', '.join(held)}"
+    log.warning("head %s is not calibrated%s: 20 %% of its travel, 0.3 of its speed", head.name, which)
+    return held_back(head, held)
+
+
+def identify(
+    head: Head,
+    joints: Collection[str],
+    where: Mapping[str, Chain | str],
+    clock: Clock,
+    kept: dict[str, Port] | None = None,
+) -> dict[str, Identity | None]:
+    """Return the servo that answers for each of `joints`, None if none does. Writes nothing. Raises PortError.
+
+    Ports are closed again, or stay open in `kept`, by bus.
+    """
+    servos: dict[str, Identity | None] = {}
+    for name, bus in head.buses.items():
+        mine = [joint for joint in joints if head.joints[joint].bus == name]
+        if family_named(bus.family).board:
+            servos |= {j: Identity(id=head.joints[j].id, model=head.joints[j].model) for j in mine}
+        elif mine:
+            port = port_of(where[name], bus, clock)()
+            try:
+                wire = Wire(port, bus.family, clock, bus.baud, fixed=True)
+                servos |= {joint: _identity(wire, head.joints[joint]) for joint in mine}
+            finally:
+                if kept is None:
+                    port.close()
+                else:
+                    kept[name] = port
+    return servos
+
+
+def _identity(wire: Wire, joint: Joint) -> Identity | None:
+    seen = wire.ping(joint.id)
+    if seen is None:
+        return None
+    expected = load_firmware_map(joint.model)
+    known = seen.model_number in (None, expected.model_number)
+    table = seen.table if seen.table is not None and seen.model_number != expected.model_number else Table.of(expected)
+    drive_mode = _register(seen, table, "drive_mode")
+    return Identity(
+        id=joint.id,
+        model=joint.model if known else seen.model,
+        firmware=seen.firmware,
+        homing_offset=_register(seen, table, "homing_offset"),
+        drive_mode=None if drive_mode is None else drive_mode & _REVERSED,
+    )
+
+
+def _register(seen: FoundServo, table: Table, name: str) -> int | None:
+    with suppress(ServoError):
+        return seen.read(table.fields[name]) if name in table.fields else None
+    return None
+
+
+# --- the parts between a plan and the bus ---------------------------------------------------------------------------
+
+
 def build_motion(head: Head, rate_hz: float) -> Motion:
-    """Timeline, retargeter, limiter and audit at the rate of the loop, which is that of the head's fastest bus."""
+    """Build the parts for a loop at `rate_hz`, the rate of the head's fastest bus."""
     limits = JointLimits.of(head)
     retargeter = HeadRetargeter(head, 1.0 / rate_hz)
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
@@ -167,19 +247,21 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     holds = np.array([each.halt == "hold" for each in safety])
     holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
     return Motion(
-        PlanTimeline(1.0 / rate_hz),
-        retargeter,
-        JerkLimiter(limits, 1.0 / rate_hz),
-        CommandAudit(limits, calibration_of(head.joints), 1.0 / rate_hz),
-        leads_s,
-        np.array([joint.rest_rad for joint in head.joints.values()]),
-        holds,
-        HeatGuard(np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()),
+        timeline=PlanTimeline(1.0 / rate_hz),
+        retargeter=retargeter,
+        limiter=JerkLimiter(limits, 1.0 / rate_hz),
+        audit=CommandAudit(limits, calibration_of(head.joints), 1.0 / rate_hz),
+        leads_s=leads_s,
+        rest_rad=np.array([joint.rest_rad for joint in head.joints.values()]),
+        holds=holds,
+        heat=HeatGuard(
+            np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()
+        ),
     )
 
 
 def on_boards(head: Head) -> list[str]:
-    """Joints whose servos report no position, so that they jump when they come on."""
+    """Return joints whose servos report no position, so that they jump when they come on."""
     return [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
 
 
@@ -214,18 +296,18 @@ def build_bus(
 
 
 def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[BusServo]:
-    maps = firmware_maps(dict(joints))
+    maps = firmware_maps(joints)
     return [
         BusServo(
-            joint=key,
-            id=j.id,
-            map=maps[j.model],
-            min_rad=j.min_rad,
-            max_rad=j.max_rad,
-            safety=head.safety_of(key),
+            joint=name,
+            id=joint.id,
+            map=maps[joint.model],
+            min_rad=joint.min_rad,
+            max_rad=joint.max_rad,
+            safety=head.safety_of(name),
             doctor=doctor,
         )
-        for key, j in joints.items()
+        for name, joint in joints.items()
     ]
 
 
@@ -242,7 +324,7 @@ def build_one(
 ) -> Any:
     """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
-    check_safety(head, joints, firmware_maps(joints))
+    check_safety(head, joints)
     servos = _bus_servos(head, joints, doctor)
     family = family_named(config.family)
     if family.board:
@@ -265,34 +347,35 @@ def build_one(
     )
 
 
-# --- what a head's file asks of its servos, and whether they can ----------------------------------------------------
+# --- the rules of a head's file that its servos cannot keep ---------------------------------------------------------
 
 
-def check_safety(head: Head, joints: Mapping[str, Joint], maps: Mapping[str, FirmwareMap]) -> None:
-    """Check joints against the maps of their models. A rule that no servo keeps is worse than none.
+def check_safety(head: Head, joints: Mapping[str, Joint]) -> None:
+    """Check joints against the firmware maps of their models. A rule that no servo keeps is worse than none.
 
     Raises ConfigError for a limit that a joint's servo cannot keep, a register that a run must not write, or more
     turns than it makes.
     """
+    maps = firmware_maps(joints)
     for name, joint in joints.items():
-        _limits(head, name, maps[joint.model])
-        _turns(head, name, maps[joint.model])
+        _check_limits(head, name, maps[joint.model])
+        _check_turns(head, name, maps[joint.model])
     check_registers(head.name, {name: (head.safety_of(name), maps[joint.model]) for name, joint in joints.items()})
 
 
-def _limits(head: Head, name: str, table: FirmwareMap) -> None:
+def _check_limits(head: Head, name: str, table: FirmwareMap) -> None:
     safety, joint = head.safety_of(name), head.joints[name]
-    can_limit, can_tell = torque_register(table) is not None, tells_current(table)
-    instead = "; torque_limit_percent limits its torque" if can_limit else ""
+    limits_torque = torque_register(table) is not None
     impossible: dict[str, tuple[float | None, str]] = {}
     if "goal_current" not in table.registers:
+        instead = "; torque_limit_percent limits its torque" if limits_torque else ""
         impossible["current_limit_mA"] = safety.current_limit_mA, f"cannot limit its current{instead}"
-    if not can_limit:
+    if not limits_torque:
         impossible["torque_limit_percent"] = safety.torque_limit_percent, "has no torque limit"
-    if not can_tell:
+    if not tells_current(table):
         for key in ("pinch", "strain"):
             rule = getattr(safety, key)
-            impossible[key] = rule and rule.current_mA, "does not tell its current in mA"
+            impossible[key] = rule and rule.current_mA, "does not report its current in mA"
     for key, (value, why) in impossible.items():
         if value is None:
             continue
@@ -304,7 +387,7 @@ def _limits(head: Head, name: str, table: FirmwareMap) -> None:
         raise ConfigError.at(head.name, f"safety.{key}", value, f"cannot be kept {except_here}")
 
 
-def _turns(head: Head, name: str, table: FirmwareMap) -> None:
+def _check_turns(head: Head, name: str, table: FirmwareMap) -> None:
     """A geared joint may need more than one turn of its servo, and only some models count them."""
     joint, turn = head.joints[name], table.ticks_per_revolution
     ticks = Calibration({name: joint}, np.array([turn]))
@@ -314,15 +397,15 @@ def _turns(head: Head, name: str, table: FirmwareMap) -> None:
     goal = table.registers.get("goal_position")
     if goal is None or not (goal.low <= low and high <= goal.high):
         reach = "one turn" if goal is None or goal.low >= 0 else f"{goal.low}..{goal.high} ticks"
-        raise ConfigError.at(
-            head.name, f"joints.{name}.ratio", joint.ratio,
+        problem = (
             f"needs {low}..{high} ticks of {joint.model}, which makes {reach}: change ratio or range, or take a servo "
-            "with extended position control",
-        )  # fmt: skip
+            "with extended position control"
+        )
+        raise ConfigError.at(head.name, f"joints.{name}.ratio", joint.ratio, problem)
     first, last = home_ticks(turn, JointNeeds(low, high))
     if first > last:
-        raise ConfigError.at(
-            head.name, f"joints.{name}.zero_ticks", joint.zero_ticks,
+        problem = (
             f"leaves no place where {low}..{high} ticks can be told apart after power-up: bring the middle of the "
-            f"range near {table.center_ticks} ticks, or make it less than two turns",
-        )  # fmt: skip
+            f"range near {table.center_ticks} ticks, or make it less than two turns"
+        )
+        raise ConfigError.at(head.name, f"joints.{name}.zero_ticks", joint.zero_ticks, problem)

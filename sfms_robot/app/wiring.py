@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from math import radians
@@ -10,18 +11,19 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.head import load_stored
-from sfms_robot.emulator.launch import Chain, EmulatedServo
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
+from sfms_robot.ports import Bus as BusConfig
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
 from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
-SIM: Final = "sim"
 HANGING: Final = 0.3  # fraction of the way from rest to its lower end, where nothing pulls hard
 BEYOND_RAD: Final = radians(2.0)  # how far a stop lies outside the range of the head's file
 
@@ -29,12 +31,23 @@ Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a ser
 
 
 def devices(head: Head, port: str) -> dict[str, str]:
-    """What `--port` says -> device per named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
+    """Return the device of each named bus. Raises ConfigError, and PortError for `auto` without an adapter."""
     return choose_ports(head.buses, list_ports()) if port == AUTO else parse_ports(head.buses, port)
 
 
+@contextmanager
+def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
+    """Give the place of each bus of the head: emulated servos, which live as long as this does, or devices."""
+    with ExitStack() as stack:
+        if options.port != SIM:
+            yield devices(head, options.port)
+            return
+        chains = plugged_in(options.head, head)
+        yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
+
+
 def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Port]:
-    """Opens the port of a bus, also again after its device was unplugged. Raises PortError."""
+    """Return a function that opens the port of a bus, again after its device was unplugged. Raises PortError."""
     if isinstance(where, str):
         return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
     if where.virtual:
@@ -42,7 +55,7 @@ def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Po
     return partial(SerialPort, where.device, bus.baud, clock)
 
 
-def firmware_maps(joints: dict[str, Joint]) -> dict[str, FirmwareMap]:
+def firmware_maps(joints: Mapping[str, Joint]) -> dict[str, FirmwareMap]:
     return {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
 
 
@@ -53,7 +66,7 @@ def calibration_of(joints: dict[str, Joint]) -> Calibration:
 
 
 def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
-    """Per bus, the servos of a head that was switched off: sagged onto its stops, torque off.
+    """Return, by bus, the servos of a head that was switched off: sagged onto its stops, torque off.
 
     A geared joint hangs where its servo, which counts turns from power-up only, can be in one place of its range.
     """
@@ -77,14 +90,14 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
 
 
 def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
-    """As `emulated`, with what somebody has stored in the servos of head `name` and the supply that they run on.
+    """Return servos as `emulated` does, with the registers and the supply voltage of the emulate.yaml of head `name`.
 
     Raises ConfigError for stored values of a joint that the head does not have.
     """
     stored = load_stored(name)
     for joint in stored.joints:
         if joint not in head.joints:
-            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is no joint of this head", head.joints)
+            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is not a joint of this head", head.joints)
     joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
     return {
         bus: [

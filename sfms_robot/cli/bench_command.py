@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
-import typer
+from typer import Argument, Exit, Option
 
-from sfms_robot.cli.json_line import print_json
+from sfms_robot.cli.show import JSON, print_rows, show
 from sfms_robot.lab.bench import ALL, BENCHES
 
 EPILOG = "\n\n".join(
@@ -24,59 +26,63 @@ class LiveAudio(StrEnum):
 
 
 def bench_names() -> list[str]:
-    """What can be measured."""
+    """Return the names of the benches."""
     return [ALL, *BENCHES]
 
 
 def bench(
-    name: str = typer.Argument(ALL, autocompletion=bench_names, help="What to measure; all: see below."),
-    head: str | None = typer.Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
-    frames: int | None = typer.Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
-    minutes: float | None = typer.Option(
+    name: str = Argument(ALL, autocompletion=bench_names, help="The bench; all: see below."),
+    head: str | None = Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
+    frames: int | None = Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
+    minutes: float | None = Option(
         None, min=0.0, help="For 'fuzz' and 'live': so long; else a million bytes each, 10 min, 30 of torture."
     ),
-    audio: LiveAudio | None = typer.Option(None, help="For 'live': an emulated microphone (the default), or calls."),
-    torture: bool = typer.Option(
-        False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."
-    ),
-    against: Path | None = typer.Option(
+    audio: LiveAudio | None = Option(None, help="For 'live': an emulated microphone (the default), or calls."),
+    torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
+    against: Path | None = Option(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
     ),
-    hours: float | None = typer.Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
-    data: Path | None = typer.Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
-    budget: bool = typer.Option(
+    hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
+    data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
+    budget: bool = Option(
         False, "--budget", help="For 'listener': operations and bytes a frame, counted, and what small computers need."
     ),
-    write: Path | None = typer.Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
-    json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
+    json: bool = JSON,
 ) -> None:
-    """Measure, each figure beside that of a peer in the same run. Exit code 1: something is not as it should be."""
-    from sfms_robot.app.out_files import checked_file
+    """Measure, each figure beside that of a peer in the same run. Exit code 1: a figure misses its limit."""
+    from sfms_robot.app.output_paths import checked_file
     from sfms_robot.lab.bench import run_bench
 
     if write is not None:
         checked_file(write, "--write")
     options = {
-        "head": head, "frames": frames, "minutes": minutes, "audio": audio and audio.value, "torture": torture or None,
-        "against": against, "hours": hours, "data": data, "budget": budget or None,
-    }  # fmt: skip
+        "head": head,
+        "frames": frames,
+        "minutes": minutes,
+        "audio": audio and audio.value,
+        "torture": torture or None,
+        "against": against,
+        "hours": hours,
+        "data": data,
+        "budget": budget or None,
+    }
     began_s = time.monotonic()
-    told = run_bench(name, {key: value for key, value in options.items() if value is not None}, _say)
+    found = run_bench(
+        name,
+        {key: value for key, value in options.items() if value is not None},
+        lambda line: print(line, file=sys.stderr),
+    )
     if write is not None:
         from sfms_robot.lab.bench import performance_page
 
-        performance_page.write(write, told.figures, (time.monotonic() - began_s) / 60)
-    if json:
-        print_json(told.figures)
-    else:
-        from sfms_robot.cli.show import print_rows
+        performance_page.write(write, found.figures, (time.monotonic() - began_s) / 60)
 
-        print_rows(told.table)
-        for line in told.lines:
+    def printed(_: Mapping[str, Any]) -> None:
+        print_rows(found.table)
+        for line in found.lines:
             print(line)
-    if not told.passed:
-        raise typer.Exit(1)
 
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr)
+    show(found.figures, json, printed)
+    if not found.passed:
+        raise Exit(1)

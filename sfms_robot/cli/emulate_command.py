@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import typer
 
-from sfms_robot.cli.json_line import print_json
+from sfms_robot.cli.show import print_json
 
 
 class Timing(StrEnum):

@@ -1,18 +1,20 @@
-"""`sfms-robot evaluate`: what a listener's parts are worth on held-out dyads, and a head's joints on faces."""
+"""`sfms-robot evaluate`: the quality of listeners on held-out dyads, and of heads on recorded faces."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
-import typer
+from typer import BadParameter, Option, Typer
 
-from sfms_robot.cli.data_command import Order
 from sfms_robot.cli.run_command import MAX_SEED
-from sfms_robot.cli.train_command import ORDER, interruptible
+from sfms_robot.cli.show import JSON, print_report, print_rows, say, show
+from sfms_robot.cli.train_command import ORDER, Order, interruptible
 
-app = typer.Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
+app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
 
 class Size(StrEnum):
@@ -38,182 +40,199 @@ class Part(StrEnum):
     test = "test"
 
 
-LISTENER = typer.Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
-JSON = typer.Option(False, "--json", help="Print one JSON object.")
-ENGINES, ENGINE_HELP = "auto|onnx|torch", "What computes the listener; its precision is as its config.yaml says."
-HOP = typer.Option(None, min=1, help="Frames between plans, as a run chooses them; default: what its config.yaml says.")
+LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
+SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
+ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
+HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = typer.Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
-    data: Path | None = typer.Option(
+    table: str | None = Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
+    data: Path | None = Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
-    models: Path | None = typer.Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
-    train: bool = typer.Option(False, "--train", help="Train the table's tokenizers anew, into --models."),
-    size: Size = typer.Option(Size.small, help="Of what is trained; paper: for a GPU."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the size's."),
-    jobs: int = typer.Option(1, min=1, help="Tokenizers trained at once."),
-    plots: Path | None = typer.Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
+    models: Path | None = Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
+    train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
+    size: Size = Option(Size.small, help="Of what is trained; paper: for a GPU."),
+    steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
+    jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
+    plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
-    from sfms_robot.cli.show_learning import print_figures, print_tokenizer_tables, show
 
     if table is None:
         from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
 
         if data is None:
-            raise typer.BadParameter("--data is needed without --table")
-        show(evaluate_tokenizer(listener, data, order.value if order else None), json, print_figures)
+            raise BadParameter("--data is needed without --table")
+        show(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
     from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
 
-    options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
-    show(interruptible(lambda: evaluate_table(options)), json, print_tokenizer_tables)
+    options = TableOptions(
+        table=table, data=data, models=models, train=train, size=size.value, steps=steps, jobs=jobs, plots=plots
+    )
+    show(interruptible(lambda: evaluate_table(options)), json)
 
 
 @app.command("listener")
 def listener_(
-    listener: list[str] = typer.Option(
+    listener: list[str] = Option(
         [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
     ),
-    data: Path = typer.Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
-    table: Table | None = typer.Option(
+    data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
+    table: Table | None = Option(
         None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
     ),
-    samples: int = typer.Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, for --table; all of them."),
-    models: Path | None = typer.Option(
+    samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads, for --table; all of them."),
+    models: Path | None = Option(
         None, help="Folder of the papers' listeners as written, and of ablations; those missing are trained."
     ),
-    config: Path | None = typer.Option(None, help="How ablations are trained; configs/training/arig-as-written.yaml."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of training steps than the file's."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
+    steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
+    seed: int = SEED,
     hop: int | None = HOP,
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.cli.show_learning import print_arig_table, print_figures, print_listener_table, show
     from sfms_robot.lab.evaluate.listener_evaluation import evaluate_listener, listener_table
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
     if table is None:
-        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json, print_figures)
+        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json)
         return
     if of_arig:
         if order is not None or hop is not None:
-            raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
+            raise BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.lab.evaluate.arig_evaluation import AblationOptions, arig_table
 
-        ablations = AblationOptions(models, config, steps)
+        ablations = AblationOptions(models=models, training=config, steps=steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
-        show(found, json, print_arig_table)
+        show(found, json)
         return
     number = int(table.value)
     result = interruptible(
         lambda: listener_table(
-            number, listener, data, samples, clips, seed, order.value if order else None, hop, models, steps
+            number,
+            listener,
+            data,
+            samples,
+            clips,
+            seed,
+            order=order.value if order else None,
+            hop=hop,
+            models=models,
+            steps=steps,
         )
     )
-    show(result, json, print_listener_table)
+    show(result, json)
 
 
 @app.command()
 def papers(
-    data: Path = typer.Option(..., help="Composed dyads."),
-    models: Path | None = typer.Option(
+    data: Path = Option(..., help="Composed dyads."),
+    models: Path | None = Option(
         None, help="Folder of what only tables need; what is missing is trained: hours. Without it: said to be missing."
     ),
-    table: list[str] = typer.Option(
+    table: list[str] = Option(
         [], metavar="1|2|3|4|arig-1|arig-2|arig-4", help="May be given often; all of them if not."
     ),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads a table; all of them."),
-    samples: int = typer.Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
-    steps: int | None = typer.Option(None, min=1, help="Another number of steps than the training files'."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads a table; all of them."),
+    samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
+    steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
+    seed: int = SEED,
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.cli.show_learning import print_paper_table, show
     from sfms_robot.lab.evaluate.papers import EVERY, PapersOptions, evaluate_papers
 
-    options = PapersOptions(data, models, table or EVERY, clips, samples, steps, seed)
-    each = (lambda name, found: None) if json else print_paper_table
-    show(interruptible(lambda: evaluate_papers(options, each)), json, lambda found: None)
+    options = PapersOptions(
+        data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed
+    )
+    each = _quiet if json else _print_paper
+    show(interruptible(lambda: evaluate_papers(options, each)), json, _quiet)
 
 
 @app.command()
 def timing(
     listener: str = LISTENER,
-    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    split: Part = typer.Option(Part.test, help="Whose meetings: test for what is reported, validation to choose by."),
-    allow_training: bool = typer.Option(False, "--allow-training", help="Play people that listeners learned from."),
-    meetings: int | None = typer.Option(None, min=1, help="At most this many, spread over the people; all of them."),
-    minutes: float = typer.Option(
+    data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    split: Part = Option(Part.test, help="People of the meetings: test to report, validation to choose."),
+    allow_training: bool = Option(False, "--allow-training", help="Play people that listeners learned from."),
+    meetings: int | None = Option(None, min=1, help="At most this many, spread over the people; all of them."),
+    minutes: float = Option(
         5.0, min=0.0, help="Of motion, from the middle of each meeting; 0: hazards and decisions alone, in minutes."
     ),
-    seeds: int = typer.Option(8, min=1, help="How often each meeting is played."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of voices, sampling and intervals."),
-    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    seeds: int = Option(8, min=1, help="Number of times that each meeting is played."),
+    seed: int = SEED,
+    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     hop: int | None = HOP,
-    engine: str = typer.Option("torch", metavar=ENGINES, help=ENGINE_HELP),
-    own_voice: bool = typer.Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
+    engine: str = Option("torch", metavar="auto|onnx|torch", help=ENGINE_HELP),
+    own_voice: bool = Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
-    from sfms_robot.app.listen.preflight import engine_named
-    from sfms_robot.cli.show_learning import print_timing, show
+    from sfms_robot.app.options import engine_named
     from sfms_robot.lab.evaluate.meetings import TimingOptions, evaluate_timing
 
-    runs_on = engine_named(engine)
     options = TimingOptions(
-        listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop, runs_on, own_voice
+        listener=listener,
+        data=data,
+        split=split.value,
+        allow_training=allow_training,
+        meetings=meetings,
+        minutes=minutes,
+        seeds=seeds,
+        seed=seed,
+        jobs=jobs,
+        hop=hop,
+        engine=engine_named(engine),
+        own_voice=own_voice,
     )
-    show(evaluate_timing(options), json, print_timing)
+    show(evaluate_timing(options), json)
 
 
 @app.command()
 def robustness(
     listener: str = LISTENER,
-    data: Path | None = typer.Option(
+    data: Path | None = Option(
         None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
     ),
-    split: Part = typer.Option(Part.test, help="Whose voices: test for what is reported, validation to choose by."),
-    speakers: int | None = typer.Option(None, min=1, help="At most this many; everybody of the part."),
-    minutes: float = typer.Option(1.0, min=0.1, help="Of each, in each way."),
-    seeds: int = typer.Option(8, min=1, help="How often each is played."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling, and of what is spoilt."),
-    jobs: int | None = typer.Option(None, min=1, help="Processes; as many as there are cores."),
+    split: Part = Option(Part.test, help="People of the voices: test to report, validation to choose."),
+    speakers: int | None = Option(None, min=1, help="At most this many; all of the part."),
+    minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
+    seeds: int = Option(8, min=1, help="Number of times that each is played."),
+    seed: int = SEED,
+    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
     json: bool = JSON,
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
-    from sfms_robot.cli.show_learning import print_robustness, show
     from sfms_robot.lab.evaluate.unseen_speakers import evaluate_robustness
 
-    found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs)
-    show(found, json, print_robustness)
+    found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs=jobs)
+    show(found, json)
 
 
 @app.command()
 def naturalness(
     listener: str = LISTENER,
-    data: Path = typer.Option(..., help="Composed dyads (`sfms-robot data compose`)."),
-    split: str = typer.Option("test", metavar="validation|test", help="Whose motion it is held against."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
-    drift: float = typer.Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
-    engine: str = typer.Option("auto", metavar=ENGINES, help=ENGINE_HELP),
+    data: Path = Option(..., help="Composed dyads (`sfms-robot data compose`)."),
+    split: str = Option("test", metavar="validation|test", help="People whose motion it is compared with."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
+    drift: float = Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
+    seed: int = SEED,
+    engine: str = Option("auto", metavar="auto|onnx|torch", help=ENGINE_HELP),
     json: bool = JSON,
 ) -> None:
-    """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
-    from sfms_robot.app.listen.preflight import engine_named
-    from sfms_robot.cli.show_learning import show
+    """Compare a listener's motion with that of unseen people: nods, smiles, gaze, sway, and a network's guess."""
+    from sfms_robot.app.options import engine_named
     from sfms_robot.lab.evaluate.naturalness import evaluate_naturalness
 
     show(evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine)), json)
@@ -221,82 +240,110 @@ def naturalness(
 
 @app.command("metrics")
 def metrics_(
-    truth: Path = typer.Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
-    prediction: Path = typer.Option(..., help="Motion to score, likewise; an array may hold K answers, (N, K, T, D)."),
-    speaker: Path | None = typer.Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
-    space: str | None = typer.Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
-    frames: int | None = typer.Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the intervals."),
+    truth: Path = Option(..., help="Recorded motion: array (.npy), face track (CSV), or a folder of tracks."),
+    prediction: Path = Option(
+        ..., help="Motion to score, in the same form; an array may hold K answers, (N, K, T, D)."
+    ),
+    speaker: Path | None = Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
+    space: str | None = Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
+    frames: int | None = Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
+    seed: int = SEED,
     json: bool = JSON,
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
-    from sfms_robot.cli.show_learning import print_figures, show
     from sfms_robot.lab.evaluate.motion_metrics import MetricFiles, evaluate_metrics
 
-    show(evaluate_metrics(MetricFiles(truth, prediction, speaker, space, frames), seed), json, print_figures)
+    show(
+        evaluate_metrics(
+            MetricFiles(truth=truth, prediction=prediction, speaker=speaker, space=space, frames=frames), seed
+        ),
+        json,
+    )
 
 
 @app.command()
 def interaction(
-    listener: str = typer.Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
-    data: Path = typer.Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
-    clips: int | None = typer.Option(None, min=1, help="At most this many dyads of each set; all of them."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling."),
+    listener: str = Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
+    data: Path = Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
+    clips: int | None = Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    seed: int = SEED,
     json: bool = JSON,
 ) -> None:
-    """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
-    from sfms_robot.cli.show_learning import print_interaction, show
+    """Score a listener that speaks: its states against labels, its lips, and the borders of its chunks."""
     from sfms_robot.lab.evaluate.arig_evaluation import evaluate_interaction
 
-    show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
+    show(evaluate_interaction(listener, data, clips, seed), json, _print_interaction)
 
 
 @app.command()
 def people(
-    listener: list[str] = typer.Option(
+    listener: list[str] = Option(
         [], metavar="NAME|DIR|recorded", help="Two or more: listeners, and what the people of --data did."
     ),
-    data: Path | None = typer.Option(
-        None, help="Composed dyads, or any data set with voices; default: bundled voices nobody was trained on."
+    data: Path | None = Option(
+        None,
+        help="Composed dyads, or any data set with voices; default: bundled voices that no listener was trained on.",
     ),
-    voices: int = typer.Option(8, min=1, help="Voices that each listens to."),
-    seconds: float = typer.Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
-    seed: int = typer.Option(1, min=0, max=MAX_SEED, help="Of the sampling, the order and the sides."),
-    out: Path = typer.Option(
-        Path("sfms-people"), metavar="DIR", help="The study: clips and answers; goes on if there."
+    voices: int = Option(8, min=1, help="Voices that each listens to."),
+    seconds: float = Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
+    seed: int = SEED,
+    out: Path = Option(
+        Path("sfms-people"), metavar="DIR", help="The study: clips and answers; continued if it exists."
     ),
-    view: str = typer.Option("auto", metavar="[HOST:]PORT", help="Where the page is; this machine alone unless told."),
-    results: Path | None = typer.Option(None, metavar="FILE.csv", help="Ask nobody: what these answers say."),
+    view: str = Option("auto", metavar="[HOST:]PORT", help="Where the page is; default: this machine alone."),
+    results: Path | None = Option(None, metavar="FILE.csv", help="Serve no page: the table of these answers."),
     json: bool = JSON,
 ) -> None:
     """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
-    from sfms_robot.cli.show_learning import print_preferences, show
     from sfms_robot.lab.evaluate import people_study
 
     if results is not None:
-        show(people_study.table(results), json, print_preferences)
+        show(people_study.table(results), json)
         return
-    options = people_study.StudyOptions(tuple(listener), data, voices, seconds, seed, out)
+    options = people_study.StudyOptions(
+        conditions=tuple(listener), data=data, voices=voices, seconds=seconds, seed=seed, folder=out
+    )
     study = people_study.prepare(options)
+
+    def ask(url: str, taken: int | None) -> None:
+        note = "" if taken is None else f" (port {taken} is taken)"
+        print(f"people answer at {url}{note}; Ctrl-C ends", file=sys.stderr, flush=True)
+
     try:
-        people_study.serve(study, view, _ask)
+        people_study.serve(study, view, ask)
     finally:
-        show(study.results(), json, print_preferences)
-
-
-def _ask(url: str, taken: int | None) -> None:
-    note = "" if taken is None else f" (port {taken} is taken)"
-    print(f"people answer at {url}{note}; Ctrl-C ends", file=sys.stderr, flush=True)
+        show(study.results(), json)
 
 
 @app.command()
 def fidelity(
-    head: list[str] = typer.Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
-    data: Path | None = typer.Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    head: list[str] = Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
+    data: Path | None = Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     json: bool = JSON,
 ) -> None:
     """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
-    from sfms_robot.app.head.fidelity import fidelity as measure
-    from sfms_robot.cli.show_learning import print_figures, show
+    from sfms_robot.app.head.head_check import fidelity as measure
 
-    show(measure(head, data), json, print_figures)
+    show(measure(head, data), json)
+
+
+def _quiet(*_: Any) -> None:
+    """Print nothing."""
+
+
+def _print_paper(name: str, found: Mapping[str, Any]) -> None:
+    """Print one table of `evaluate papers` when it is finished."""
+    say(f"ARIG, table {name.removeprefix('arig-')}" if name.startswith("arig") else f"SFMS, table {name}", "bold")
+    print_report(found)
+
+
+def _print_interaction(result: Mapping[str, Any]) -> None:
+    """Print every figure; then the states, labels down, answers across, in percent of the label."""
+    confusion = result.get("confusion") or {"states": [], "label_by_answer": []}
+    print_report({key: value for key, value in result.items() if key != "confusion"})
+    rows = []
+    for name, counts in zip(confusion["states"], confusion["label_by_answer"], strict=True):
+        total = sum(counts)
+        shares = [f"{100 * count / total:.0f}" if total else "-" for count in counts]
+        rows.append({"label": name, **dict(zip(confusion["states"], shares, strict=True)), "frames": total})
+    print_rows(rows, "answer, % of the label")

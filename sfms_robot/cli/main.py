@@ -18,27 +18,20 @@ import typer
 from sfms_robot import __version__
 from sfms_robot.cli import (
     bench_command,
-    data_command,
-    demo_command,
     emulate_command,
     evaluate_command,
-    export_command,
-    fleet_command,
     head_command,
-    list_commands,
-    replay_command,
+    remote_command,
     run_command,
-    serve_command,
     servo_command,
     train_command,
 )
-from sfms_robot.cli.json_line import print_json
-from sfms_robot.errors import ConfigError, RobotError, optional
+from sfms_robot.cli.show import print_json
+from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, optional
 
 NAME = "sfms-robot"
-INTERRUPTED = 130
 UNEXPECTED = 1
-_COMPLETION = "_SFMS_ROBOT_COMPLETE"  # set by a shell that asks what could come next
+_COMPLETION = "_SFMS_ROBOT_COMPLETE"  # set by a shell that completes a command
 
 app = typer.Typer(
     name=NAME,
@@ -48,23 +41,29 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo_command.demo)
-app.command("run")(run_command.run)
-app.command("serve")(serve_command.serve)
-app.command("export")(export_command.export)
-app.command("replay")(replay_command.replay)
-app.command("emulate")(emulate_command.emulate)
-app.command("doctor")(servo_command.doctor)
+for _name, _command in (
+    ("demo", run_command.demo),
+    ("run", run_command.run),
+    ("serve", remote_command.serve),
+    ("export", train_command.export),
+    ("replay", run_command.replay),
+    ("emulate", emulate_command.emulate),
+    ("doctor", servo_command.doctor),
+):
+    app.command(_name)(_command)
 app.command("bench", epilog=bench_command.EPILOG)(bench_command.bench)
-app.add_typer(fleet_command.app, name="fleet")
-app.add_typer(head_command.app, name="head")
-app.add_typer(list_commands.listener, name="listener")
-app.add_typer(list_commands.speaker, name="speaker")
-app.add_typer(list_commands.port, name="port")
-app.add_typer(servo_command.app, name="servo")
-app.add_typer(data_command.app, name="data")
-app.add_typer(train_command.app, name="train")
-app.add_typer(evaluate_command.app, name="evaluate")
+for _name, _group in (
+    ("fleet", remote_command.app),
+    ("head", head_command.app),
+    ("listener", head_command.listener),
+    ("speaker", head_command.speaker),
+    ("port", head_command.port),
+    ("servo", servo_command.app),
+    ("data", train_command.data_app),
+    ("train", train_command.app),
+    ("evaluate", evaluate_command.app),
+):
+    app.add_typer(_group, name=_name)
 
 
 def _version(wanted: bool) -> None:
@@ -86,8 +85,8 @@ def _common(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; leaves by SystemExit.
 
-    What goes wrong is one line on stderr and an exit code of its own (see `errors`); with --json one object on stdout
-    too, as its last line. A command that already said how it ended leaves by typer.Exit and is not spoken for.
+    An error is a line on stderr and an exit code (see `errors`); with --json also one object, the last line of stdout.
+    A command that has printed its own end leaves by typer.Exit, and nothing is added.
     """
     if _COMPLETION in os.environ:
         app()
@@ -109,18 +108,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """The command is over and its exit code stands: one more Ctrl-C would only make it that of a signal."""
+    """Ignore Ctrl-C after a command, which would replace its exit code by that of a signal."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
 def _endings_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does, so that what a command has open is put right.
+    """Raise KeyboardInterrupt for SIGTERM and SIGHUP as for Ctrl-C, so that a command closes everything it has opened.
 
     Not where they are ignored (nohup) or handled, and only in the main thread: Python gives signals to no other.
-    SIGINT does so also where it is ignored, as a script's shell has it for whatever it starts with `&`: it has to stop
-    who moves a head in every phase.
+    SIGINT is an interrupt also where it is ignored, as for commands that a script starts with `&`: it has to stop a
+    moving head in every phase.
     """
     main_thread = threading.current_thread() is threading.main_thread()
     replaced = {"SIGINT": signal.SIG_IGN, "SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL}
@@ -138,7 +137,7 @@ def _endings_as_interrupts() -> Iterator[None]:
 
 
 def _outcome(words: list[str]) -> tuple[int, str | None]:
-    """Run the command: its exit code, and what went wrong, said on stderr already; None where it told that itself."""
+    """Run the command; return its exit code, and the error that was printed on stderr, None without one."""
     try:
         command = typer.main.get_command(app)
         with command.make_context(NAME, words) as context, optional(_typed(words)):
@@ -151,13 +150,13 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
     except KeyboardInterrupt:
         return INTERRUPTED, "interrupted"
     except (EOFError, typer.Abort):
-        return _said(UNEXPECTED, "there is nobody to answer (stdin ended)")
+        return _said(UNEXPECTED, "no answer to the question: stdin ended")
     except RobotError as error:
         return _said(error.exit_code, str(error))
     except BrokenPipeError as error:
         return UNEXPECTED, str(error)
     except OSError as error:  # a file that a flag names, or a full disk behind stdout
-        logging.getLogger(__name__).info("what led to it", exc_info=True)
+        logging.getLogger(__name__).info("traceback", exc_info=True)
         problem = error.strerror or str(error)
         if error.errno == errno.EMFILE:
             return _said(UNEXPECTED, f"{problem}: raise the limit of the shell (ulimit -n)")
@@ -165,9 +164,9 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
             return _said(UNEXPECTED, problem)
         return _said(ConfigError.exit_code, f"{_flagged(str(error.filename), words)}: {problem}")
     except Exception as error:
-        usage = getattr(error, "show", None)  # of a flag or argument that is none
+        usage = getattr(error, "show", None)  # of an unknown flag or argument
         if usage is None:
-            logging.getLogger(__name__).error("an error that nobody expected", exc_info=True)
+            logging.getLogger(__name__).error("internal error, please report it", exc_info=True)
             return _said(UNEXPECTED, f"{type(error).__name__}: {error}")
         usage()
         return ConfigError.exit_code, str(error.format_message())  # type: ignore[attr-defined]
@@ -175,8 +174,8 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
 
 
 def _completed(words: Sequence[str]) -> list[str]:
-    """The words, with the value that it stands for behind every option that may stand alone and does."""
-    completed = []
+    """Return the words, with a value after each option that may be given without one and is."""
+    completed: list[str] = []
     for word, following in zip(words, [*words[1:], "-"], strict=False):
         completed.append(word)
         if word in run_command.OPTIONAL and following.startswith("-"):
@@ -185,7 +184,7 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 
 def _typed(words: Sequence[str]) -> str:
-    """Return the command that `words` begin with, as it is typed."""
+    """Return the command that `words` begin with, as the user typed it."""
     return " ".join([NAME, *takewhile(lambda word: not word.startswith("-"), words[:2])])
 
 

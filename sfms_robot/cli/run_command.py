@@ -1,175 +1,177 @@
-"""`sfms-robot run`: drive a head."""
+"""`sfms-robot run`, `demo` and `replay`: drive a head, watch one, look at a recorded run."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack, closing
+from collections.abc import Mapping
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from typing import Any
 
-import typer
+from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
-from sfms_robot.cli.json_line import print_json
+from sfms_robot.cli.show import JSON, cell, print_report, say, show
 from sfms_robot.data import head_names, listener_names, speaker_names
+from sfms_robot.errors import ConfigError
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
+DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods, beside a mean of 4.4
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
 OPTIONAL = {
     "--play": "default",
     "--status": "auto",
     "--view": "auto",
-}  # options that may stand alone, and what they mean then
+}  # options that may be given without a value, and the value that they have then
 
 
 def run(
-    head: str = typer.Option(
+    head: str = Option(
         "face28", autocompletion=head_names, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
     ),
-    port: str = typer.Option(
+    port: str = Option(
         "sim",
         rich_help_panel=HEAD,
         help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
     ),
     packages: list[str] = PACKAGES,
-    intensity: list[str] = typer.Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="How far a region goes, 0 to 2; may be repeated."
+    intensity: list[str] = Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of a region's motion, 0 to 2; may be repeated."
     ),
-    style: list[str] = typer.Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="How much of its small motions shows, 0 to 2."
+    style: list[str] = Option(
+        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of its small motions, 0 to 2; may be repeated."
     ),
-    audio: str = typer.Option(
+    audio: str = Option(
         "default",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
         metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, who is in front of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
+        "yours, the visitor of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
     ),
-    face: str = typer.Option(
+    face: str = Option(
         "auto",
         rich_help_panel=PERSON,
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
-        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, who "
-        "is in front of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
+        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, "
+        "the visitor of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
     ),
-    agent_audio: str = typer.Option(
+    agent_audio: str = Option(
         "none",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
-        help="What the robot itself says: a sound file, a device that records the loudspeaker, a shipped speaker, a "
+        help="The robot's own speech: a sound file, a device that records the loudspeaker, a shipped speaker, a "
         "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
-    play: str | None = typer.Option(
+    play: str | None = Option(
         None,
         metavar="[DEVICE]",
         rich_help_panel=PERSON,
         help="Play what the robot says, on a device (by number, name or part of it: `port list`; alone: the default).",
     ),
-    duration: float | None = typer.Option(
+    duration: float | None = Option(
         None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
     ),
-    listener: str = typer.Option(
+    listener: str = Option(
         "sfms-small",
         autocompletion=listener_names,
         rich_help_panel=LISTENER,
         help="Shipped listener, a folder with config.yaml and weights, or zenoh/NAME on a machine that serves it.",
     ),
-    calmness: list[str] = typer.Option(
+    calmness: list[str] = Option(
         [],
         metavar="KIND=PER_MINUTE",
         rich_help_panel=LISTENER,
-        help="How often it does something, as nod=2.2; may be repeated. Default: as often as people do.",
+        help="Events per minute, as nod=2.2; may be repeated. Default: the rates of people.",
     ),
-    addressed: str = typer.Option(
+    addressed: str = Option(
         "sense",
         metavar="sense|assume|never",
         rich_help_panel=LISTENER,
         help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
     ),
-    engine: str = typer.Option(
+    engine: str = Option(
         "auto",
         metavar="auto|onnx|torch",
         rich_help_panel=LISTENER,
-        help="What computes the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
+        help="Engine of the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
     ),
-    seed: int = typer.Option(
+    seed: int = Option(
         0,
         min=0,
         max=MAX_SEED,
         rich_help_panel=LISTENER,
         help="Two seeds listen differently, one seed repeats (with --fast).",
     ),
-    fast: bool = typer.Option(
+    fast: bool = Option(
         False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
     ),
-    record: Path | None = typer.Option(
+    record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
     ),
-    overwrite: bool = typer.Option(
+    overwrite: bool = Option(
         False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
     ),
-    json: bool = typer.Option(
-        False, "--json", rich_help_panel=OUTPUT, help="Print the report as one JSON object, last line of stdout."
+    json: bool = JSON,
+    check: bool = Option(
+        False, "--check", rich_help_panel=PERSON, help="Judge the sound of --audio for 3 s; no servo moves."
     ),
-    check: bool = typer.Option(
-        False, "--check", rich_help_panel=PERSON, help="Say how good the sound of --audio is, for 3 s; no servo moves."
-    ),
-    status: str | None = typer.Option(
+    status: str | None = Option(
         None,
         metavar="[PORT]",
         rich_help_panel=OUTPUT,
-        help="Serve how the run is as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
+        help="Serve the status as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
-    view: str | None = typer.Option(
+    view: str | None = Option(
         None,
         metavar="[[HOST:]PORT]",
         rich_help_panel=OUTPUT,
         help="Serve a page that shows the run, and works it (alone: 127.0.0.1:8780, or the next port that is free).",
     ),
-    view_cert: Path | None = typer.Option(
+    view_cert: Path | None = Option(
         None, metavar="FILE", rich_help_panel=OUTPUT, help="Serve it by https, which a phone's microphone needs: PEM."
     ),
-    view_key: Path | None = typer.Option(
+    view_key: Path | None = Option(
         None, metavar="FILE", rich_help_panel=OUTPUT, help="The key of that certificate: PEM."
     ),
-    fleet: str | None = typer.Option(
+    fleet: str | None = Option(
         None,
         metavar="NAME",
         rich_help_panel=OUTPUT,
-        help="Tell a fleet how the run is, as NAME, and obey it: docs/remote.md.",
+        help="Join a fleet as NAME, which sees the run and may halt it: docs/remote.md.",
     ),
-    zenoh: Path | None = typer.Option(
+    zenoh: Path | None = Option(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
         help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
     ),
-    insecure: bool = typer.Option(
+    insecure: bool = Option(
         False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
     ),
-    fleet_key: Path | None = typer.Option(
+    fleet_key: Path | None = Option(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
-        help="Key that --fleet asks of whoever resumes or ends the run; made where there is none yet.",
+        help="Key of the fleet, needed to resume or end the run; made if there is none yet.",
     ),
-    dry_run: bool = typer.Option(
+    dry_run: bool = Option(
         False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
     ),
-    yes: bool = typer.Option(
+    yes: bool = Option(
         False,
         "--yes",
         rich_help_panel=SAFETY,
         help="Hobby servos may jump when they come on: they report no position to begin from.",
     ),
-    halt_on: str | None = typer.Option(
+    halt_on: str | None = Option(
         None,
         metavar="FILE|/dev/gpiochipN:LINE",
         rich_help_panel=SAFETY,
         help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
     ),
-    without: list[str] = typer.Option(
+    without: list[str] = Option(
         [],
         metavar="JOINT",
         rich_help_panel=SAFETY,
@@ -177,37 +179,58 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.listen.preflight import begin_listening, begin_page, check_names, engine_named
+    from sfms_robot.app.options import RunOptions, begin_listening, begin_page, check_names, engine_named
 
-    check_names(head, listener, port, audio, face, agent_audio, play, status)
-    runs_on = engine_named(engine)
     calm = None
     if calmness or addressed != "sense":
         from sfms_robot.app.listen.knobs import calmed
 
         calm = calmed(calmness, addressed)
+    options = RunOptions(
+        head=head,
+        port=port,
+        fast=fast,
+        yes=yes,
+        without=tuple(without),
+        listener=listener,
+        audio=audio,
+        face=face,
+        agent_audio=agent_audio,
+        play=play,
+        duration_s=duration,
+        seed=seed,
+        engine=engine_named(engine),
+        intensity=tuple(intensity),
+        style=tuple(style),
+        calmness=calm,
+        record=record,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        halt_on=halt_on,
+        status=status,
+        fleet=fleet,
+        fleet_key=fleet_key,
+        zenoh=zenoh,
+        insecure=insecure,
+        packages=tuple(packages),
+    )
+    check_names(options)
     if check:
-        _check(audio, duration, json)
+        from sfms_robot.app.listen.sound_check import LevelMeter, check_sound
+
+        with LevelMeter() as meter:
+            found = check_sound("mic" if audio == "default" else audio, duration, None if json else meter)
+        show(found, json)
         return
     with ExitStack() as stack:
-        # The listener loads from here on, in a process of its own, while this one imports what drives a head.
-        page = begin_page(view, view_cert, view_key, audio=audio, face=face, fast=fast, dry_run=dry_run)
+        # The listener loads from here on, in its own process, while this one imports the parts that drive a head.
+        page = begin_page(view, view_cert, view_key, options=options)
         if page is not None:
             stack.enter_context(closing(page))
-        feed = (
-            None
-            if fast or dry_run
-            else stack.enter_context(closing(begin_listening(listener, seed, calm, zenoh, runs_on, insecure)))
-        )
+        feed = None if fast or dry_run else stack.enter_context(closing(begin_listening(options)))
         from sfms_robot.app import session
         from sfms_robot.app.listen.panel import live_panel
-        from sfms_robot.cli import show  # before the run: afterwards there may be no descriptor to import it with
 
-        options = session.RunOptions(
-            head, port, listener, audio, face, agent_audio, duration, fast, seed, record, overwrite, dry_run, yes,
-            tuple(intensity), tuple(style), tuple(without), halt_on, status, calm, play, fleet, zenoh, runs_on,
-            packages=tuple(packages), insecure=insecure, fleet_key=fleet_key,
-        )  # fmt: skip
         panel = None if json else live_panel
         if page is None:
             report = session.run(options, panel, feed=feed)
@@ -215,24 +238,153 @@ def run(
             from sfms_robot.app.listen.page_session import page_session
 
             report = stack.enter_context(page_session(page, options)).run(panel, feed)
-    if json:
-        print_json(report)
-    elif dry_run:
-        show.print_dry_run(report)
-    else:
-        show.print_run(report, record)
-    if report.get("error"):
-        print(f"sfms-robot: {report['error']}", file=sys.stderr)
-    raise typer.Exit(report.get("exit_code", 0))
+    show(report, json, None if dry_run else _print_run)
 
 
-def _check(audio: str, duration_s: float | None, json: bool) -> None:
-    from sfms_robot.app.listen.sound_check import CHECK_S, check_sound
-    from sfms_robot.cli.show import LevelMeter, print_sound_check
+def _print_run(report: Mapping[str, Any]) -> None:
+    """Print the report of a run on one screen."""
+    motion, limits, bus = report["motion"], report["limits"], report["bus"]
+    tick, latency, step = report["tick"], report["latency_ms"], report["listener_step_ms"]
+    rate = f"in virtual time, {tick['target_hz']:g} a second"
+    if tick["achieved_hz"] is not None:
+        rate = f"at {tick['achieved_hz']:.4g} Hz of {tick['target_hz']:g}, {tick['late']} late, jitter p99 "
+        rate += f"{cell(tick['jitter_ms']['p99'])} ms"
+    facts = {
+        "face": f"{motion['nods']} nods, {motion['blinks']} blinks, {motion['smiles']} smiles",
+        "ticks": f"{report['ticks']} {rate}",
+        "latency": f"frame to wire p50 {cell(latency['frame_to_wire']['p50'])} ms, "
+        f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
+        "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
+        "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
+        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, silent: {cell(bus['silent'])}",
+    }
+    if "recording" in report:
+        facts["recording"] = f"{report['recording']['bytes'] * 1e-6:.1f} MB"
+    if report["torque_unconfirmed"]:
+        facts["torque"] = f"NOT confirmed off: {cell(report['torque_unconfirmed'])}"
+    say(f"{report['head']} listened for {report['duration_s']:g} s ({report['exit']})", "bold")
+    print_report(facts)
+    if report.get("priority", "").startswith("refused"):
+        say(f"real-time priority {report['priority']}", "dim")
+    if "recording" not in report:
+        say("To see it: add --record DIR, then `sfms-robot replay DIR --plot run.png --sheet head.png`.", "dim")
 
-    with LevelMeter() as meter:
-        told = check_sound("mic" if audio == "default" else audio, duration_s or CHECK_S, None if json else meter)
-    if json:
-        print_json(told)
+
+def demo(
+    head: str = Option("face28", autocompletion=head_names, help="Shipped head, or a folder with a head.yaml."),
+    listener: str = Option("sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder."),
+    seed: int = Option(DEMO_SEED, min=0, max=MAX_SEED, help="Two seeds listen differently."),
+    duration: float | None = Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
+    fast: bool = Option(False, "--fast", help="Virtual time: as fast as it goes."),
+    out: Path | None = Option(
+        None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
+    ),
+    overwrite: bool = Option(False, "--overwrite", help="Replace the recording that --out holds."),
+    seeds: int | None = Option(
+        None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
+    ),
+    view: str | None = Option(
+        None,
+        metavar="[[HOST:]PORT]",
+        help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
+    ),
+    no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
+    json: bool = JSON,
+) -> None:
+    """A recorded person talks, an emulated head listens; a page shows it, or two pictures without a visitor."""
+    from sfms_robot.app.options import RunOptions, begin_page, check_names
+
+    options = RunOptions(
+        head=head,
+        listener=listener,
+        seed=seed,
+        duration_s=duration,
+        fast=fast or seeds is not None,
+        overwrite=overwrite,
+    )
+    check_names(options)
+    served = not (no_view or options.fast or json)
+    with ExitStack() as stack:
+        page = begin_page(view or ("auto" if served else None), options=options)
+        if page is not None:
+            stack.enter_context(closing(page))
+        from sfms_robot.app.listen import demo as app
+        from sfms_robot.app.listen.panel import live_panel
+
+        if seeds is not None:
+            found = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
+        else:
+            found = app.demo(options, out, None if json else live_panel, page)
+    show(found, json, _print_demo)
+
+
+def _print_demo(found: Mapping[str, Any]) -> None:
+    """Print what a demo showed, or the statistics of several seeds."""
+    if "runs" in found:
+        nods = found["nods"]
+        scatter = f"variance over mean {cell(nods['variance_over_mean'])}"
+        print(f"nods: {nods['mean']:g} in the mean, {scatter}, {nods['seeds_without']} seeds without")
         return
-    print_sound_check(told)
+    print(_line(found))
+    print(f"look at {' and '.join(found['pictures'])}" if found["pictures"] else f"recorded in {found['folder']}")
+    if found["missing"]:
+        print(found["missing"], file=sys.stderr)
+
+
+def _line(seen: Mapping[str, Any]) -> str:
+    return (
+        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): {seen['nods']} nods, "
+        f"{seen['blinks']} blinks, {seen['smiles']} smiles, {seen['neck_travel_deg']:.0f} degrees of neck travel"
+    )
+
+
+def replay(
+    folder: Path = Argument(..., metavar="DIR", help="Folder that `sfms-robot run --record` wrote."),
+    plot: Path | None = Option(
+        None, help="PNG: states and events, voice, head pose, six face channels, joint angles over time."
+    ),
+    sheet: Path | None = Option(None, help="PNG: the virtual head and the robot at twelve instants of the run."),
+    port: str | None = Option(
+        None, help="Drive a head with the recorded face: 'sim', 'auto', a device, or NAME=DEVICE per bus."
+    ),
+    head: str | None = Option(None, autocompletion=head_names, help="With --port: another head than the recorded one."),
+    fast: bool = Option(False, "--fast", help="With --port sim: virtual time."),
+    yes: bool = Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
+    view: str | None = Option(
+        None, metavar="[[HOST:]PORT]", help="Put it on a page, to be played there (alone: 127.0.0.1:8780)."
+    ),
+    json: bool = JSON,
+) -> None:
+    """Draw a recorded run, drive a head with it, or summarise it."""
+    if view is not None and port is not None:
+        raise ConfigError("--view shows a recording, --port drives a head with it: one at a time")
+    if port is None and (head is not None or fast or yes):
+        raise ConfigError("--head, --fast and --yes are of a head that is driven: add --port (sim, or a device)")
+    from sfms_robot.app.replay.pictures import replay_run
+
+    found = replay_run(folder, plot, sheet)
+    if port is not None:
+        from sfms_robot.app.listen.panel import live_panel
+        from sfms_robot.app.replay.play_back import play_back
+
+        panel = None if json else live_panel
+        found = {**play_back(folder, panel, head=head, port=port, fast=fast, yes=yes), "recording": found}
+    if view is not None:
+        _view(folder, view)
+    show(found, json)
+
+
+def _view(folder: Path, view: str) -> None:
+    """Serve a recording on a page until all visitors have left, or Ctrl-C."""
+    from sfms_robot.app.options import begin_page, open_browser
+    from sfms_robot.app.replay.play_back import show_recording, wait_for_visitors
+
+    page = begin_page(view)
+    assert page is not None
+    with closing(page):
+        page.wait()
+        show_recording(folder, page)
+        print(f"page: {page} (Ctrl-C ends it)", file=sys.stderr)
+        open_browser(page.url)
+        with suppress(KeyboardInterrupt):
+            wait_for_visitors(page)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfms_robot.cli.json_line import print_json
+from sfms_robot.cli.show import print_json
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:

@@ -1,21 +1,36 @@
-"""`sfms-robot train`: the two phases of a listener, and when it does what."""
+"""`sfms-robot data`, `train` and `export`: training data, the phases of a listener, and its networks without torch."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.data_command import Order
-from sfms_robot.errors import ConfigError
+from sfms_robot.cli.show import JSON, cell, print_rows, say, show
+from sfms_robot.data import listener_names
+from sfms_robot.errors import INTERRUPTED, ConfigError
 
-INTERRUPTED = 130
+if TYPE_CHECKING:
+    from sfms_robot.lab.train.train_runs import TrainOptions
 
-app = typer.Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
+app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
+data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
+
+_SHOWN = 3  # names of a problem; --json has them all
+_LAYOUTS = (
+    "composed, l2l, lm_listener, react, react2025, dualtalk, dualtalk_arkit, dim, vico, seamless; "
+    "default: found automatically."
+)
+
+
+class Order(StrEnum):
+    exp_first = "exp-first"
+    pose_first = "pose-first"
 
 
 class Placement(StrEnum):
@@ -31,23 +46,25 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
-CONFIG = typer.Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = typer.Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
-OUT = typer.Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
-RESUME = typer.Option(False, "--resume", help="Go on from the checkpoint in --out, with the same settings and data.")
-OVERWRITE = typer.Option(False, "--overwrite", help="Train anew although --out holds an earlier training.")
-DEVICE = typer.Option(Device.auto, help="auto: the GPU if there is one.")
-STEPS = typer.Option(None, min=1, help="Another number of steps than the file's.")
-TENSORBOARD = typer.Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
-ORDER = typer.Option(None, help="Order of the channels in the files, if not their layout's own.")
-ACCUMULATE = typer.Option(
+CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
+DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
+OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
+RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
+OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
+DEVICE = Option(Device.auto, help="auto: the GPU if there is one.")
+STEPS = Option(None, min=1, help="Another number of steps than the file's.")
+TENSORBOARD = Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
+ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
+ACCUMULATE = Option(
     None, min=1, help="Pieces of a step's batch that each process takes one after the other; saves memory."
 )
-SCRATCH = typer.Option(None, help="Folder for frames that are read from disk as they are drawn, not held in memory.")
-DRY_RUN = typer.Option(
+SCRATCH = Option(None, help="Folder for frames that are read from disk as they are drawn, not held in memory.")
+DRY_RUN = Option(
     False, "--dry-run", help="One step of every stage on made-up frames, and what all of it would take; no data needed."
 )
-JSON = typer.Option(False, "--json", help="Print the figures as one JSON object.")
+
+
+# --- train ------------------------------------------------------------------------------------------------------------
 
 
 @app.command()
@@ -59,7 +76,7 @@ def tokenizer(
     overwrite: bool = OVERWRITE,
     device: Device = DEVICE,
     steps: int | None = STEPS,
-    placement: Placement | None = typer.Option(None, help="Another keyframe placement than the file's, to compare."),
+    placement: Placement | None = Option(None, help="Another keyframe placement than the file's, to compare."),
     tensorboard: bool | None = TENSORBOARD,
     order: Order | None = ORDER,
     accumulate: int | None = ACCUMULATE,
@@ -68,18 +85,25 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    if dry_run:
-        _show_dry_run(config, json)
-        return
-    from sfms_robot.lab.train.train_runs import TrainOptions, train_tokenizer
+    from sfms_robot.lab.train.train_runs import train_tokenizer
 
-    data, out = _both(data, out)
-    placed = placement.value if placement else None
-    options = TrainOptions(
-        config, data, out, resume, device.value, steps, placed, tensorboard, order.value if order else None, overwrite,
-        accumulate, scratch,
-    )  # fmt: skip
-    _show(interruptible(lambda: train_tokenizer(options)), json)
+    _train(
+        train_tokenizer,
+        dry_run,
+        json,
+        file=config,
+        data=data,
+        out=out,
+        resume=resume,
+        device=device.value,
+        steps=steps,
+        placement=placement.value if placement else None,
+        tensorboard=tensorboard,
+        order=order.value if order else None,
+        overwrite=overwrite,
+        accumulate=accumulate,
+        scratch=scratch,
+    )
 
 
 @app.command()
@@ -99,68 +123,57 @@ def listener(
     json: bool = JSON,
 ) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
+    from sfms_robot.lab.train.train_runs import train_listener
+
+    _train(
+        train_listener,
+        dry_run,
+        json,
+        file=config,
+        data=data,
+        out=out,
+        resume=resume,
+        device=device.value,
+        steps=steps,
+        tensorboard=tensorboard,
+        order=order.value if order else None,
+        overwrite=overwrite,
+        accumulate=accumulate,
+        scratch=scratch,
+    )
+
+
+def _train(
+    work: Callable[[TrainOptions], dict[str, Any]],
+    dry_run: bool,
+    json: bool,
+    *,
+    file: Path,
+    data: Path | None,
+    out: Path | None,
+    **options: Any,
+) -> None:
+    """Run a phase of training, or one step of every phase, and print its figures."""
     if dry_run:
-        _show_dry_run(config, json)
+        from sfms_robot.config import load_training
+        from sfms_robot.lab.train.dry_run import dry_run as estimate
+
+        show(estimate(load_training(file)), json)
         return
-    from sfms_robot.lab.train.train_runs import TrainOptions, train_listener
+    from sfms_robot.lab.train.train_runs import TrainOptions
 
-    data, out = _both(data, out)
-    options = TrainOptions(
-        config, data, out, resume, device.value, steps, None, tensorboard, order.value if order else None, overwrite,
-        accumulate, scratch,
-    )  # fmt: skip
-    _show(interruptible(lambda: train_listener(options)), json)
-
-
-@app.command()
-def events(
-    data: Path = typer.Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    out: Path | None = typer.Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
-    all_series: bool = typer.Option(
-        False, "--all-series", help="Learn from everybody, to compare; what comes out was taught on test."
-    ),
-    seed: int = typer.Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
-    json: bool = JSON,
-) -> None:
-    """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
-    from sfms_robot.cli.show_learning import print_figures, show
-    from sfms_robot.lab.train.event_training import train_events
-
-    show(interruptible(lambda: train_events(data, out, all_series, seed)), json, print_figures)
-
-
-@app.command()
-def idle(
-    listener: str = typer.Option(..., metavar="NAME|DIR", help="One that is told of events, trained."),
-    data: Path = typer.Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
-    clips: int = typer.Option(12, min=1, help="Dyads of training that it listens to."),
-    seed: int = typer.Option(1, min=0, help="Of what it draws."),
-    json: bool = JSON,
-) -> None:
-    """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
-    from sfms_robot.cli.show_learning import show
-    from sfms_robot.lab.train.idle_training import train_idle
-
-    show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
-
-
-def _both(data: Path | None, out: Path | None) -> tuple[Path, Path]:
-    """Where from and where to, which everything but a dry run needs. Raises ConfigError."""
     if data is None or out is None:
         raise ConfigError(f"{'--data' if data is None else '--out'} is missing; only --dry-run goes without")
-    return data, out
-
-
-def _show_dry_run(config: Path, json: bool) -> None:
-    from sfms_robot.cli.show_learning import print_dry_run, show
-    from sfms_robot.config import load_training
-    from sfms_robot.lab.train.dry_run import dry_run
-
-    show(dry_run(load_training(config)), json, print_dry_run)
+    figures = interruptible(lambda: work(TrainOptions(file=file, data=data, out=out, **options)))
+    if not figures:  # of a process that is not the first of its group
+        return
+    if figures["resumed_at"] == figures["steps"]:
+        print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
+    show(figures, json)
 
 
 def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Ctrl-C says how to go on, where there is something to go on from."""
+    """Return the figures of a training; Ctrl-C ends the process, and prints how to continue if it can be continued."""
     try:
         return train()
     except KeyboardInterrupt as stopped:
@@ -168,11 +181,165 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         sys.exit(INTERRUPTED)
 
 
-def _show(figures: Mapping[str, Any], json: bool) -> None:
-    from sfms_robot.cli.show_learning import show
+@app.command()
+def events(
+    data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
+    out: Path | None = Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
+    all_series: bool = Option(
+        False, "--all-series", help="Learn from all people, to compare; the result has seen the test set."
+    ),
+    seed: int = Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
+    json: bool = JSON,
+) -> None:
+    """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
+    from sfms_robot.lab.train.event_training import train_events
 
-    if not figures:  # of a process that is not the first of its group
-        return
-    if figures["resumed_at"] == figures["steps"]:
-        print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
-    show(figures, json)
+    show(interruptible(lambda: train_events(data, out, all_series, seed)), json)
+
+
+@app.command()
+def idle(
+    listener: str = Option(..., metavar="NAME|DIR", help="One that follows events, trained."),
+    data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
+    clips: int = Option(12, min=1, help="Dyads of training that it listens to."),
+    seed: int = Option(1, min=0, help="Of what it draws."),
+    json: bool = JSON,
+) -> None:
+    """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
+    from sfms_robot.lab.train.idle_training import train_idle
+
+    show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
+
+
+# --- data -------------------------------------------------------------------------------------------------------------
+
+
+@data_app.command()
+def compose(
+    data: Path = Option(..., help="Folder with ami_listener_annotations/ and, if at hand, more voices."),
+    out: Path = Option(..., help="Folder to write train/, validation/ and test/ into."),
+    minutes: float = Option(
+        240.0, min=1.0, help="Minutes of training dyads; all that the tables give if they give less."
+    ),
+    seed: int = Option(1, min=0, help="One seed composes the same dyads."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace the dyads that --out holds."),
+    json: bool = JSON,
+) -> None:
+    """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
+    from sfms_robot.lab.train.datasets import compose_dyads
+
+    show(compose_dyads(data, out, minutes, seed, overwrite), json)
+
+
+@data_app.command()
+def check(
+    folder: Path = Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
+    layout: str = Option("auto", help=_LAYOUTS),
+    order: Order | None = ORDER,
+    window: int = Option(0, min=0, help="Frames that a clip must have."),
+    channels: bool = Option(False, "--channels", help="Show the range of every channel."),
+    json: bool = JSON,
+) -> None:
+    """Read a whole data set once: its contents, and everything that is wrong with it."""
+    from sfms_robot.lab.train.datasets import check_data
+
+    report = check_data(folder, layout, order.value if order else None, window)
+    show(report, json, partial(_print_data, channels=channels))
+    if not report["usable"]:
+        raise Exit(2)
+
+
+@data_app.command()
+def convert(
+    folder: Path = Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
+    out: Path = Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
+    layout: str = Option("auto", help=_LAYOUTS),
+    order: Order | None = ORDER,
+    flame_matrix: Path | None = Option(
+        None, help="FLAME coefficients of every ARKit blendshape (.npy, .csv): shows the expression of deca56 data."
+    ),
+    flame_order: str = Option("alphabetical", help="Order of the matrix's rows: alphabetical, apple, ..."),
+    json: bool = JSON,
+) -> None:
+    """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
+    from sfms_robot.lab.train.data_conversion import convert_data
+
+    converted = convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order)
+    show(converted, json)
+
+
+def _print_data(report: Mapping[str, Any], channels: bool) -> None:
+    """Print splits, their problems, and if wanted the range of every channel."""
+    order = f", {report['order']}" if report["order"] else ""
+    splits, first = report["splits"], report["splits"][0]
+    say(report["folder"])
+    if report["licence"]:
+        say(f"licence: {report['licence']}")
+    rows = [
+        {
+            **{name: split[name] for name in ("split", "clips", "minutes")},
+            "frames": _span(split["frames"]),
+            "listening": None if split["listening_share"] is None else f"{split['listening_share']:.0%}",
+            **{name: cell(split[name]) for name in ("sound", "features")},
+        }
+        for split in splits
+    ]
+    print_rows(rows, f"{report['layout']}{order}: {first['space']} at {first['fps']:g} fps")
+    for split in splits if channels else ():
+        figures = ("min", "max", "mean", "std")
+        rows = [{"channel": row["name"], **{key: row[key] for key in figures}} for row in split["channels"]]
+        print_rows(rows, f"{split['split']}: the listeners' motion")
+    problems = [
+        {
+            "split": split["split"],
+            "problem": problem["kind"],
+            "count": problem["count"],
+            "where": cell(problem["names"][:_SHOWN]) + (", ..." if problem["count"] > _SHOWN else ""),
+            "first": problem["first"],
+        }
+        for split in splits
+        for problem in split["problems"]
+    ]
+    print_rows(problems, "left out, or wrong")
+    for note in dict.fromkeys(note for split in splits for note in split["notes"]):
+        say(note, "dim")
+    for split in splits:
+        if split["speaker_unknown_frames"]:
+            say(f"{split['split']}: the speaker's face is unknown in {split['speaker_unknown_frames']} frames", "dim")
+    say("usable" if report["usable"] else "not usable")
+
+
+def _span(frames: Mapping[str, float] | None) -> str:
+    if frames is None:
+        return "-"
+    return f"{frames['min']:g}" if frames["min"] == frames["max"] else f"{frames['min']:g}-{frames['max']:g}"
+
+
+# --- export -----------------------------------------------------------------------------------------------------------
+
+
+def export(
+    listener: str = Argument(
+        ..., autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml."
+    ),
+    out: Path | None = Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
+    int8: bool = Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
+    weight_bits: int | None = Option(
+        None, "--weight-bits", metavar="8|16|32", help="Also write the weights, in so many bits. Default: leave them."
+    ),
+    json: bool = JSON,
+) -> None:
+    """Write a listener's networks as ONNX graphs, which run without torch. Takes a minute.
+
+    They hold no weights: trained again for the same configuration, a listener needs no new ones. In 8 bits weights take
+    a quarter of the room; every engine computes with them as real numbers.
+    """
+    from sfms_robot.app.graph_export import export_listener
+
+    files = export_listener(listener, out, int8, weight_bits)
+
+    def printed(_: Mapping[str, Any]) -> None:
+        for file in files:
+            print(f"{file.stat().st_size / 1000:8.1f} kB  {file}")
+
+    show({"listener": listener, "int8": int8, "files": [str(file) for file in files]}, json, printed)

@@ -1,8 +1,9 @@
-"""How the virtual head is drawn, off-screen, by vtk (extra `pictures`)."""
+"""Pictures of the virtual head and of a robot's URDF, drawn off-screen by vtk (extra `pictures`)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, optional
-from sfms_robot.face.human import HumanHead, grid_triangles, load_human
+from sfms_robot.face.human import HumanHead, collar, load_human
+from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.face.urdf import Visual
 from sfms_robot.frames import Doubles, Floats
 
 INK: Final = (0.16, 0.17, 0.20)
@@ -20,12 +23,21 @@ ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
 SIZE_PX: Final = (640, 480)
 _EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
 _COLLAR: Final = (0.23, 0.29, 0.36)
+_ROUND: Final = 48  # corners of a circle
+_DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
+_ANGLE_DEG: Final = 24.0
+_ROOM: Final = 1.12  # of a picture, by what it shows
+_LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
+_READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
 
 Point = Sequence[float] | Doubles  # x, y, z
 
 
 def load_vtk() -> Any:
-    """The parts of vtk that are used. Importing the whole takes a second more. Raises MissingExtra without it."""
+    """Return the parts of vtk that are used, as one object. Importing all of vtk takes a second more.
+
+    Raises MissingExtra without it.
+    """
     with optional("a picture of the head"):
         import vtkmodules.vtkRenderingFreeType
         import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
@@ -37,7 +49,7 @@ def load_vtk() -> Any:
             vtkRenderingCore,
         )
         from vtkmodules.util import numpy_support
-    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # no display is no warning
+    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # not of a missing display
     names: dict[str, Any] = {"arrays": numpy_support}
     for module in (vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore):
         names |= {name.removeprefix("vtk"): getattr(module, name) for name in dir(module) if name.startswith("vtk")}
@@ -62,15 +74,16 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
     """Add the head at one instant, its collar and three lights."""
-    skin = _actor(vtk, head.vertices(motion), head.triangles)
+    skin = _mesh_actor(vtk, head.vertices(motion), head.triangles)
     colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
     skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
     skin.GetProperty().SetSpecular(0.12)
     skin.GetProperty().SetSpecularPower(18)
     renderer.AddActor(skin)
-    collar = _actor(vtk, *_collar())
-    collar.GetProperty().SetColor(*_COLLAR)
-    renderer.AddActor(collar)
+    worn = collar()
+    neck = _mesh_actor(vtk, worn.vertices, worn.triangles)
+    neck.GetProperty().SetColor(*_COLLAR)
+    renderer.AddActor(neck)
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
         add_light(vtk, renderer, place, (0, 0, 0), strength)
 
@@ -108,8 +121,8 @@ def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
     renderer.ResetCameraClippingRange()
 
 
-def _actor(vtk: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Any:
-    """A smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
+def _mesh_actor(vtk: Any, vertices: Floats | Doubles, triangles: NDArray[np.int64]) -> Any:
+    """Return a smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
     mesh, points, cells = vtk.PolyData(), vtk.Points(), vtk.CellArray()
     points.SetData(vtk.arrays.numpy_to_vtk(np.ascontiguousarray(vertices, dtype=np.float32), deep=True))
     corners = np.ascontiguousarray(triangles, dtype=np.int64).ravel()
@@ -130,28 +143,6 @@ def _actor(vtk: Any, vertices: Floats, triangles: NDArray[np.int64]) -> Any:
     actor.SetMapper(mapper)
     actor.GetProperty().SetInterpolationToPhong()
     return actor
-
-
-def _collar(around: int = 64) -> tuple[Floats, NDArray[np.int64]]:
-    """A roll-neck that hides the cut edge of the neck: rings of centre x, height z, half width, half depth."""
-    rings = (
-        (-0.012, -0.100, 0.050, 0.046),
-        (-0.012, -0.084, 0.054, 0.051),
-        (-0.012, -0.082, 0.059, 0.056),
-        (-0.012, -0.090, 0.064, 0.061),
-        (-0.012, -0.112, 0.066, 0.063),
-        (-0.014, -0.124, 0.078, 0.066),
-        (-0.018, -0.140, 0.125, 0.078),
-        (-0.020, -0.165, 0.190, 0.090),
-        (-0.020, -0.250, 0.215, 0.095),
-    )
-    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    # The neck leans forward: the rim is lower in front than behind.
-    points = [
-        np.stack([x + depth * np.cos(angle), width * np.sin(angle), z - 0.012 * np.cos(angle)], axis=1)
-        for x, z, width, depth in rings
-    ]
-    return np.concatenate(points).astype(np.float32), grid_triangles(len(rings), around)
 
 
 def save(vtk: Any, window: Any, file: Path | str) -> None:
@@ -202,3 +193,136 @@ class VirtualWebcam:
         wide, high = self._window.GetSize()
         flat = vtk.arrays.vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
         return np.ascontiguousarray(flat.reshape(high, wide, 3)[::-1])
+
+
+# --- robots -----------------------------------------------------------------------------------------------------------
+
+
+def render_robots(
+    file: Path | str,
+    robots: Sequence[tuple[str, RobotScene, Doubles]],
+    columns: int = 1,
+    size_px: tuple[int, int] = (640, 640),
+) -> None:
+    """Draw scenes with joint values (U,), each with its name below if it has one, as one PNG.
+
+    Raises ConfigError for a mesh that cannot be read, MissingExtra without vtk.
+    """
+    vtk = load_vtk()
+    rows, (wide, high), caption = -(-len(robots) // columns), size_px, 26 if any(name for name, *_ in robots) else 0
+    size = (columns * wide, rows * (high + caption))
+    window = open_window(vtk, size)
+    paper = add_renderer(vtk, window, (0, 0, 1, 1), BACKGROUND)
+    for index, (name, scene, values) in enumerate(robots):
+        left, low = index % columns * wide, size[1] - (index // columns + 1) * (high + caption) + caption
+        box = (left / size[0], low / size[1], (left + wide) / size[0], (low + high) / size[1])
+        add_robot(vtk, add_renderer(vtk, window, box, BACKGROUND), scene, values)
+        if name:
+            add_text(vtk, paper, name, (left + wide // 2, low - caption + 8), 15).SetJustificationToCentered()
+    save(vtk, window, file)
+
+
+def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
+    """Add every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh.
+
+    The camera stands where it sees all of the robot at rest, so pictures of one robot show how it moves.
+    """
+    at_rest = vtk.Renderer()
+    _add_visuals(vtk, at_rest, scene, scene.rest())
+    bounds = np.array(at_rest.ComputeVisiblePropBounds()).reshape(3, 2)
+    _add_visuals(vtk, renderer, scene, values)
+    middle, size = bounds.mean(axis=1), float(np.linalg.norm(np.ptp(bounds, axis=1)))
+    away_m = _distance(bounds, renderer.GetTiledAspectRatio())
+    look(renderer, middle + away_m * _DIRECTION, middle, _ANGLE_DEG)
+    renderer.AutomaticLightCreationOff()
+    for place, strength in _LIGHTS:
+        add_light(vtk, renderer, middle + size * np.array(place), middle, strength)
+
+
+def _distance(bounds: Doubles, aspect: float) -> float:
+    """Return the distance at which a camera along `_DIRECTION` sees a box (3, 2) with room around it.
+
+    aspect: width by height of the picture.
+    """
+    corners = np.stack(np.meshgrid(*bounds), axis=-1).reshape(8, 3) - bounds.mean(axis=1)
+    aside = np.cross([0.0, 0.0, 1.0], _DIRECTION)
+    aside /= np.linalg.norm(aside)
+    slope = math.tan(math.radians(_ANGLE_DEG / 2)) / _ROOM
+    away = np.maximum(np.abs(corners @ aside) / aspect, np.abs(corners @ np.cross(_DIRECTION, aside))) / slope
+    return float((away + corners @ _DIRECTION).max())
+
+
+def _add_visuals(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
+    places = scene.robot.link_places(dict(zip(scene.joints, values.tolist(), strict=True)))
+    for visual in scene.robot.visuals:
+        renderer.AddActor(_visual_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
+
+
+def _visual_actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str, Path]) -> Any:
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    matrix, mapper, actor = vtkMatrix4x4(), vtk.PolyDataMapper(), vtk.Actor()
+    matrix.DeepCopy((place @ _upright(visual)).ravel().tolist())
+    source = _source(visual, meshes)
+    source.Update()
+    mapper.SetInputData(source.GetOutput())
+    mapper.ScalarVisibilityOff()
+    actor.SetMapper(mapper)
+    actor.SetUserMatrix(matrix)
+    style = actor.GetProperty()
+    style.SetColor(*visual.color[:3])
+    style.SetOpacity(visual.color[3])
+    style.SetInterpolationToPhong()
+    style.SetAmbient(0.12)
+    style.SetSpecular(0.18)
+    style.SetSpecularPower(24)
+    return actor
+
+
+def _upright(visual: Visual) -> Doubles:
+    """Return (4, 4) from vtk's shape to the URDF's: its cylinders lie along z, vtk's along y; a mesh has a scale."""
+    out = np.eye(4)
+    if visual.shape == "cylinder":
+        out[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    elif visual.shape == "mesh":
+        out[:3, :3] = np.diag(visual.size)
+    return out
+
+
+def _source(visual: Visual, meshes: Mapping[str, Path]) -> Any:
+    from vtkmodules import vtkFiltersSources as sources
+
+    if visual.shape == "mesh":
+        return _mesh(meshes[visual.mesh])
+    if visual.shape == "box":
+        box = sources.vtkCubeSource()
+        for axis, length in zip("XYZ", visual.size, strict=True):
+            getattr(box, f"Set{axis}Length")(length)
+        return box
+    if visual.shape == "sphere":
+        ball = sources.vtkSphereSource()
+        ball.SetRadius(visual.size[0])
+        ball.SetThetaResolution(_ROUND)
+        ball.SetPhiResolution(_ROUND // 2)
+        return ball
+    rod = sources.vtkCylinderSource()
+    rod.SetRadius(visual.size[0])
+    rod.SetHeight(visual.size[1])
+    rod.SetResolution(_ROUND)
+    return rod
+
+
+def _mesh(file: Path) -> Any:
+    from vtkmodules import vtkIOGeometry, vtkIOPLY
+
+    name = _READERS.get(file.suffix.lower())
+    if name is None:
+        raise ConfigError(f"{file}: a picture needs one of {', '.join(_READERS)}")
+    reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")()
+    reader.SetFileName(str(file))
+    for part in (reader, reader.GetExecutive()):  # of a part with an observer vtk prints no error
+        part.AddObserver("ErrorEvent", lambda *_: None)
+    reader.Update()
+    if reader.GetErrorCode() or not reader.GetOutput().GetNumberOfPoints():
+        raise ConfigError(f"{file}: not a mesh that can be read")
+    return reader

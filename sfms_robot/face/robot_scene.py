@@ -7,13 +7,13 @@ A neck whose servos do not turn the head's axes themselves (a platform, a differ
     pose_x, pose_y, pose_z [m], pose_roll, pose_pitch, pose_yaw [rad]     the head's pose against the base
     LEG_rod_swing, LEG_rod_lean [rad]                                     the rod of a platform's leg
 
-by forward kinematics, where the URDF has joints of these names. What follows nothing keeps to 0.
+by forward kinematics, where the URDF has joints of these names. All other joints stay at 0.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Protocol
@@ -34,7 +34,7 @@ _POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
 
 
 class ForwardNeck(Protocol):
-    """What a scene needs of a neck (`retarget.head_retargeter.Neck`)."""
+    """The part of a neck (`retarget.kinematics.Neck`) that a scene uses."""
 
     @property
     def joints(self) -> Sequence[str]: ...
@@ -47,14 +47,14 @@ class ForwardNeck(Protocol):
 
 
 class RobotScene:
-    """One head as a URDF.
+    """A head as a URDF.
 
     Attributes:
         urdf: the file.
         robot: what it holds, without the visuals of `left_out`.
         meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
         left_out: one line for each mesh that may not be served or drawn.
-        joints: the URDF joints that `values` gives, in its order; mimic joints are left to who draws.
+        joints: the URDF joints of `values`, in its order; mimic joints follow from them.
         follows: joint of the head -> the URDF joint that it moves.
         undriven: joints of the head that move nothing in the picture.
     """
@@ -72,14 +72,14 @@ class RobotScene:
         follows = _following(head, self.robot, urdf, description)
         self.follows = {name: each.joint for name, each in follows.items()}
         self.undriven = tuple(name for name in self._names if name not in follows)
-        parts: list[tuple[str, ...]] = [tuple(each.joint for each in follows.values())]
-        steps: list[Callable[[Doubles], Doubles]] = [_Followers(self._names, follows).values]
-        if neck is not None and (pose := _NeckPose.of(head, neck, self.robot, set(parts[0]))) is not None:
-            parts.append(pose.joints)
-            steps.append(pose.values)
+        self._columns = np.array([self._names.index(name) for name in follows], dtype=np.intp)
+        self._scale = np.array([each.scale for each in follows.values()])
+        self._offset = np.array([each.offset for each in follows.values()])
+        self.joints = tuple(self.follows.values())
+        self._pose = None if neck is None else _NeckPose.of(head, neck, self.robot, set(self.joints))
+        if neck is not None and self._pose is not None:
+            self.joints += self._pose.joints
             self.undriven = tuple(name for name in self.undriven if name not in neck.joints)
-        self._steps = steps
-        self.joints = tuple(name for part in parts for name in part)
         if not self.joints:
             ours, theirs = ", ".join(self._names), ", ".join(_free(self.robot)) or "none"
             raise ConfigError(
@@ -113,23 +113,24 @@ class RobotScene:
         self.robot = replace(self.robot, visuals=tuple(visuals))
 
     def values(self, read_rad: Doubles) -> Doubles:
-        """Angles (J,) in the head's order -> values (U,) of `joints`; an angle that is not finite stays as it last was.
+        """Return values (U,) of `joints` for angles (J,) in the head's order; one that is not finite keeps its last.
 
-        Where the angles of a platform fit no pose, it stays where it last was.
+        A platform keeps its last pose where the angles fit none.
         """
         read = np.asarray(read_rad, dtype=np.float64)
         if read.shape != self._read.shape:
             raise ValueError(f"angles are ({len(self._read)},), not {read.shape}")
         self._read = np.where(np.isfinite(read), read, self._read)
-        return np.concatenate([step(self._read) for step in self._steps])
+        values = np.asarray(self._offset + self._scale * self._read[self._columns])
+        return values if self._pose is None else np.concatenate([values, self._pose.values(self._read)])
 
     def rest(self) -> Doubles:
-        """The values (U,) of the head at rest."""
+        """Return the values (U,) of the head at rest."""
         return self.values(self._rest)
 
 
 def urdf_file(head: Head) -> Path | None:
-    """The URDF that the head's file names, else the shipped one of that name, else None. Raises ConfigError."""
+    """Return the URDF that the head's file names, else the shipped one of that name, else None. Raises ConfigError."""
     shipped = data_dir("sim") / "heads"
     if head.urdf is None:
         file = shipped / head.name / URDF_FILE
@@ -143,12 +144,12 @@ def urdf_file(head: Head) -> Path | None:
 
 
 def _free(robot: Urdf) -> list[str]:
-    """Joints that somebody has to give a value."""
+    """Return the joints that move and mimic no other."""
     return [joint.name for joint in robot.joints.values() if joint.kind in MOVING and joint.mimic is None]
 
 
 def _following(head: Head, robot: Urdf, file: Path, description: RobotDescription) -> dict[str, FollowingJoint]:
-    """Our joint -> what follows it, in the head's order. Raises ConfigError for one that cannot."""
+    """Return the URDF joint that follows each joint of the head. Raises ConfigError for one that cannot."""
     free = _free(robot)
     for name, follows in description.joints.items():
         if follows.joint not in robot.joints:
@@ -165,20 +166,8 @@ def _following(head: Head, robot: Urdf, file: Path, description: RobotDescriptio
     return {name: both[name] for name in head.joints if name in both}
 
 
-class _Followers:
-    """Joints that follow one of ours each."""
-
-    def __init__(self, names: Sequence[str], follows: Mapping[str, FollowingJoint]) -> None:
-        self._columns = np.array([names.index(name) for name in follows], dtype=np.intp)
-        self._scale = np.array([each.scale for each in follows.values()])
-        self._offset = np.array([each.offset for each in follows.values()])
-
-    def values(self, read: Doubles) -> Doubles:
-        return np.asarray(self._offset + self._scale * read[self._columns])
-
-
 class _NeckPose:
-    """Joints that show where a neck's forward kinematics has the head, and the rods below it."""
+    """The URDF joints of the head's pose by forward kinematics, and of the rods below it."""
 
     def __init__(self, head: Head, neck: ForwardNeck, joints: Sequence[str], rods: PlatformRods | None) -> None:
         self.joints = tuple(joints)
@@ -190,13 +179,13 @@ class _NeckPose:
 
     @classmethod
     def of(cls, head: Head, neck: ForwardNeck, robot: Urdf, taken: set[str]) -> _NeckPose | None:
-        """None where the URDF has none of these joints."""
-        legs = neck.joints if isinstance(head.kinematics, StewartPlatform) else ()
+        """Return the joints that the URDF has; None where it has none of them."""
+        platform = head.kinematics if isinstance(head.kinematics, StewartPlatform) else None
+        legs = () if platform is None else neck.joints
         rods = [f"{leg}_rod_{part}" for leg in legs for part in ("swing", "lean")]
         joints = [name for name in _free(robot) if name in (*_POSE, *rods) and name not in taken]
         if not joints:
             return None
-        platform = head.kinematics if isinstance(head.kinematics, StewartPlatform) else None
         return cls(head, neck, joints, PlatformRods(platform) if platform else None)
 
     def values(self, read: Doubles) -> Doubles:
@@ -208,7 +197,7 @@ class _NeckPose:
         return np.asarray(table[self._order])
 
     def _home(self, angles: Doubles) -> Doubles:
-        """Where the search for the pose begins: at home on the body as it is turned, never at the last pose.
+        """Return the start of the search for the pose: home on the turned body, never the last pose.
 
         Several poses fit the legs of a platform. After a gap in what is read the last pose may lead to one that the
         head can only reach by falling through, and from there it would never come back.
@@ -217,7 +206,7 @@ class _NeckPose:
         return np.array([0.0, 0.0, body, 0.0, 0.0, 0.0])
 
     def _rod_angles(self, angles: Doubles) -> Doubles:
-        """(12,) swing and lean of each leg."""
+        """Return (12,) swing and lean of each leg."""
         assert self._rods is not None
         roll, pitch, yaw = self._pose[:3]
         body = angles[0] if self._neck.turns_body else 0.0
@@ -260,7 +249,7 @@ def _mesh_file(name: str, folder: Path, own: Path, packages: Mapping[str, str]) 
 
 
 class PlatformRods:
-    """Geometry of the six rods of one platform: two angles each, for a picture of it.
+    """The geometry of the six rods of one platform: two angles each, for a picture of it.
 
     In the frame of a leg's servo (x, y in the plane of the crank, z its axis; see `config.kinematics.Leg`) the crank's
     tip is (c cos a, c sin a, 0), and the rod's head end is q = T H b with T = `servo_from_body`, H the head's pose seen
@@ -274,7 +263,7 @@ class PlatformRods:
         self._crank_m, self._height_m = config.crank_m, config.home_height_m
 
     def angles(self, cranks_rad: Doubles, rotation: Doubles, place_m: Doubles) -> Doubles:
-        """Crank angles (6,) and the head's pose seen from the body, R (3, 3) and t (3,) -> swing and lean (6, 2)."""
+        """Return swing and lean (6, 2) for crank angles (6,) and the pose seen from the body, R (3, 3), t (3,)."""
         ends = self._ends_m @ rotation.T + place_m + [0.0, 0.0, self._height_m]
         q = np.einsum("lij,lj->li", self._servo[..., :3], ends) + self._servo[..., 3]
         cosine, sine = np.cos(cranks_rad), np.sin(cranks_rad)

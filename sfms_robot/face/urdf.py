@@ -1,7 +1,7 @@
 """URDF files: links, joints and what is drawn of them; and where every link is for given joint values.
 
 What the format says is at http://wiki.ros.org/urdf/XML. Read: visuals (box, cylinder, sphere, mesh), materials with a
-colour, joints of every type but floating and planar, mimic. Left alone: inertia, collision, transmissions, textures.
+colour, joints of every type but floating and planar, mimic. Not read: inertia, collision, transmissions, textures.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ROUND: Final = {"cylinder": ("radius", "length"), "sphere": ("radius",)}  # the
 Color = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Visual:
     """A shape on a link.
 
@@ -56,7 +56,7 @@ class Mimic:
     offset: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class JointElement:
     """A joint: `place` (4, 4) child at value 0 -> parent, `axis` (3,) of unit length in the child's frame."""
 
@@ -71,7 +71,7 @@ class JointElement:
     mimic: Mimic | None
 
     def motion(self, value: float) -> Doubles:
-        """(4, 4) child -> child at value 0."""
+        """Return the transform (4, 4) from the child to the child at value 0."""
         out = np.eye(4)
         if self.kind in TURNING:
             out[:3, :3] = _about(self.axis, value)
@@ -90,7 +90,7 @@ class Urdf:
     visuals: tuple[Visual, ...]
 
     def link_places(self, values: Mapping[str, float]) -> dict[str, Doubles]:
-        """Joint values [rad, m], 0 where none is given -> every link's place (4, 4) in the root's axes."""
+        """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; 0 where none is given."""
         places = {self.root: np.eye(4)}
         for joint in self.joints.values():
             value = self._value(joint, values)
@@ -104,7 +104,7 @@ class Urdf:
 
 
 def read_urdf(file: Path) -> Urdf:
-    """Raises ConfigError of one line that names the file and the link or joint that is wrong."""
+    """Read a URDF. Raises ConfigError of one line that names the file and the link or joint that is wrong."""
     try:
         root = ElementTree.fromstring(file.read_bytes())
     except OSError as error:
@@ -119,7 +119,7 @@ def read_urdf(file: Path) -> Urdf:
 
 
 class _Reader:
-    """One file: everything that may be wrong is told with the file and the element's name."""
+    """A reader of one file, whose errors name the file and the element."""
 
     def __init__(self, file: Path, root: Element) -> None:
         self._file, self._root = file, root
@@ -153,24 +153,36 @@ class _Reader:
             end = element.find(tag)
             link = "" if end is None else end.get("link", "")
             if link not in links:
-                raise self._wrong("joint", name, f"has as its {tag} {link!r}, which is no link of this file")
+                raise self._wrong("joint", name, f"has as its {tag} {link!r}, which is not a link of this file")
             ends.append(link)
-        axis = self._triple(element.find("axis"), "xyz", (1.0, 0.0, 0.0), f"joint {name}")
+        where = f"joint {name}"
+        axis = np.array(self._floats(element.find("axis"), "xyz", where, 3, (1.0, 0.0, 0.0)))
         length = float(np.linalg.norm(axis))
         if kind in MOVING and length < 1e-9:
             raise self._wrong("joint", name, "has an axis of length 0")
         limit, copied = element.find("limit"), element.find("mimic")
-        where = f"joint {name}"
-        lower, upper = (self._number(limit, key, math.nan, where) for key in ("lower", "upper"))
+        lower, upper = (self._floats(limit, key, where, 1, (math.nan,))[0] for key in ("lower", "upper"))
         mimic = None
         if copied is not None:
-            factors = (self._number(copied, key, at, where) for key, at in (("multiplier", 1.0), ("offset", 0.0)))
-            mimic = Mimic(copied.get("joint", ""), *factors)
-        place = self._origin(element, where)
-        return JointElement(name, kind, ends[0], ends[1], place, axis / max(length, 1e-9), lower, upper, mimic)
+            multiplier, offset = (
+                self._floats(copied, key, where, 1, (value,))[0]
+                for key, value in (("multiplier", 1.0), ("offset", 0.0))
+            )
+            mimic = Mimic(copied.get("joint", ""), multiplier, offset)
+        return JointElement(
+            name=name,
+            kind=kind,
+            parent=ends[0],
+            child=ends[1],
+            place=self._origin(element, where),
+            axis=axis / max(length, 1e-9),
+            lower=lower,
+            upper=upper,
+            mimic=mimic,
+        )
 
     def _tree(self, links: list[str], joints: dict[str, JointElement]) -> tuple[str, dict[str, JointElement]]:
-        """The link on which all hangs, and the joints from there on."""
+        """Return the root link, and the joints from there on, parents first."""
         above: dict[str, str] = {}
         for joint in joints.values():
             if above.setdefault(joint.child, joint.name) != joint.name:
@@ -195,7 +207,7 @@ class _Reader:
         seen, at = {joint.name}, joint
         while at.mimic is not None:
             if at.mimic.joint not in joints:
-                raise self._wrong("joint", at.name, f"mimics {at.mimic.joint!r}, which is no joint of this file")
+                raise self._wrong("joint", at.name, f"mimics {at.mimic.joint!r}, which is not a joint of this file")
             at = joints[at.mimic.joint]
             if at.name in seen:
                 raise self._wrong("joint", joint.name, "mimics itself")
@@ -211,15 +223,15 @@ class _Reader:
                 raise self._wrong("link", name, "has a visual without a geometry")
             place, color = self._origin(visual, where), self._material(visual)
             if shape.tag == "box":
-                size = tuple(self._triple(shape, "size", None, where))
+                size = self._floats(shape, "size", where, 3)
             elif shape.tag == "mesh":
-                size = tuple(self._triple(shape, "scale", (1.0, 1.0, 1.0), where))
+                size = self._floats(shape, "scale", where, 3, (1.0, 1.0, 1.0))
             elif shape.tag in _ROUND:
-                size = tuple(self._number(shape, key, None, where) for key in _ROUND[shape.tag])
+                size = tuple(self._floats(shape, key, where)[0] for key in _ROUND[shape.tag])
             else:
                 raise self._wrong("link", name, f"has the shape <{shape.tag}>, not box, cylinder, sphere or mesh")
             mesh = shape.get("filename", "") if shape.tag == "mesh" else ""
-            found.append(Visual(name, place, shape.tag, size, color, mesh))
+            found.append(Visual(link=name, place=place, shape=shape.tag, size=size, color=color, mesh=mesh))
         return found
 
     def _material(self, visual: Element) -> Color:
@@ -230,39 +242,31 @@ class _Reader:
         return self._colors.get(material.get("name", ""), _GREY) if color is None else self._color(color)
 
     def _color(self, element: Element) -> Color:
-        values = self._floats(element.get("rgba", ""), 4, "a colour's rgba")
-        return (values[0], values[1], values[2], values[3])
+        red, green, blue, opacity = self._floats(element, "rgba", "a colour", 4)
+        return red, green, blue, opacity
 
     def _origin(self, element: Element, where: str) -> Doubles:
         origin, out = element.find("origin"), np.eye(4)
-        roll, pitch, yaw = self._triple(origin, "rpy", (0.0, 0.0, 0.0), where)
+        roll, pitch, yaw = self._floats(origin, "rpy", where, 3, (0.0, 0.0, 0.0))
         x, y, z = np.eye(3)
         out[:3, :3] = _about(z, yaw) @ _about(y, pitch) @ _about(x, roll)
-        out[:3, 3] = self._triple(origin, "xyz", (0.0, 0.0, 0.0), where)
+        out[:3, 3] = self._floats(origin, "xyz", where, 3, (0.0, 0.0, 0.0))
         return out
 
-    def _triple(
-        self, element: Element | None, key: str, default: tuple[float, float, float] | None, where: str
-    ) -> Doubles:
-        text = None if element is None else element.get(key)
-        if text is None and default is not None:
-            return np.array(default)
-        return np.array(self._floats(text or "", 3, f"{where}: {key}"))
-
-    def _number(self, element: Element | None, key: str, default: float | None, where: str) -> float:
+    def _floats(
+        self, element: Element | None, key: str, where: str, count: int = 1, default: tuple[float, ...] | None = None
+    ) -> tuple[float, ...]:
+        """Return `count` finite numbers of an attribute; `default` where it is missing."""
         text = None if element is None else element.get(key)
         if text is None and default is not None:
             return default
-        return self._floats(text or "", 1, f"{where}: {key}")[0]
-
-    def _floats(self, text: str, count: int, where: str) -> list[float]:
         try:
-            values = [float(part) for part in text.split()]
+            values = tuple(float(part) for part in (text or "").split())
         except ValueError:
-            values = []
-        if len(values) != count or not all(math.isfinite(value) for value in values):
+            values = ()
+        if len(values) != count or not all(map(math.isfinite, values)):
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
-            raise ConfigError(f"{self._file}: {where} = {text!r} is not {wanted}")
+            raise ConfigError(f"{self._file}: {where}: {key} = {text or ''!r} is not {wanted}")
         return values
 
     def _name(self, element: Element) -> str:
@@ -276,7 +280,7 @@ class _Reader:
 
 
 def _about(axis: Doubles, angle: float) -> Doubles:
-    """Rotation (3, 3) about an axis of unit length (Rodrigues)."""
+    """Return the rotation (3, 3) about an axis of unit length (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     out: Doubles = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)

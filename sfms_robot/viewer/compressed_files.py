@@ -67,8 +67,10 @@ def _plain(file: Path) -> bytes:
 
 @cache
 def human_gz() -> bytes:
-    """Return `face.human_mesh`, compressed. Blocks for a second, once."""
-    from sfms_robot.face.human import load_human  # scipy's trees: in the thread that makes it, not at start-up
-    from sfms_robot.face.human_mesh import packed_human
+    """Return `face.human.packed_human`, compressed. Blocks for a second, once."""
+    from sfms_robot.face.human import (
+        load_human,  # scipy's trees: in the thread that makes it, not at start-up
+        packed_human,
+    )
 
     return gzip.compress(packed_human(load_human()), _LEVEL)

@@ -1,7 +1,7 @@
 """The page over HTTP and its WebSocket, in the page's process: what a run tells goes to all visitors, once encoded.
 
     /                  the page              /static/...     what it loads
-    /ws                the protocol          /human/head.bin the virtual human (`face.human_mesh`)
+    /ws                the protocol          /human/head.bin the virtual human (`face.human`)
     /robot/robot.urdf  the robot, and beside it the meshes that it names
     /face_landmarker.task  the model by which a page sees its visitor's face
     /runs/last         the run so far, or the last one: its messages, a line of JSON each

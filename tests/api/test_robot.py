@@ -1,4 +1,4 @@
-"""`Robot` and `open_bus` on emulated servos: threads, errors, what is refused, what comes to rest."""
+"""`Robot` and `open_bus` on emulated servos: threads, errors, refusals, coming to rest, speech that is played."""
 
 import subprocess
 import sys
@@ -15,6 +15,8 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
 pytestmark = pytest.mark.realtime
 HEAD = "reachy_mini"
 PITCH = CHANNEL_INDEX["pitch"]
+LIMIT_S = 60.0
+LOOK_S = 0.02
 
 
 @pytest.fixture(autouse=True)
@@ -161,7 +163,7 @@ def test_an_error_before_torque_is_raised_by_start():
 REFUSED = [
     ({"head": "nope"}, sr.ConfigError, "'nope' is neither a shipped name"),
     ({"port": "/dev/nowhere"}, sr.PortError, "/dev/nowhere"),
-    ({"without": ("nose",)}, sr.ConfigError, "'nose' is no joint of head"),
+    ({"without": ("nose",)}, sr.ConfigError, "expected a joint of head 'face28', got 'nose'"),
     ({"fast": True}, sr.InputError, 'another source than audio="push"'),
     ({"face": "me.csv"}, sr.InputError, r"the face comes by see\(\)"),
     ({"intensity": {"ears": 1}}, sr.InputError, r"'ears' is not a region of this head \(.*neck"),
@@ -293,3 +295,47 @@ def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report
         assert (report["exit"], report["exit_code"], report["torque_unconfirmed"]) == ("failed", 4, unconfirmed)
         assert opens is sr.open_bus or robot.state == "fault"
         assert [servo.id for servo in servos if chain.state(servo.id)["torque"]] == [servos[0].id]
+
+
+# --- speech that is played ---
+
+
+class Resting(Nodder):
+    """A listener whose face rests."""
+
+    def step(self, speaker, memory):
+        plan, memory = super().step(speaker, memory)
+        return sr.Plan(plan.made_at_s, plan.times_s, np.zeros((2, MOTION_DIM), np.float32)), memory
+
+
+def until(robot, state):
+    for _ in range(round(LIMIT_S / LOOK_S)):
+        if robot.state == state:
+            return
+        assert not robot.wait(LOOK_S), robot.report()
+    raise AssertionError(f"never {state}: {robot.state}")
+
+
+@pytest.mark.slow
+def test_what_it_says_is_played_and_it_speaks_until_it_is_hushed(sound_server):
+    noise = (0.3 * np.random.default_rng(0).uniform(-1, 1, 60 * 24_000)).astype(np.float32)
+    with sr.Robot("interbotix_wxxms", listener=Resting(), play="person") as robot:
+        until(robot, "idle")
+        robot.say(noise, 24_000)
+        until(robot, "speaking")
+        robot.hush()
+        until(robot, "idle")
+    told = robot.report()["source"]["agent_audio"]
+    assert told["device"] == "person" and told["delay_ms"] > 80.0 and told["restarts"] == 0
+
+
+def test_what_is_said_elsewhere_is_not_played(sound_server):
+    class Nobody(sr.Source):
+        def read(self, now_s):
+            return []
+
+    with pytest.raises(sr.InputError, match="play='person': what a source of your own says is not played"):
+        sr.Robot("interbotix_wxxms", source=Nobody(), play="person")
+    robot = sr.Robot("interbotix_wxxms", listener=Resting(), audio="katie", play="person")
+    with pytest.raises(sr.ConfigError, match="^--play person: nothing is played of --agent-audio none"):
+        robot.start()

@@ -10,11 +10,10 @@ import soundfile
 import torch
 
 from sfms_robot import config
-from sfms_robot.app.replay import read_recording
-from sfms_robot.app.replay.page_replay import pictures
-from sfms_robot.app.replay.run_file import _records
-from sfms_robot.app.replay.run_playback import PlaybackOptions, play_back
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.replay.play_back import pictures, play_back
+from sfms_robot.app.replay.run_file import _records, read_recording
+from sfms_robot.app.session import run
 from sfms_robot.config.listener import STATES, paper_state
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX
@@ -85,7 +84,7 @@ def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_pat
 def test_a_recording_of_a_head_that_speaks_moves_a_head_and_a_listener_as_the_run_did(seeded, tmp_path):
     said = voice(tmp_path / "said.wav", 2.0)
     done = listened(seeded, agent_audio=said, duration_s=3.0, record=tmp_path / "run")
-    played = play_back(tmp_path / "run", PlaybackOptions(fast=True))
+    played = play_back(tmp_path / "run", fast=True)
     assert played["motion"] == done["motion"]
     for end in ("min_rad", "max_rad"):
         assert played["joints"]["jaw"][end] == pytest.approx(done["joints"]["jaw"][end], abs=0.02)

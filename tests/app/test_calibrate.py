@@ -16,9 +16,9 @@ import pytest
 import yaml
 from emulated_devices import device_of, servos_of
 
-from sfms_robot.app.calibrated_head import calibrated_head, identify
-from sfms_robot.app.head.calibrate import Outcome, calibrate, calibrate_on
-from sfms_robot.app.open_head import HeadOptions, open_head
+from sfms_robot.app.head.calibrate import CalibrationOutcome, calibrate, calibrate_on
+from sfms_robot.app.open_head import calibrated_head, identify, open_head
+from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import held_back
@@ -33,7 +33,6 @@ from sfms_robot.config.overlay import (
 )
 from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.servo.port import Port
 
@@ -103,7 +102,7 @@ def hand(chain: Chain, servo: int, ticks: int) -> Callable[[], str]:
     return turn
 
 
-def led(name: str, chain: Chain, person: Person, **more) -> Outcome:
+def led(name: str, chain: Chain, person: Person, **more) -> CalibrationOutcome:
     return calibrate_on(name, {"main": chain}, VirtualClock(), person, overlay_file("two"), DAY, **more)
 
 
@@ -262,11 +261,6 @@ def test_every_family_tells_who_it_is(tmp_path, family, model, zero):
     assert gone == {"brow": None}
 
 
-def test_a_joint_of_another_head_is_refused(name):
-    with pytest.raises(ConfigError, match=r"--joint = 'chin' is not a joint of this head \(jaw, brow\)"):
-        calibrate_on(name, {}, VirtualClock(), Person(), overlay_file("two"), DAY, ["chin"])
-
-
 def test_practice_on_emulated_servos_is_kept_apart(name):
     outcome = calibrate(name, "sim", Person("k", "5", "", "20", "", "n"), ["jaw"])
     assert outcome.measured == ["jaw"] and outcome.file == overlay_file("two", practice=True)
@@ -304,7 +298,7 @@ def test_a_start_opens_the_port_of_a_calibrated_head_once(name):
         led(name, chain, Person(*by_hand(chain)))
     with Adapter() as adapter:
         threading.Thread(target=adapter.serve_forever, daemon=True).start()
-        with open_head(HeadOptions(name, f"socket://127.0.0.1:{adapter.server_address[1]}")) as opened:
+        with open_head(HeadOptions(head=name, port=f"socket://127.0.0.1:{adapter.server_address[1]}")) as opened:
             opened.bus.poll(opened.clock.now_s())
         adapter.shutdown()
     assert adapter.opened == 1

@@ -5,7 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from sfms_robot.app.listen.demo import DemoOptions, compare_seeds, demo, free_folder, nods_over_seeds
+from sfms_robot.app.listen.demo import compare_seeds, demo, free_folder, nods_over_seeds
+from sfms_robot.app.options import RunOptions
+
+SHORT = RunOptions(head="op3_head", duration_s=1.0, fast=True)
 
 
 @pytest.mark.slow
@@ -42,7 +45,7 @@ def test_a_second_demo_writes_beside_the_first(tmp_path):
 
 def test_seeds_are_told_one_by_one():
     seen = []
-    told = compare_seeds(DemoOptions("op3_head", duration_s=1.0, fast=True), 2, seen.append)
+    told = compare_seeds(SHORT, 2, seen.append)
     assert [row["seed"] for row in seen] == [0, 1] == [row["seed"] for row in told["runs"]]
     assert told["exit"] == "done" and told["exit_code"] == 0
     assert told["nods"]["mean"] == np.mean([row["nods"] for row in told["runs"]])
@@ -55,12 +58,12 @@ def test_nods_of_several_seeds_have_a_mean_a_scatter_and_those_without():
 
 def test_without_the_packages_of_pictures_the_run_is_kept_and_the_pip_install_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
-    told = demo(DemoOptions("op3_head", duration_s=1.0, fast=True, folder=tmp_path / "demo"))
+    told = demo(SHORT, tmp_path / "demo")
     assert told["exit"] == "done" and told["pictures"] == [] and (tmp_path / "demo" / "run.mcap").is_file()
     assert told["missing"].count("\n") == 0 and "pip install 'sfms-robot[plots]'" in told["missing"]
 
 
 def test_without_vtk_the_plot_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "vtkmodules", None)  # as if it were not installed
-    told = demo(DemoOptions("op3_head", duration_s=1.0, fast=True, folder=tmp_path / "demo"))
+    told = demo(SHORT, tmp_path / "demo")
     assert told["pictures"] == [str(tmp_path / "demo" / "run.png")] and "sfms-robot[pictures]" in told["missing"]

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_motion
-from sfms_robot.app.session import Programme, drive_head
+from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
+from sfms_robot.app.options import HeadOptions
+from sfms_robot.app.session import drive_head, parts_of
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.head import held_back
@@ -65,13 +66,13 @@ def driven(head, servos, seconds, seed, fault=None):
         bus.connect()
         for chain in opened.values() if fault else ():
             chain.inject(fault)
-        options = HeadOptions(head.name, fast=True)
+        options = HeadOptions(head=head.name, fast=True)
         silence = PairedSource(RecordedVoice(np.zeros(round(seconds * 16_000), np.float32)), duration_s=seconds)
         motion = build_motion(head, rate_hz)
-        there = OpenHead(options, head, motion, bus, clock, rate_hz, opened)
+        there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
-        programme = Programme(silence, InlineFeed(Restless(), seed, 0.01), seconds)
-        drove = drive_head(there, programme, Interrupt(), signals=False)
+        parts = parts_of(there, silence, InlineFeed(Restless(), seed, 0.01))
+        drove = drive_head(there, parts, Interrupt(), duration_s=seconds, signals=False)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
     assert (drove.outcome, drove.error) == ("done", None)
     assert not any(state["torque"] for state in stand.values())

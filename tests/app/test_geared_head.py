@@ -32,8 +32,7 @@ def geared(tmp_path, gear=GEAR, model="xm430-w350"):
 
 
 def checked(head):
-    maps = {joint.model: load_firmware_map(joint.model) for joint in head.joints.values()}
-    check_safety(head, head.joints, maps)
+    check_safety(head, head.joints)
 
 
 def test_its_whole_range_is_reached_on_the_wire(tmp_path):

@@ -103,7 +103,7 @@ def test_the_list_has_every_head_with_its_families(command):
     assert heads["open_duck_mini_v2_head"]["buses"] == {"neck": "feetech", "antennas": "maestro"}
     families = {family for head in heads.values() for family in head["buses"].values()}
     assert families == {"dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"}
-    assert "reachy_mini  9 joints, stewart neck, dynamixel" in command("list")[1]
+    assert "stewart" in next(line for line in command("list")[1].splitlines() if "reachy_mini" in line)
 
 
 def test_show_tells_value_and_origin(command):

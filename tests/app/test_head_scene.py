@@ -21,7 +21,7 @@ def test_a_head_without_a_picture_says_what_is_missing(tmp_path):
         "limits: {any: {speed_deg_s: 1, acceleration_deg_s2: 1, jerk_deg_s3: 1}}\n"
         "joints: {jaw: {bus: main, id: 1, model: xl330-m288, zero_ticks: 0, min_deg: -1, max_deg: 1, limits: any}}\n"
     )
-    with pytest.raises(ConfigError, match="head.yaml: urdf says what the head looks like"):
+    with pytest.raises(ConfigError, match="head.yaml: urdf: expected a file"):
         draw_scene(str(tmp_path), tmp_path / "a.png")
 
 

@@ -117,7 +117,7 @@ def bus_of(family, model, safety, faults=None) -> Head:
     ("family", "model", "safety", "message"),
     [
         ("dynamixel1", "ax-12a", {"current_limit_mA": 300}, "limit its current; torque_limit_percent limits its"),
-        ("dynamixel1", "ax-12a", {"pinch": {"current_mA": 300, "for_s": 1}}, "for jaw: ax-12a does not tell its curr"),
+        ("dynamixel1", "ax-12a", {"pinch": {"current_mA": 300, "for_s": 1}}, "for jaw: ax-12a does not report its"),
         ("feetech", "scs0009", {"torque_limit_percent": 50}, "for jaw: scs0009 has no torque limit .*percent: null"),
         ("maestro", "maestro-6", {"current_limit_mA": 300}, "for jaw: maestro-6 cannot limit its current \\("),
     ],

@@ -6,7 +6,8 @@ import pytest
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.open_head import build_bus, build_motion
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch

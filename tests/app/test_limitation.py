@@ -10,7 +10,8 @@ from safetensors.torch import save_file
 
 from sfms_robot.app.head.head_check import check
 from sfms_robot.app.listen.report import limitation
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.config.listener import load_listener
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.sfms.model import SfmsModel

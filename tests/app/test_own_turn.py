@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan
 from sfms_robot.runtime.clock import InlineFeed
 from sfms_robot.runtime.states import TURN_GAP_S
@@ -54,7 +55,7 @@ def spoken(*sayings, person=True):
     speech.outlet = told
     voice = RecordedVoice(AudioFile(shipped_speaker("katie").audio)) if person else None
     source = PairedSource(voice, None, speech, TALKS_S)
-    options = RunOptions("interbotix_wxxms", duration_s=TALKS_S, fast=True)
+    options = RunOptions(head="interbotix_wxxms", duration_s=TALKS_S, fast=True)
     report = run(options, source=source, feed=InlineFeed(Still(), 0, 0.01), signals=False)
     assert report["exit"] == "done"
     return told

@@ -10,9 +10,8 @@ import pytest
 from websockets.sync.client import connect
 
 from sfms_robot.app.listen.page_session import LEFT_S, EndsAlone, page_session
-from sfms_robot.app.listen.preflight import begin_page
+from sfms_robot.app.options import RunOptions, begin_page
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.session import RunOptions
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError

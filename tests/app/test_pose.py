@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, HeldFace, PoseOptions, parse_face, pose_head
+from sfms_robot.app.head.pose import EXPRESSIONS, RISE_S, held_face, parse_face, pose_head
+from sfms_robot.app.options import HeadOptions
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX
@@ -48,14 +49,14 @@ def test_what_is_no_face_is_refused(word, message):
 
 
 def test_the_face_rises_stays_and_falls():
-    held = HeldFace(parse_face(["jawOpen=0.8"]), hold_s=1.0)
+    held = held_face(parse_face(["jawOpen=0.8"]), hold_s=1.0)
     times = np.array([0.0, EASE_S, EASE_S + RISE_S, EASE_S + RISE_S + 1.0, held.duration_s])
     jaw = held.sample(times, 0.0, None)[0][:, CHANNEL_INDEX["jawOpen"]]
     assert jaw.tolist() == pytest.approx([0, 0, 0.8, 0.8, 0], abs=1e-6)
 
 
 def test_a_smile_moves_the_mouth_and_leaves_the_neck_alone():
-    told = pose_head(PoseOptions("face28", ("smile",), hold_s=0.5, fast=True))
+    told = pose_head(HeadOptions(fast=True), ["smile"], 0.5)
     assert told["exit"] == "done" and {"corner_left", "corner_right"} <= set(told["joints"])
     assert not {"neck_yaw", "neck_pitch", "neck_roll", "jaw"} & set(told["joints"])
     for row in told["joints"].values():
@@ -64,15 +65,15 @@ def test_a_smile_moves_the_mouth_and_leaves_the_neck_alone():
 
 @pytest.mark.parametrize("name", HEADS)
 def test_every_head_nods_or_says_that_it_cannot(name):
-    told = pose_head(PoseOptions(name, ("pitch=0.1",), hold_s=0.2, fast=True))
+    told = pose_head(HeadOptions(head=name, fast=True), ["pitch=0.1"], 0.2)
     assert told["exit"] == "done" and (told["joints"] or told["blind"] == ["pitch"])
 
 
 def test_virtual_time_on_real_servos_is_refused():
     with pytest.raises(ConfigError, match="--fast needs emulated servos"):
-        pose_head(PoseOptions("face28", ("smile",), port="/dev/ttyUSB0", fast=True))
+        pose_head(HeadOptions(port="/dev/ttyUSB0", fast=True), ["smile"])
 
 
 def test_hobby_servos_move_only_when_somebody_said_yes():
     with pytest.raises(ConfigError, match="hobby servos report no position, and each jumps to rest .*--yes"):
-        pose_head(PoseOptions("inmoov2_maestro", ("blink",), port="/dev/null"))
+        pose_head(HeadOptions(head="inmoov2_maestro", port="/dev/null"), ["blink"])

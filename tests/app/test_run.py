@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import soundfile
 
-from sfms_robot.app.replay import read_recording
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.app.session import run
 from sfms_robot.config import load_head
+from sfms_robot.data import data_dir, head_names
 from sfms_robot.errors import ConfigError, PortError
 
 SHORT = RunOptions(duration_s=3.0, fast=True, seed=3)
@@ -20,9 +22,10 @@ WATCHED = """
 import json, sys
 from pathlib import Path
 from sfms_robot.app import session
+from sfms_robot.app.options import RunOptions
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import PageRecorder
-from sfms_robot.app.listen.report import RunTeller
+from sfms_robot.app.listen.report import OutletObserver
 from sfms_robot.config import load_head
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.safety import Interrupt
@@ -57,8 +60,8 @@ recorder = PageRecorder(page, folder, joints, {})
 recorder.record(True)
 watcher = PageObserver(page, joints)
 watcher.document = lambda: shown[0]()
-options = session.RunOptions(listener=listener, duration_s=3.0, fast=True, record=folder / "run", status="0")
-observers = [watcher, recorder, RunTeller(Outlet()), looks]
+options = RunOptions(listener=listener, duration_s=3.0, fast=True, record=folder / "run", status="0")
+observers = [watcher, recorder, OutletObserver(Outlet()), looks]
 report = session.run(options, Shown, observers=observers, interrupt=looks)
 page.close()
 print(json.dumps([report["exit"], report["observers_detached"], sorted(looks.after - looks.before)]))
@@ -110,8 +113,6 @@ def test_one_seed_is_one_command_stream_and_another_seed_another(report):
 @pytest.mark.parametrize(("audio", "face"), [("katie", "none"), ("none", "none"), ("none", "face.csv.gz")])
 def test_a_missing_modality_is_normal(audio, face, tmp_path):
     if face != "none":
-        from sfms_robot.data import data_dir
-
         face = str(data_dir("sim") / "speakers" / "facegood_1114_3_16" / face)
     done = run(dataclasses.replace(SHORT, audio=audio, face=face))
     assert done["exit"] == "done" and done["limits"]["violations"] == 0
@@ -177,20 +178,38 @@ def test_in_real_time_every_figure_is_measured():
     assert "wire" not in done
 
 
-@pytest.mark.parametrize(
-    ("options", "hears"),
-    [
-        ({}, "default"),
-        ({"port": "/dev/ttyUSB0"}, "mic"),
-        ({"port": "/dev/ttyUSB0", "audio": "katie"}, "katie"),
-        ({"port": "/dev/ttyUSB0", "audio": "none"}, "none"),
-        ({"port": "/dev/ttyUSB0", "dry_run": True}, "default"),
-    ],
-)
-def test_a_head_on_a_real_port_hears_the_microphone_unless_told_otherwise(options, hears):
-    assert RunOptions(**options).hears == hears
-
-
 def test_there_is_no_microphone_in_virtual_time():
     with pytest.raises(ConfigError, match="^--audio mic:2: what a microphone hears takes real time, --fast has none$"):
         run(RunOptions(audio="mic:2", fast=True, duration_s=1.0))
+
+
+@pytest.mark.parametrize("name", head_names())
+def test_it_listens_for_three_seconds_without_a_violation(name):
+    head = load_head(name)
+    report = run(RunOptions(head=name, duration_s=3.0, fast=True))
+    assert (report["exit"], report["head"], report["frames"]) == ("done", name, 75)
+    assert report["limits"]["violations"] == 0
+    assert (report["bus"]["errors"], report["bus"]["silent"], report["bus"]["faults"]) == (0, [], [])
+    assert set(report["wire"]) == set(head.buses) and all(wire["bytes"] for wire in report["wire"].values())
+    if head.kinematics is not None:
+        neck = [report["joints"][joint]["travel_rad"] for joint in head.kinematics.joints()]
+        assert sum(neck) > 0.05
+
+
+def test_a_joint_left_out_is_named_and_the_others_move():
+    report = run(RunOptions(duration_s=2.0, fast=True, seed=3, without=("jaw", "neck_roll")))
+    assert report["exit"] == "done" and report["limits"]["violations"] == 0
+    assert report["bus"]["buses"]["main"]["silent"] == []
+    assert report["joints"]["neck_pitch"]["travel_rad"] > 0
+
+
+def test_a_bus_of_joints_that_are_all_left_out_is_not_opened():
+    without = ("antenna_left", "antenna_right")
+    options = RunOptions(head="open_duck_mini_v2_head", duration_s=1.0, fast=True, without=without)
+    report = run(options)
+    assert report["exit"] == "done" and set(report["bus"]["buses"]) == {"neck", "left out"}
+
+
+def test_a_joint_that_is_none_is_refused_by_name():
+    with pytest.raises(ConfigError, match="--without: expected a joint of head 'face28', got 'tail'"):
+        run(RunOptions(duration_s=1.0, fast=True, without=("tail",)))

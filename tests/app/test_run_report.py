@@ -10,8 +10,9 @@ from dataclasses import replace
 import pytest
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.open_head import HeadOptions, open_head
-from sfms_robot.app.session import Programme, RunOptions, drive_head, run
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import HeadOptions, RunOptions
+from sfms_robot.app.session import drive_head, parts_of, run
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 from sfms_robot.ports import Source
 from sfms_robot.runtime.safety import Interrupt, Released
@@ -114,12 +115,13 @@ class Ending(NobodyThere):
 def drive(how=0, fault=None, bus=lambda bus: bus):
     """A drive of 0.4 s, and whether each servo has torque after it. `fault` begins when torque is on."""
     interrupt = Interrupt()
-    with open_head(HeadOptions(HEAD, fast=True)) as opened:
+    with open_head(HeadOptions(head=HEAD, fast=True)) as opened:
         chain = opened.opened["main"]
         if fault is not None:
             chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
-        programme = Programme(Ending(how, interrupt), NobodyThere(), 0.4)
-        drove = drive_head(replace(opened, bus=bus(opened.bus)), programme, interrupt, signals=False)
+        there = replace(opened, bus=bus(opened.bus))
+        parts = parts_of(there, Ending(how, interrupt), NobodyThere())
+        drove = drive_head(there, parts, interrupt, duration_s=0.4, signals=False)
         return drove, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
 
 

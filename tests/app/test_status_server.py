@@ -78,7 +78,7 @@ def test_a_port_in_use_is_found_before_a_listener_is_loaded(capsys, monkeypatch)
     def load(*_: object) -> None:
         raise AssertionError("a listener was loaded")
 
-    monkeypatch.setattr("sfms_robot.app.listen.preflight.begin_listening", load)
+    monkeypatch.setattr("sfms_robot.app.options.begin_listening", load)
     with closing(status_server("0")) as server, pytest.raises(SystemExit) as ended:
         main(["run", "--duration", "1", "--status", str(server.port)])
     assert ended.value.code == PortError.exit_code

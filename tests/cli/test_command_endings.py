@@ -49,7 +49,7 @@ def command(capsys, monkeypatch):
         (FileNotFoundError(2, "No such file", "x.yaml"), 2, "x.yaml: No such file"),
         (OSError(28, "No space left on device"), 1, "No space left on device"),
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero"),
-        (EOFError(), 1, "there is nobody to answer (stdin ended)"),
+        (EOFError(), 1, "no answer to the question: stdin ended"),
     ],
 )
 def test_a_failure_is_a_line_and_with_json_an_object(command, error, code, text):
@@ -109,11 +109,6 @@ def test_a_signal_that_would_kill_is_an_interruption_and_its_handler_is_put_back
 def test_a_command_that_said_how_it_ended_is_not_spoken_for(command):
     assert command(typer.Exit(4), "breaks", "--json") == (4, "", "")
     assert command(None, "breaks", "--json") == (0, "", "")
-
-
-def test_a_flag_that_is_none_is_an_object_too(command):
-    ended, out, err = command(None, "breaks", "--json", "--nope")
-    assert ended == 2 and "--nope" in err and json.loads(out)["exit_code"] == 2
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
@@ -203,12 +198,6 @@ def test_a_slip_of_the_keyboard_is_found_before_anything_is_loaded(words, code):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr
     assert words[1] in done.stderr
-
-
-def test_a_head_that_is_not_there_is_named_as_it_was_given(command_line):
-    for words in (["head", "check", "nope"], ["run", "--head", "nope"]):
-        told = command_line(*words).err
-        assert told.startswith("sfms-robot: head 'nope' is neither a shipped name nor a folder")
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,8 @@ def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(zenoh
     with closing(head), Fleet(zenoh) as fleet:
         while not fleet.states():
             pass  # until it is connected
-        assert command_line("fleet", "halt", "--zenoh", zenoh).out == "hall: halt\n" and latch.by is not None
+        halted = command_line("fleet", "halt", "--zenoh", zenoh, "--json").told
+        assert halted["answers"] == [{"name": "hall", "done": "halt"}] and latch.by is not None
         for words in (["--fleet-key", other], []):  # that of another fleet, and one that is made on first use
             ended = command_line("fleet", "resume", "hall", "--zenoh", zenoh, *words)
             assert "resume: proof: expected the fleet's key (--fleet-key)" in ended.out and latch.by is not None

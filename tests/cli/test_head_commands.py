@@ -34,7 +34,7 @@ def test_calibrate_leads_through_a_joint_and_says_what_it_wrote(run):
 
 def test_a_line_that_breaks_off_is_an_interruption(run):
     code, out, _ = run("head", "calibrate", "face28", "--port", "sim", "--joint", "jaw", typed="k\n5\n")
-    assert code == 130 and "0 joints measured now" in out and "to be calibrated first: eye_pan_left" in out
+    assert code == 130 and "measured: -" in out and "missing: eye_pan_left" in out
 
 
 class Typist(io.StringIO):
@@ -70,8 +70,6 @@ def test_calibrate_ends_with_4_when_torque_is_not_confirmed_off(command_line, mo
         (["calibrate", "face28", "--port", "/dev/nowhere"], 3, "/dev/nowhere: no such device"),
         (["calibrate", "face28", "--port", "sim", "--joint", "chin"], 2, "--joint = 'chin' is not a joint of this"),
         (["calibrate", "face29", "--port", "sim"], 2, "'face29' is neither a shipped name nor a folder"),
-        (["pose", "face28", "grin"], 2, "'grin' is not an expression (smile, "),
-        (["pose", "face28", "jawOpen=7"], 2, "jawOpen = '7' is not a number in its range (0..1)"),
     ],
 )
 def test_what_is_wrong_is_one_line_with_its_exit_code(run, words, code, message):

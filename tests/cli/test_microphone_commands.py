@@ -2,8 +2,6 @@
 
 import pytest
 
-from sfms_robot.cli.show import LevelMeter, meter_line
-
 pytestmark = pytest.mark.realtime
 
 
@@ -23,21 +21,3 @@ def test_a_check_says_what_it_heard_of_nobody(sound_server, command_line):
     assert ended.code == 0 and heard["seconds"] == 0.4
     assert heard["source"]["voice"]["device"] == "person.monitor"
     assert "digital silence" in heard["findings"][0]
-
-
-@pytest.mark.parametrize(
-    ("level_db", "loudest_db", "full", "mark"),
-    [(-60.0, -60.0, 0, 0), (-30.0, -30.0, 20, None), (-30.0, -15.0, 20, 29), (0.0, 0.0, 40, None), (5.0, 5.0, 40, None),
-     (-100.0, -30.0, 0, 19)],
-)  # fmt: skip
-def test_the_meter_is_as_full_as_the_sound_is_loud(level_db, loudest_db, full, mark):
-    bar = meter_line(level_db, loudest_db, clipped=False).plain[:40]
-    assert bar.count("█") == full
-    assert bar.find("│") == (-1 if mark is None else mark)
-
-
-def test_a_meter_says_that_it_has_clipped_and_shows_nothing_where_nobody_looks(capsys):
-    assert "clips" in meter_line(-3.0, -3.0, clipped=True).plain
-    with LevelMeter() as meter:
-        meter(-20.0, True)
-    assert capsys.readouterr().err == ""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfms_robot.app.calibrated_head import ready
+from sfms_robot.app.open_head import ready
 from sfms_robot.config import load_head
 from sfms_robot.config.head import PACE, TRAVEL, held_back
 from sfms_robot.data import head_names

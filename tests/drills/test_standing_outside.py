@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.open_head import HeadOptions, OpenHead, build_bus, build_motion
-from sfms_robot.app.session import Programme, drive_head
+from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
+from sfms_robot.app.options import HeadOptions
+from sfms_robot.app.session import drive_head, parts_of
 from sfms_robot.app.wiring import calibration_of, plugged_in
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
@@ -73,10 +74,12 @@ def test_wherever_joints_stand_a_run_ends_at_rest_and_limp(name, seed):
         stack.callback(bus.close)
         bus.connect()
         motion = build_motion(head, rate_hz)
-        there = OpenHead(HeadOptions(name, fast=True), head, motion, bus, clock, rate_hz, chains)
+        there = OpenHead(
+            options=HeadOptions(head=name, fast=True), config=head, motion=motion, bus=bus, clock=clock, opened=chains
+        )
         silence = PairedSource(RecordedVoice(np.zeros(round(LISTEN_S * 16_000), np.float32)), duration_s=LISTEN_S)
-        programme = Programme(silence, InlineFeed(Nodder(), seed, 0.01), LISTEN_S)
-        drove = drive_head(there, programme, Interrupt(), signals=False)
+        parts = parts_of(there, silence, InlineFeed(Nodder(), seed, 0.01))
+        drove = drive_head(there, parts, Interrupt(), duration_s=LISTEN_S, signals=False)
         states = {key: chains[joint.bus].state(joint.id) for key, joint in head.joints.items()}
     assert (drove.outcome, drove.error) == ("done", None)
     assert drove.log.audited.violations == 0

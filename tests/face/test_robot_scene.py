@@ -11,7 +11,7 @@ from sfms_robot.app.head.head_scene import draw_scene, scene_of
 from sfms_robot.config import load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.robot_drawing import render_robot
+from sfms_robot.face.drawing import render_robots
 from sfms_robot.face.robot_scene import MOST_MESH_BYTES
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 
@@ -226,7 +226,7 @@ def test_head_check_tells_joints_that_the_head_has_not(tmp_path):
 def test_a_robot_is_drawn_without_a_display(tmp_path):
     pytest.importorskip("vtkmodules")
     scene = scene_of(owl(tmp_path))
-    render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+    render_robots(tmp_path / "a.png", [("", scene, scene.rest())], size_px=(64, 48))
     data = (tmp_path / "a.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n" and int.from_bytes(data[16:20], "big") == 64
 
@@ -237,7 +237,7 @@ def test_a_mesh_that_cannot_be_read_is_told(tmp_path):
     scene.meshes["package://owl/head.stl"].rename(tmp_path / "parts" / "head.step")
     scene.meshes["package://owl/head.stl"] = tmp_path / "parts" / "head.step"
     with pytest.raises(ConfigError, match="a picture needs one of .stl"):
-        render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+        render_robots(tmp_path / "a.png", [("", scene, scene.rest())], size_px=(64, 48))
 
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
@@ -253,7 +253,7 @@ def test_a_broken_mesh_is_one_line_of_ours_and_none_of_vtk(tmp_path, capfd, suff
     scene.meshes["package://owl/head.stl"] = file = tmp_path / f"a{suffix}"
     file.write_bytes(content)
     with pytest.raises(ConfigError, match=f"^{file}: not a mesh that can be read$"):
-        render_robot(tmp_path / "a.png", scene, scene.rest(), (64, 48))
+        render_robots(tmp_path / "a.png", [("", scene, scene.rest())], size_px=(64, 48))
     assert capfd.readouterr() == ("", "")
 
 

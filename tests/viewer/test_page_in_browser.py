@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from chromium import Page, ServedRun, missing
 
-from sfms_robot.app.session import RunOptions
+from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run as record
 from sfms_robot.face.human import load_human
 

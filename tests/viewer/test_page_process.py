@@ -20,7 +20,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from sfms_robot.app.listen.preflight import PAGE
+from sfms_robot.app.options import PAGE
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, InputError, PortError
 from sfms_robot.viewer.frame_record import Picture, pack_picture, rare_json

@@ -1,1 +1,1 @@
-"""What `import sfms_robot` gives to programs: the parts of a run by themselves, and a run in a thread."""
+"""The public API: the parts of a run alone, and a run in a thread."""

@@ -15,10 +15,10 @@ from sfms_robot.ports import Listener
 
 
 def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListener:
-    """A listener by shipped name, folder, or the name under which another package registers its own.
+    """Load a listener by shipped name, folder, or the name under which another package registers its own.
 
-    `engine`: what computes it, "onnx" or "torch"; "auto": onnxruntime where it has graphs for it, as those that ship.
-    Blocks while its engine and its weights load, half a second, with torch two. Raises ConfigError, ModelError.
+    `engine`: "onnx" or "torch" compute it; "auto": onnxruntime where it has graphs for it, as those that ship. Blocks
+    while its engine and its weights load, half a second, with torch two. Raises ConfigError, ModelError.
     """
     from sfms_robot.listeners import registry  # an engine comes with what it loads
 
@@ -26,7 +26,7 @@ def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListen
 
 
 class LoadedListener:
-    """Weights and the pure functions of `ports.Listener`; `stream` holds what they hand on."""
+    """Weights and the pure functions of a `Listener`; `stream` keeps the state of a conversation."""
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
@@ -42,15 +42,15 @@ class LoadedListener:
         return self._listener.horizon
 
     def start(self, seed: int) -> Any:
-        """Memory of a stream that has heard nothing."""
+        """Return the memory of a new stream."""
         return self._listener.start(seed)
 
     def step(self, speaker: SpeakerFrame, memory: Any) -> tuple[Plan | None, Any]:
-        """See `ports.Listener`."""
+        """Return a plan or None, and the memory after a frame: see `Listener`."""
         return self._listener.step(speaker, memory)
 
     def stream(self, seed: int = 0) -> ListenerStream:
-        """A conversation that begins now. Streams of one listener know nothing of one another."""
+        """Return a conversation that begins now. Streams of one listener are independent."""
         return ListenerStream(self, seed)
 
 
@@ -75,14 +75,14 @@ class ListenerStream:
     ) -> Plan | None:
         """Take the next 40 ms; a plan on every `hop`-th frame, None between.
 
-        Blocks for as long as the listener computes. What is refused changes nothing: the stream goes on.
+        Blocks for as long as the listener computes. A frame that is refused changes nothing.
 
         Args:
             audio: (640,) mono 16 kHz, -1..1; None or empty without a microphone.
             face: the person's face at the end of the frame, as (58,) motion or a FaceFrame; None where it is not seen.
-            agent_audio: (640,) what the robot itself says during the next frame; None when it does not speak.
+            agent_audio: (640,) the robot's own speech during the next frame; None when it does not speak.
 
-        Raises InputError for another number of samples or channels, and for what is not finite.
+        Raises InputError for another number of samples or channels, and for values that are not finite.
         """
         time_s = (self._frames + 1) / FRAME_HZ
         said = None if agent_audio is None else _samples("agent_audio", agent_audio)

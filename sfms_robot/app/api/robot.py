@@ -1,7 +1,7 @@
-"""A head that listens, as an object: the loop in a thread of its own, worked from any other.
+"""A head that listens, as an object: the loop in its own thread, used from any other.
 
-person  ->  hear, see, say      what a program hears and sees; or a source that a run has
-face    ->  show, look_at       laid over what the listener planned, under the same limits
+person  ->  hear, see, say      sound and faces from a program; or a source of `run`
+face    ->  show, look_at       replaces the plan of the listener for a while, under the same limits
 plans   ->  on                  nods, smiles, "mm-hm" and so on before the servos do them
 rates   ->  calm                how often it does them
 """
@@ -11,20 +11,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.background import Background, Report, head_name
+from sfms_robot.app.api.servos import Background, Progress, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.session import RunOptions, run
-from sfms_robot.app.wiring import SIM
+from sfms_robot.app.options import SIM, RunOptions, begin_listening
+from sfms_robot.app.session import run
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError, RobotError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.remote import NamedFeed, open_feed
+from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Observer, Source
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -43,26 +43,24 @@ PUSH: Final = "push"
 EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
 
 
-@dataclass(frozen=True)
 class _PushedPerson:
-    """What a program hears, sees and says."""
+    """The sound and faces that a program hands over, and the robot's own speech."""
 
-    voice: PushedVoice = field(default_factory=PushedVoice)
-    sight: PushedSight = field(default_factory=PushedSight)
-    speech: PushedSpeech = field(default_factory=PushedSpeech)
+    def __init__(self) -> None:
+        self.voice, self.sight, self.speech = PushedVoice(), PushedSight(), PushedSpeech()
 
     def source(self, play: str | None) -> Source:
-        """`play`: the device that plays what it says; None: the program does."""
+        """Return them as a source. `play`: the device that plays the speech; None: the program does."""
         own = self.speech if play is None else open_playback(play, self.speech)
         return PairedSource(self.voice, self.sight, own)
 
 
 class Robot:
-    """A run of `sfms-robot run`, with its options by name, in a thread of its own.
+    """A run of `sfms-robot run`, with its options by name, in its own thread.
 
     `with Robot(...) as robot:` or `Robot(...).start()` and `stop()`: from then on the head moves, until `stop`. In a
-    script, a notebook or any thread; no signal is touched. Methods may be called from any thread, none of them
-    waits for the loop but `start`, `wait` and `stop`.
+    script, a notebook or any thread; no signal is touched. Methods may be called from any thread; only `start`, `wait`
+    and `stop` wait for the loop.
 
     Args:
         head: shipped name, folder, or what `load_head` gave.
@@ -71,11 +69,11 @@ class Robot:
             `Listener`, which is then stepped in a thread of this process.
         audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
         face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
-        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: whoever
-            calls `say` plays it.
+        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: the
+            caller of `say` plays it.
         source: an object of a class derived from `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is
             called in the loop: it must not block.
-        duration_s: seconds after which it ends by itself; None for that of the source.
+        duration_s: seconds after which it ends; None for that of the source.
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
         seed: of everything that is drawn at random.
         record: folder for the recording; `overwrite` for one that has a recording already.
@@ -119,17 +117,28 @@ class Robot:
         if play is not None and source is not None:
             raise InputError(f"play={play!r}: what a source of your own says is not played; leave it out")
         own = listener if not isinstance(listener, (str, Path)) else None
+        self._calmness = parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness")
         self._options = RunOptions(
-            head=head_name(head), port=port, listener=type(own).__name__ if own is not None else str(listener),
-            audio="none" if pushed else audio, face=face, agent_audio=agent_audio, duration_s=duration_s, fast=fast,
-            seed=seed, record=None if record is None else Path(record), overwrite=overwrite, yes=yes,
-            without=tuple(without), play=play, engine=engine,
-            calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
-        )  # fmt: skip
-        prepare_head(self._options.servos)
+            head=head_name(head),
+            port=port,
+            fast=fast,
+            yes=yes,
+            without=tuple(without),
+            listener=type(own).__name__ if own is not None else str(listener),
+            audio="none" if pushed else audio,
+            face=face,
+            agent_audio=agent_audio,
+            play=play,
+            duration_s=duration_s,
+            seed=seed,
+            engine=engine,
+            calmness=self._calmness,
+            record=None if record is None else Path(record),
+            overwrite=overwrite,
+        )
+        prepare_head(self._options)
         config = load_head(self._options.head)
         self._listener = own
-        self._calmness = self._options.calmness or Calmness()
         self._feed: ListenerThread | NamedFeed | None = None
         self._person = _PushedPerson() if pushed else None
         self._speech = self._person.speech if self._person is not None else None
@@ -146,7 +155,7 @@ class Robot:
         return self.start()
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """`stop`. Does not hide an exception that is on its way."""
+        """Stop. An error of it does not replace an exception that is being raised."""
         try:
             self.stop()
         except RobotError as failure:
@@ -163,11 +172,11 @@ class Robot:
         return self
 
     def wait(self, limit_s: float | None = None) -> bool:
-        """Block until it has ended by itself, or for `limit_s`: whether it has."""
+        """Block until the run has ended, or for `limit_s`; return whether it has ended."""
         return self._run is None or self._run.wait(limit_s)
 
     def stop(self) -> None:
-        """Come to rest, torque off. Blocks until then, 4 s at most once it has started; idempotent.
+        """Come to rest, switch torque off. Block until then, 4 s at most once it has started; idempotent.
 
         A joint that was found far outside its range takes what its limits need, up to a minute. Raises once,
         as RobotError, what ended the run before.
@@ -180,13 +189,15 @@ class Robot:
                 self._events.join(EVENTS_LIMIT_S)
 
     def release(self) -> None:
-        """Torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
+        """Switch torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
         if self._run is not None:
             self._run.release()
 
     def halt(self) -> None:
-        """Emergency stop: every joint brakes as fast as its limits allow, from the next tick on; those that bear weight
-        then hold, the others are released. Latched until `resume`. Does not wait, raises nothing.
+        """Stop in an emergency: from the next tick on every joint brakes as fast as its limits allow.
+
+        Joints that bear weight then hold, the others are released. Latched until `resume`. Does not wait,
+        raises nothing.
         """
         if self._run is not None:
             self._run.halt.close("Robot.halt()")
@@ -199,10 +210,10 @@ class Robot:
         if self._run is not None:
             self._run.halt.resume("device")
 
-    # --- what the robot hears and sees ---
+    # --- sound and sight of the robot ---
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
-        """The person's voice: the next piece of sound, of any length. Never blocks.
+        """Hand over the person's voice: the next piece of sound, of any length. Never blocks.
 
         (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
         this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
@@ -211,25 +222,26 @@ class Robot:
         self._pushed("hear").voice.hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | None) -> None:
-        """The person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms. Never blocks.
+        """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
 
-        Raises ConfigError for another shape.
+        Never blocks. Raises ConfigError for another shape.
         """
         self._pushed("see").sight.see(face)
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
-        """What the robot itself says, as `hear`: the listener moves its lips by it and does not take it for the person.
+        """Hand over the robot's own speech, as `hear`: the lips follow it, and it is not taken for the person.
 
-        With `play=` it is played here, as soon as it can be. Else play it yourself, one frame (40 ms) after it is
-        handed over, behind what still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
-        that replaces what was to be played from then on. Up to two minutes may wait. Never blocks. With a microphone
-        (`audio="mic"`) it is taken out of what is heard. Raises InputError beside another source.
+        With `play=` it is played here, as soon as possible. Else play it yourself, one frame (40 ms) after it is handed
+        over, after the speech that still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
+        that replaces the speech from then on. Up to two minutes may wait. Never blocks. With a microphone
+        (`audio="mic"`) it is removed from the sound. Raises InputError beside another source.
         """
         self._spoken("say").say(pcm, rate_hz, at_s)
 
     def hush(self) -> None:
-        """What it still had to say will not be played: you were interrupted. With `play=` what is on its way out of the
-        device is the last that is heard. Never blocks.
+        """Drop the speech that still waits, after an interruption. Never blocks.
+
+        With `play=` the buffer of the device is still played.
         """
         self._spoken("hush").hush()
 
@@ -243,20 +255,20 @@ class Robot:
             raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
         return self._person
 
-    # --- what the face shows ---
+    # --- the face ---
 
     def show(self, face58: Floats | Mapping[str, float], seconds: float = 0.5) -> None:
-        """A face (58,), or some channels by name, over what the listener asks for; for `seconds`, then it goes back.
+        """Show a face (58,), or some channels by name, over the plan of the listener, for `seconds`.
 
-        Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer one takes over where it is. Never
-        blocks. Raises InputError for what is no face.
+        Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer face starts from the present one.
+        Never blocks. Raises InputError for another shape, an unknown channel, or a value that is not finite.
         """
         self._puppet.show(face58, seconds)
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float = 2.0) -> None:
         """Look at a point for `seconds`, in metres from the middle of the head: x forward, y to its left, z up.
 
-        Eyes first, then the head with its share. Never blocks. Raises InputError for what is no point.
+        Eyes first, then the head with its share. Never blocks. Raises InputError for a point that is not finite.
         """
         self._puppet.look_at(x_m, y_m, z_m, seconds)
 
@@ -266,17 +278,17 @@ class Robot:
         return self._knobs
 
     def calm(self, addressed: str | None = None, **per_minute: float | None) -> None:
-        """How often it does what, from now on: `robot.calm(nod=2.2, addressed="assume")`; None: as people do.
+        """Set the rate of events per minute: `robot.calm(nod=2.2, addressed="assume")`; None: the rate of people.
 
-        What is not named stays as it is. A listener that decides no events takes no notice, and none does in virtual
-        time once it runs. Raises ConfigError for an unknown kind and a rate that cannot be.
+        Kinds that are not named keep their rate. It has no effect on a listener that decides no events, nor in virtual
+        time once it runs. Raises ConfigError for an unknown kind and an invalid rate.
         """
-        asked = {**(self._calmness.model_dump()), **per_minute}
-        self._calmness = parse(Calmness, asked if addressed is None else asked | {"addressed": addressed}, "calm")
+        rates = {**self._calmness.model_dump(), **per_minute}
+        self._calmness = parse(Calmness, rates if addressed is None else rates | {"addressed": addressed}, "calm")
         if self._feed is not None:
             self._feed.calm(self._calmness)
 
-    # --- what it does ---
+    # --- events, state, report ---
 
     def on(self, kind: str, callback: Callable[[ListenerEvent], object]) -> None:
         """Call `callback` with a `ListenerEvent` before the servos do it.
@@ -295,42 +307,47 @@ class Robot:
         return "stopped" if self._run is None else self._run.state
 
     def report(self) -> dict[str, Any]:
-        """The report of `run --json`; while it runs, those of its keys that are known, with "exit": "running"."""
+        """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
         if self._run is not None and self._run.report is not None:
             return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
-        seen = None if self._run is None else self._run.progress
-        options = self._options
+        options, progress = self._options, Progress() if self._run is None else self._run.progress
         return {
-            "version": 1, "head": Path(options.head).name, "listener": Path(options.listener).name,
-            "port": options.port, "seed": options.seed, "exit": "running", "torque_unconfirmed": [],
-            "duration_s": seen.seen.time_s if seen is not None and seen.seen is not None else 0.0,
-            "frames": 0 if seen is None else seen.frames, "ticks": 0 if seen is None else seen.ticks,
+            "version": 1,
+            "head": Path(options.head).name,
+            "listener": Path(options.listener).name,
+            "port": options.port,
+            "seed": options.seed,
+            "exit": "running",
+            "torque_unconfirmed": [],
+            "duration_s": 0.0 if progress.seen is None else progress.seen.time_s,
+            "frames": progress.frames,
+            "ticks": progress.ticks,
             "callbacks_detached": dict(self._events.detached),
-        }  # fmt: skip
+        }
 
     def _begin_listening(self) -> ListenerThread | NamedFeed | None:
-        """What listens in real time; in virtual time the run steps a listener inline."""
+        """Return the listener of a run in real time; in virtual time the run steps one inline."""
         if self._listener is not None:
             return ListenerThread(self._listener, self._options.seed)
-        if self._options.fast:
-            return None
-        return open_feed(self._options.listener, self._options.seed, self._calmness, engine=self._options.engine)
+        return None if self._options.fast else begin_listening(replace(self._options, calmness=self._calmness))
 
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
+        options = self._options
+        source: Source | None = self._source
         with ExitStack() as stack:
             self._feed = self._begin_listening()
             if self._feed is not None:
                 stack.callback(self._feed.close)
-            source: Source | None = self._source
-            asked = self._options
-            if self._person is not None:
-                source = self._person.source(asked.play)
-                stack.callback(source.close)
-            elif self._speech is not None:
-                source = open_source(asked.hears, asked.face, asked.duration_s, agent=self._speech, play=asked.play)
+            if source is None and self._speech is not None:
+                if self._person is not None:
+                    source = self._person.source(options.play)
+                else:
+                    source = open_source(
+                        options.hears, options.face, options.duration_s, agent=self._speech, play=options.play
+                    )
                 stack.callback(source.close)
             return run(
-                self._options,
+                options,
                 source=source,
                 feed=self._feed,
                 observers=[progress, self._events],

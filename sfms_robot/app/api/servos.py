@@ -1,29 +1,30 @@
-"""The servos of a head by themselves: joint angles in, readings out, under the same limits as a whole run.
+"""A run in its own thread, and the servos of a head without a listener: joint angles in, readings out.
 
-It is a run whose joint angles come from a program instead of a face. The loop has a thread of its own, so servos are
-written to and looked after at their rate, whatever the program does meanwhile, and their watchdogs stay content.
+`Servos` is a run whose joint angles come from a program instead of a face, under the same limits. The loop has its own
+thread, so servos are written to and polled at their rate whatever the program does, and their watchdogs do not trip.
 """
 
 from __future__ import annotations
 
+import atexit
 import logging
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfms_robot.app.api.background import Background, Report, head_name
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import run_report
-from sfms_robot.app.open_head import HeadOptions, open_head
-from sfms_robot.app.session import Programme, drive_head
-from sfms_robot.app.wiring import SIM
-from sfms_robot.config import Head
-from sfms_robot.errors import BusError, InputError, RobotError
-from sfms_robot.frames import POSE, Doubles, Floats, Reading
-from sfms_robot.ports import Observer
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.config import Head, load_head
+from sfms_robot.errors import BusError, ConfigError, InputError, ModelError, PortError, RobotError
+from sfms_robot.frames import POSE, Doubles, Floats, Reading, SpeakerFrame
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
@@ -32,28 +33,172 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD: Final = 1e-3  # of the goal sent; the servo itself is behind by its lag
 SLACK_RAD: Final = 1e-9  # so that the end of a range, computed twice, is inside it
 _LOOK_S: Final = 0.01
+_KINDS: Final = {kind.exit_code: kind for kind in (PortError, BusError, ModelError)}
+
+Report = Mapping[str, Any]
+
+
+# --- a run in its own thread ----------------------------------------------------------------------------------------
+
+
+class Progress(Observer):
+    """An observer that keeps the newest tick and counts; `came` is set at the first tick, or when the run ends."""
+
+    def __init__(self) -> None:
+        self.came = threading.Event()
+        self.seen: Tick | None = None
+        self.ticks = 0
+        self.frames = 0
+
+    def tick(self, seen: Tick) -> None:
+        self.seen = seen
+        self.ticks += 1
+        self.came.set()
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        self.frames += 1
+
+
+class Background:
+    """A run in its own thread: `work` drives a head until the interrupt is set, and returns its report.
+
+    A program that ends without `stop` is stopped at its exit: the head comes to rest first.
+
+    Attributes:
+        progress: the newest tick, and counts.
+        halt: emergency stop.
+    """
+
+    def __init__(self, work: Callable[[Interrupt, HaltLatch, Observer], Report]) -> None:
+        self._work = work
+        self._interrupt = Interrupt()
+        self.halt = HaltLatch()
+        self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
+        self._error: Exception | None = None
+        self._raised = False
+        self._stopping = False
+        self.progress = Progress()
+        self.report: Report | None = None
+
+    @property
+    def state(self) -> str:
+        """State of the run, see docs/safety.md."""
+        if self._error is not None:
+            return "fault"
+        if self.report is not None:
+            return "stopped"
+        if self._stopping:
+            return "stopping"
+        seen = self.progress.seen
+        return "starting" if seen is None else seen.state
+
+    @property
+    def running(self) -> bool:
+        """True from the first tick until the end, or until it is stopped."""
+        ended = self._error is not None or self.report is not None or self._stopping
+        return self.progress.came.is_set() and not ended
+
+    def start(self) -> None:
+        """Start; block until the first tick, all torque on. Raises the error that prevented it, as RobotError."""
+        atexit.register(self.stop)
+        self._thread.start()
+        try:
+            self.progress.came.wait()
+        except BaseException:  # Ctrl-C: the caller gets no object that it could stop
+            self.stop()
+            raise
+        if not self._thread.is_alive() or self.report is not None or self._error is not None:
+            self._end()
+
+    def wait(self, limit_s: float | None = None) -> bool:
+        """Block until the run has ended, or for `limit_s`; return whether it has ended."""
+        self._thread.join(limit_s)
+        return not self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Come to rest, torque off. Block until then; raise an error of the run once, as RobotError.
+
+        A Ctrl-C while it blocks releases at once.
+        """
+        if self._thread.is_alive() and not self._stopping:
+            self._stopping = True
+            self._interrupt.ask()
+        self._end()
+
+    def release(self) -> None:
+        """Torque off now, without coming to rest first. From any thread; does not wait. Raises nothing."""
+        self._stopping = True
+        self._interrupt.ask()
+        self._interrupt.ask()
+
+    def check(self) -> None:
+        """Raise the error that ended the run, if there is one; once."""
+        if self._error is not None and not self._raised:
+            self._raised = True
+            raise self._error
+
+    def _end(self) -> None:
+        try:
+            self._thread.join()
+        except KeyboardInterrupt:
+            self.release()
+            raise
+        atexit.unregister(self.stop)
+        self.check()
+
+    def _run(self) -> None:
+        try:
+            self.report = self._work(self._interrupt, self.halt, self.progress)
+            if self.report["exit"] == "failed":
+                kind = _KINDS.get(self.report.get("exit_code", 1), RobotError)
+                self._error = kind(self.report["error"])
+        except RobotError as error:
+            self._error = error
+        except Exception as error:
+            log.exception("internal error: the run ends")
+            self._error = RobotError(f"{type(error).__name__}: {error}")
+            self._error.__cause__ = error
+        finally:
+            self.progress.came.set()
+
+
+def head_name(head: Head | str) -> str:
+    """Return the name or folder of a head that a program loaded, as a run opens it.
+
+    Calibration and stored settings of a build lie beside the head's file, so a head runs from there. Raises
+    ConfigError for one that was changed since it was loaded, or was made without a file.
+    """
+    if isinstance(head, str):
+        return head
+    if head.folder is None or load_head(str(head.folder)) != head:
+        raise ConfigError(
+            f"head {head.name!r} is not what its file says: write it to a folder as head.yaml and name that folder"
+        )
+    return str(head.folder)
+
+
+# --- servos without a listener --------------------------------------------------------------------------------------
 
 
 def open_bus(head: Head | str, port: str = SIM, *, yes: bool = False, without: Sequence[str] = ()) -> Servos:
-    """The servos of a head, for a `with` block.
+    """Return the servos of a head, for a `with` block.
 
     Args:
         head: what `load_head` gave, a shipped name, or a folder.
         port: "sim" for emulated servos, a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
-        yes: hobby servos report no position and jump when they come on; confirms that nobody is in their way.
+        yes: hobby servos report no position and jump when they come on; confirms that nothing is in their way.
         without: joints that are left alone.
 
     Raises ConfigError for a head or port that cannot be right.
     """
-    return Servos(HeadOptions(head_name(head), port, False, yes, tuple(without)))
+    return Servos(HeadOptions(head=head_name(head), port=port, yes=yes, without=tuple(without)))
 
 
 class Servos:
     """Joints by their angle. Entering the `with` block connects; leaving it comes to rest and takes torque off.
 
-    Nothing that is written reaches a servo but through the limits of position, speed, acceleration and jerk of the
-    head's file. Methods may be called from any thread. What ended the loop meanwhile (a bus that failed) is raised by
-    the next call, as RobotError.
+    Every angle passes the limits of position, speed, acceleration and jerk of the head's file. Methods may be called
+    from any thread. An error that ended the loop (a bus that failed) is raised by the next call, as RobotError.
 
     Attributes:
         joints: names, in the order of every (J,).
@@ -78,7 +223,7 @@ class Servos:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """`stop`, then the ports are given back. Does not hide an exception that is on its way."""
+        """Stop, and close the ports. An error of it does not replace an exception that is being raised."""
         with self._stack:
             try:
                 self.stop()
@@ -90,7 +235,7 @@ class Servos:
     def enable(self) -> None:
         """Torque on, each joint held where it stands; one outside its range comes in. Blocks until all are on.
 
-        Raises ServoError, BusError. Again: does nothing while torque is on.
+        Raises ServoError, BusError. Does nothing while torque is on.
         """
         if self._run is not None and self._run.running:
             return
@@ -102,9 +247,9 @@ class Servos:
         self._run.start()
 
     def write(self, angles_rad: ArrayLike) -> None:
-        """Where the joints are to go, (J,) rad; the newest counts. Returns at once.
+        """Set the goals of the joints, (J,) rad; the newest replace all others. Returns at once.
 
-        They are on their way with the next tick, as fast as their limits allow, and stay there. Raises InputError,
+        The joints move from the next tick on, as fast as their limits allow, and stay there. Raises InputError,
         with nothing changed, for a shape, a value that is not finite, or an angle outside its joint's range; BusError
         before `enable`.
         """
@@ -112,7 +257,7 @@ class Servos:
         self._target.angles_rad = self._checked(angles_rad)
 
     def move(self, angles_rad: ArrayLike, limit_s: float = 10.0) -> bool:
-        """`write`, then block until the goals sent are there; for `limit_s` at most: whether they are."""
+        """Write, block until the goals sent have arrived or for `limit_s`, and return whether they have."""
         self.write(angles_rad)
         run, target = self._running(), self._target.angles_rad
         for _ in range(round(limit_s / _LOOK_S)):
@@ -124,14 +269,14 @@ class Servos:
         return False
 
     def read(self) -> Mapping[str, Reading]:
-        """Freshest reading of every joint. Before `enable` it asks the servos and blocks for that; then never."""
+        """Return the newest reading of every joint. Before `enable` it polls the servos and blocks for that."""
         if self._run is None:
             return self._opened.bus.poll(self._opened.clock.now_s())
         seen = self._running().progress.seen
         return {} if seen is None else seen.readings
 
     def stop(self) -> None:
-        """Ease to rest and torque off; blocks until then. Raises once what went wrong meanwhile.
+        """Ease to rest, torque off. Block until then; raise an error of the run once.
 
         4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
         """
@@ -144,7 +289,7 @@ class Servos:
             self._run.release()
 
     def report(self) -> Report | None:
-        """After `stop`: the report, with the keys of `run --json`. None before."""
+        """Return the report after `stop`, with the keys of `run --json`; None before."""
         return None if self._run is None else self._run.report
 
     def _running(self) -> Background:
@@ -168,13 +313,13 @@ class Servos:
 
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, observer: Observer) -> Report:
         opened, alone = self._opened, NobodyThere()
-        programme = Programme(alone, alone, None, retargeter=self._target, halt=halt, observers=[observer])
-        drove = drive_head(opened, programme, interrupt, signals=False)
+        parts = parts_of(opened, alone, alone, retargeter=self._target, halt=halt, observers=[observer])
+        drove = drive_head(opened, parts, interrupt, signals=False)
         return run_report(opened, drove, alone, "none", 0)
 
 
 class _Target:
-    """A `ports.Retargeter` that gives the angles (J,) written last, whatever the face."""
+    """A `Retargeter` that returns the angles (J,) written last, for every face."""
 
     def __init__(self, angles_rad: Doubles, joints: Sequence[str] = ()) -> None:
         self.angles_rad = angles_rad
@@ -187,5 +332,5 @@ class _Target:
         return self.angles_rad, None
 
     def shown_pose(self, motion: Floats, knobs: Any = None) -> Doubles:
-        """No neck that anybody makes up for: as asked."""
+        """Return the pose unchanged: no neck is solved."""
         return motion[..., POSE].astype(np.float64)

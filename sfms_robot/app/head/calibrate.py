@@ -1,9 +1,9 @@
-"""`head calibrate`: joint by joint, where its ends and its rest are and which way it turns.
+"""`head calibrate`: joint by joint, the ends of its range, its rest and its direction.
 
-    who answers -> torque off, moved by hand, or moved by keys -> ends, rest, direction -> a slow check -> saved
+    the servo that answers -> torque off and by hand, or by keys -> ends, rest, direction -> a slow check -> saved
 
 All it needs of a terminal is a line out and a line in, so it works over any connection. Every joint is saved when it
-is done: a calibration that is stopped goes on there the next time. Only the overlay of this build is written.
+is done: a calibration that is stopped continues there the next time. Only the overlay of this build is written.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 
-from sfms_robot.app.calibrated_head import identify
-from sfms_robot.app.open_head import HeadOptions, build_bus, build_motion, open_wires
-from sfms_robot.app.wiring import SIM
+from sfms_robot.app.open_head import build_bus, build_motion, fastest_hz, identify
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.servo.move import SPEED_DEG_S
+from sfms_robot.app.wiring import Opened, open_wires
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.overlay import (
     CalibrateLayer,
     Identity,
-    Layered,
     Measured,
     Overlay,
     head_hash,
@@ -35,7 +35,7 @@ from sfms_robot.config.overlay import (
     save_overlay,
 )
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import BusError, ConfigError, ServoError, TorqueError
+from sfms_robot.errors import BusError, ConfigError, RobotError, ServoError, TorqueError
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.families import family_named
@@ -43,39 +43,38 @@ from sfms_robot.servo.families import family_named
 LEAST_TRAVEL_DEG: Final = 2.0
 ARRIVED_DEG: Final = 3.0  # a held servo sags a little
 STEPS_DEG: Final[Mapping[str, float]] = {"+": 1.0, "-": -1.0, "++": 5.0, "--": -5.0}
-Point = Literal["min", "max", "rest"]
-TITLES: Final[Mapping[Point, str]] = {"min": "LOWER end", "max": "UPPER end", "rest": "REST"}
-PACE_DEG_S: Final = 20.0
+TITLES: Final[Mapping[str, str]] = {"min": "LOWER end", "max": "UPPER end", "rest": "REST"}
 _PERIOD_S: Final = 0.01
 _TRIES: Final = 20
-_PULSE_US: Final = (500.0, 2500.0)  # what a hobby servo may be sent, whatever its board can make
+_PULSE_US: Final = (500.0, 2500.0)  # the most that a hobby servo may be sent, whatever its board can generate
 
 
 class Talk(Protocol):
-    """Somebody who reads and answers lines. `ask` raises EOFError or KeyboardInterrupt when they have gone."""
+    """The user, by lines. `ask` raises EOFError or KeyboardInterrupt when they have gone."""
 
     def say(self, text: str) -> None: ...
 
     def ask(self, prompt: str) -> str: ...
 
 
-class Stopped(Exception):  # noqa: N818  (nothing is wrong)
-    """Whoever calibrates wants to stop here."""
+class SkippedError(ServoError):
+    """The user leaves this joint out."""
 
 
-class Skipped(Exception):  # noqa: N818
-    """Not this joint."""
+class AgainError(RobotError):
+    """This joint is to be measured again; the text says why."""
 
 
-class Again(Exception):  # noqa: N818
-    """This joint once more; the text says why."""
+@dataclass(kw_only=True)
+class CalibrationOutcome:
+    """The result of a calibration.
 
-
-@dataclass
-class Outcome:
-    """What came of it: joints measured now and before, joints left out with the reason, and what the check found.
-
-    `torque_unconfirmed`: joints whose torque came on and could not be confirmed off.
+    Attributes:
+        measured, before: joints measured now, and earlier.
+        skipped: joints left out, with the reason.
+        missing: joints without a measurement that holds.
+        problems: found when the file was read back.
+        torque_unconfirmed: joints whose torque came on and could not be confirmed off.
     """
 
     head: str
@@ -92,196 +91,184 @@ class Outcome:
         return {"version": 1, **vars(self), "file": str(self.file)}
 
 
-def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> Outcome:
+def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> CalibrationOutcome:
     """Lead through the joints of a head on `port`, or those named.
 
-    Emulated servos (`sim`) are for practice: what is measured there is kept apart and never used. `again`: also joints
+    Emulated servos (`sim`) are for practice: their measurements are kept apart and never used. `again`: also joints
     that are measured already. Raises RobotError.
     """
     head = load_head(name)
-    with open_wires(head, HeadOptions(name, port)) as where:
+    with open_wires(head, HeadOptions(head=name, port=port)) as where:
         file = overlay_file(head.name, practice=port == SIM)
-        return calibrate_on(name, where, RealClock(), talk, file, date.today(), joints, again)
+        return calibrate_on(name, where, RealClock(), talk, file, date.today(), joints=joints, again=again)
 
 
 def calibrate_on(
     name: str,
-    where: Mapping[str, Chain | str],
+    where: Opened,
     clock: Clock,
     talk: Talk,
     file: Path,
     today: date,
+    *,
     joints: Sequence[str] = (),
     again: bool = False,
-) -> Outcome:
-    """As `calibrate`, on buses that are there, into `file`."""
+) -> CalibrationOutcome:
+    """Calibrate as `calibrate` does, on buses that are there, into `file`."""
     head, sha256 = load_head(name), head_hash(name)
     for joint in joints:
         if joint not in head.joints:
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", head.joints)
     wanted = list(joints or head.joints)
-    outcome = Outcome(head.name, file)
+    outcome = CalibrationOutcome(head=head.name, file=file)
     overlay = load_overlay(head, file)
     servos = identify(head, wanted, where, clock)
+    guide = _Guide(talk, today)
     try:
-        overlay = _of_this_file(overlay, sha256, talk)
+        if (old := overlay.calibrate) is not None and old.head_sha256 != sha256 and old.joints:
+            kept = old.joints if guide.keeps_old() else {}
+            overlay = overlay.model_copy(update={"calibrate": CalibrateLayer(head_sha256=sha256, joints=kept)})
         holds = layered(head, overlay, sha256, servos).calibrated
         outcome.before = [joint for joint in wanted if joint in holds and not again]
         todo = [joint for joint in wanted if joint not in outcome.before]
         talk.say(f"{head.name}: {len(outcome.before)} joints are measured, {len(todo)} to go; saved to {file}")
-        talk.say("Enter takes what stands first; q stops at any question, and the next time goes on from there.")
+        talk.say("Enter takes the first choice; q stops at any question, and the next time continues from there.")
         for number, joint in enumerate(todo, 1):
-            talk.say(f"\n[{number}/{len(todo)}] {_described(joint, head.joints[joint])}")
-            found = _one(head, joint, servos[joint], where, clock, talk, today, outcome)
-            if found is not None:
-                overlay = _with(overlay, sha256, joint, found)
-                save_overlay(overlay, file)
-                outcome.measured.append(joint)
-                talk.say("  saved")
-    except (Stopped, KeyboardInterrupt):
+            config = head.joints[joint]
+            note = f" ({config.note})" if config.note else ""
+            servo = f"{config.model} id {config.id} on bus {config.bus}"
+            talk.say(f"\n[{number}/{len(todo)}] {joint}{note}: {servo}")
+            try:
+                identity = servos[joint]
+                if identity is None:
+                    raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
+                by_hand = guide.asks_how(family_named(head.buses[config.bus].family).board)
+                stored, unconfirmed = identity.stored, outcome.torque_unconfirmed
+                with probe(head, joint, where[config.bus], clock, stored=stored, unconfirmed=unconfirmed) as at:
+                    found = guide.measure_until_right(config, identity, at, by_hand)
+            except (BusError, ServoError) as reason:
+                outcome.skipped[joint] = str(reason)
+                talk.say(f"  left out: {reason}")
+                continue
+            overlay = _with(overlay, sha256, joint, found)
+            save_overlay(overlay, file)
+            outcome.measured.append(joint)
+            talk.say("  saved")
+    except KeyboardInterrupt:
         outcome.exit = "interrupted"
     _check(head, sha256, servos, outcome)
     return outcome
 
 
-def _one(
-    head: Head,
-    joint: str,
-    identity: Identity | None,
-    where: Mapping[str, Chain | str],
-    clock: Clock,
-    talk: Talk,
-    today: date,
-    outcome: Outcome,
-) -> Measured | None:
-    """Measure one joint until it is right; None when it is left out."""
-    config = head.joints[joint]
-    try:
-        if identity is None:
-            raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
-        by_hand = _ask_how(talk, jumps(head, joint))
-        unconfirmed = outcome.torque_unconfirmed
-        with probe(head, joint, where[config.bus], clock, stored=identity.stored, unconfirmed=unconfirmed) as at:
-            while True:
-                try:
-                    return _measure(config, identity, at, by_hand, talk, today)
-                except Again as reason:
-                    talk.say(f"  {reason}; once more")
-    except (Skipped, BusError, ServoError) as reason:
-        outcome.skipped[joint] = str(reason)
-        talk.say(f"  left out: {reason}")
-        return None
+class _Guide:
+    """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the lines."""
 
+    def __init__(self, talk: Talk, today: date) -> None:
+        self._talk, self._today = talk, today
 
-def _ask_how(talk: Talk, blind: bool) -> bool:
-    """True: by hand."""
-    if blind:
-        _ask(talk, "  It reports no position and JUMPS when it comes on: keep clear. Enter: by keys, s: skip > ")
-        return False
-    return _ask(talk, "  Enter: by hand, torque off; k: by keys; s: skip > ") != "k"
-
-
-def _measure(joint: Joint, identity: Identity, at: Probe, by_hand: bool, talk: Talk, today: date) -> Measured:
-    ticks = {point: _point(joint, point, at, by_hand, talk) for point in _points(joint)}
-    low, high = ticks["min"], ticks["max"]
-    travel_deg = abs(high - low) / at.ticks_per_deg
-    if travel_deg < LEAST_TRAVEL_DEG:
-        raise Again(f"its ends are only {travel_deg:.1f} deg apart")
-    rest = ticks.get("rest", low if joint.rest_deg == joint.min_deg else high)
-    if not min(low, high) <= rest <= max(low, high):
-        raise Again(f"its rest, {rest} ticks, is not between its ends, {low} and {high}")
-    sign: Literal[1, -1] = 1 if high > low else -1
-    talk.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {joint.max_deg - joint.min_deg:.1f})")
-    if sign != joint.sign:
-        turns = "fall" if sign < 0 else "rise"
-        question = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "
-        if _ask(talk, question) == "n":
-            raise Again("its ends were mixed up")
-    _look(low, high, rest, at, talk)
-    found = {"date": today, "min_ticks": low, "center_ticks": rest, "max_ticks": high, "sign": sign}
-    return Measured(**identity.model_dump(), **found)
-
-
-def _points(joint: Joint) -> tuple[Point, ...]:
-    """A joint that rests at an end has no rest of its own to show."""
-    return ("min", "max") if joint.rest_deg in (joint.min_deg, joint.max_deg) else ("min", "max", "rest")
-
-
-def _point(joint: Joint, point: Point, at: Probe, by_hand: bool, talk: Talk) -> int:
-    where = f"  {TITLES[point]} ({getattr(joint, f'{point}_deg'):g} deg in its file)"
-    if by_hand:
-        at.limp()
-        _ask(talk, f"{where}: move it there by hand, not into its stop. Enter records > ")
-        return at.ticks()
-    while True:
-        key = _ask(talk, f"{where}, now at {at.ticks()} ticks: + - (1 deg) ++ -- (5 deg) or degrees; Enter records > ")
-        if not key:
-            return at.ticks()
+    def keeps_old(self) -> bool:
+        """Ask whether measurements for an older head file are kept."""
         try:
-            at.by(STEPS_DEG[key] if key in STEPS_DEG else float(key))
-        except (ValueError, OverflowError):
-            talk.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
-
-
-def _look(low: int, high: int, rest: int, at: Probe, talk: Talk) -> None:
-    """Go to the ends and to rest slowly, and ask whether that was right."""
-    if _ask(talk, "  Enter: check it, slowly to both ends and to rest; n: without a check > ") == "n":
-        return
-    for ticks in (low, high, rest):
-        at.go(ticks)
-        off_deg = abs(at.ticks() - ticks) / at.ticks_per_deg
-        if off_deg > ARRIVED_DEG:
-            talk.say(
-                f"  at {at.ticks()} ticks in place of {ticks}: it is {off_deg:.1f} deg off, is something in its way?"
+            return (
+                self._ask("The head's file has changed since. Enter: measure again; k: keep the measurements > ") == "k"
             )
-    if _ask(talk, "  Was that right? Enter: yes, n: measure again > ") == "n":
-        raise Again("it was not right")
+        except SkippedError:
+            return False
 
+    def asks_how(self, blind: bool) -> bool:
+        """Ask whether the joint is moved by hand; one whose servo reports no position is moved by keys."""
+        if blind:
+            self._ask("  It reports no position and JUMPS when it comes on: keep clear. Enter: by keys, s: skip > ")
+            return False
+        return self._ask("  Enter: by hand, torque off; k: by keys; s: skip > ") != "k"
 
-def _ask(talk: Talk, prompt: str) -> str:
-    try:
-        answer = talk.ask(prompt).strip().lower()
-    except (EOFError, KeyboardInterrupt):
-        raise Stopped from None
-    if answer == "q":
-        raise Stopped
-    if answer == "s":
-        raise Skipped("skipped")
-    return answer
+    def measure_until_right(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
+        """Measure a joint until the measurement can be right. Raises SkippedError, BusError, ServoError."""
+        while True:
+            try:
+                return self._measure(joint, identity, at, by_hand)
+            except AgainError as reason:
+                self._talk.say(f"  {reason}; once more")
 
-
-def _described(name: str, joint: Joint) -> str:
-    note = f" ({joint.note})" if joint.note else ""
-    return f"{name}{note}: {joint.model} id {joint.id} on bus {joint.bus}"
-
-
-def _of_this_file(overlay: Overlay, sha256: str, talk: Talk) -> Overlay:
-    """Measurements of an older head file are kept only if somebody says so."""
-    old = overlay.calibrate
-    if old is None or old.head_sha256 == sha256 or not old.joints:
-        return overlay
-    try:
-        kept = (
-            _ask(talk, "The head's file has changed since. Enter: measure again; k: keep what was measured > ") == "k"
+    def _measure(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
+        rests_at_end = joint.rest_deg in (joint.min_deg, joint.max_deg)
+        low, high = (self._point(joint, point, at, by_hand) for point in ("min", "max"))
+        rest = low if joint.rest_deg == joint.min_deg else high
+        if not rests_at_end:
+            rest = self._point(joint, "rest", at, by_hand)
+        travel_deg = abs(high - low) / at.ticks_per_deg
+        if travel_deg < LEAST_TRAVEL_DEG:
+            raise AgainError(f"its ends are only {travel_deg:.1f} deg apart")
+        if not min(low, high) <= rest <= max(low, high):
+            raise AgainError(f"its rest, {rest} ticks, is not between its ends, {low} and {high}")
+        sign: Literal[1, -1] = 1 if high > low else -1
+        in_file = joint.max_deg - joint.min_deg
+        self._talk.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {in_file:.1f})")
+        if sign != joint.sign:
+            turns = "fall" if sign < 0 else "rise"
+            said = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "
+            if self._ask(said) == "n":
+                raise AgainError("its ends were mixed up")
+        self._check_ends(low, high, rest, at)
+        return Measured(
+            **identity.model_dump(), date=self._today, min_ticks=low, center_ticks=rest, max_ticks=high, sign=sign
         )
-    except Skipped:
-        kept = False
-    joints = old.joints if kept else {}
-    return overlay.model_copy(update={"calibrate": CalibrateLayer(head_sha256=sha256, joints=joints)})
+
+    def _point(self, joint: Joint, point: str, at: JointProbe, by_hand: bool) -> int:
+        """Return the ticks at which the user says that the joint is at its end or its rest."""
+        where = f"  {TITLES[point]} ({getattr(joint, f'{point}_deg'):g} deg in its file)"
+        if by_hand:
+            at.limp()
+            self._ask(f"{where}: move it there by hand, not into its stop. Enter records > ")
+            return at.ticks()
+        while True:
+            keys = "+ - (1 deg) ++ -- (5 deg) or degrees; Enter records > "
+            key = self._ask(f"{where}, now at {at.ticks()} ticks: {keys}")
+            if not key:
+                return at.ticks()
+            try:
+                at.by(STEPS_DEG[key] if key in STEPS_DEG else float(key))
+            except (ValueError, OverflowError):
+                self._talk.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
+
+    def _check_ends(self, low: int, high: int, rest: int, at: JointProbe) -> None:
+        """Move to the ends and to rest slowly, and ask whether that was right. Raises AgainError if not."""
+        if self._ask("  Enter: check it, slowly to both ends and to rest; n: without a check > ") == "n":
+            return
+        for ticks in (low, high, rest):
+            at.go(ticks)
+            off_deg = abs(at.ticks() - ticks) / at.ticks_per_deg
+            if off_deg > ARRIVED_DEG:
+                place = f"at {at.ticks()} ticks in place of {ticks}"
+                self._talk.say(f"  {place}: it is {off_deg:.1f} deg off, is something in its way?")
+        if self._ask("  Was that right? Enter: yes, n: measure again > ") == "n":
+            raise AgainError("it was not right")
+
+    def _ask(self, prompt: str) -> str:
+        try:
+            answer = self._talk.ask(prompt).strip().lower()
+        except EOFError:
+            answer = "q"
+        if answer == "q":
+            raise KeyboardInterrupt
+        if answer == "s":
+            raise SkippedError("skipped")
+        return answer
 
 
 def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay:
+    """Return the overlay with a measurement added."""
     joints = overlay.calibrate.joints if overlay.calibrate is not None else {}
     layer = CalibrateLayer(head_sha256=sha256, joints={**joints, joint: found})
     overlay = overlay.model_copy(update={"calibrate": layer})
     return overlay.recorded(sha256, joint, found.stored) if overlay.stored is not None else overlay
 
 
-def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: Outcome) -> None:
-    """Read back what was written, lay it over the head, and build the head's motion from it."""
+def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: CalibrationOutcome) -> None:
+    """Read the file back, apply it to the head, and build the head's motion from it."""
     try:
-        layers: Layered = layered(head, load_overlay(head, outcome.file), sha256, servos)
-        build_motion(layers.head, max(bus.rate_hz for bus in head.buses.values()))
+        layers = layered(head, load_overlay(head, outcome.file), sha256, servos)
+        build_motion(layers.head, fastest_hz(head))
     except ConfigError as error:
         outcome.problems.append(str(error))
         return
@@ -289,17 +276,17 @@ def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outco
     outcome.missing = [joint for joint in head.joints if joint not in layers.calibrated]
 
 
-# --- one joint on its own, in servo ticks ---------------------------------------------------------------------------
+# --- one joint alone, in servo ticks --------------------------------------------------------------------------------
 
 
-class Probe:
-    """A joint whose bus is open: where it stands, limp, and by keys.
+class JointProbe:
+    """A joint on an open bus.
 
     The bus is opened with this joint alone and with the whole travel of its servo as its range, for its range has yet
     to be found. It moves only on request, at a slow and steady pace.
 
     Attributes:
-        tells: whether its servo says where it stands.
+        tells: whether its servo reports its position.
         lowest, highest: ticks it may be sent to.
     """
 
@@ -313,11 +300,11 @@ class Probe:
 
     @property
     def ticks_per_deg(self) -> float:
-        """Of the joint, without direction."""
+        """Ticks per degree of the joint, without direction."""
         return abs(self._per_rad) / math.degrees(1.0)
 
     def ticks(self) -> int:
-        """Where it stands; for a servo that does not tell, where it was sent. Raises ServoError."""
+        """Return its position; of a servo that reports none, its goal. Raises ServoError."""
         if not self.tells:
             return self._ticks(self._goal_rad if self._goal_rad is not None else self._joint.rest_rad)
         for _ in range(_TRIES):
@@ -325,7 +312,7 @@ class Probe:
             if reading.position_rad is not None and reading.age_s < 2 * _PERIOD_S:
                 return self._ticks(reading.position_rad)
             self._clock.wait_until(self._clock.now_s() + _PERIOD_S)
-        raise ServoError(f"{self.name} (id {self._joint.id}) does not say where it stands")
+        raise ServoError(f"{self.name} (id {self._joint.id}) does not report its position")
 
     def limp(self) -> None:
         """Switch torque off, for a hand to move it. Raises TorqueError where that could not be confirmed."""
@@ -335,11 +322,11 @@ class Probe:
         self._goal_rad = None
 
     def go(self, ticks: int) -> int:
-        """Slowly to `ticks`, torque on from where it stands; held there. Returns the ticks it was sent to."""
+        """Move slowly to `ticks`, torque on from where it stands, and hold. Blocks; returns the ticks of the goal."""
         if self._goal_rad is None:
             self._goal_rad = float(self._bus.enable([self.name])[0])
         start_rad, to_rad = self._goal_rad, self._angle(min(max(ticks, self.lowest), self.highest))
-        steps = max(1, math.ceil(math.degrees(abs(to_rad - start_rad)) / (PACE_DEG_S * _PERIOD_S)))
+        steps = max(1, math.ceil(math.degrees(abs(to_rad - start_rad)) / (SPEED_DEG_S * _PERIOD_S)))
         began_s = self._clock.now_s()
         for k in range(1, steps + 1):
             self._goal_rad = start_rad + (to_rad - start_rad) * k / steps
@@ -349,7 +336,7 @@ class Probe:
         return self._ticks(to_rad)
 
     def by(self, step_deg: float) -> int:
-        """As `go`, from where it is held, so that one that sags under its load still moves. Raises ValueError."""
+        """Move as `go` does, by a step from the goal, so that a joint that sags still moves. Raises ValueError."""
         here = self.ticks() if self._goal_rad is None else self._ticks(self._goal_rad)
         return self.go(here + round(step_deg * self.ticks_per_deg))
 
@@ -363,7 +350,7 @@ class Probe:
 @contextmanager
 def probe(
     head: Head, name: str, where: Chain | str, clock: Clock, *, stored: Mapping[str, int], unconfirmed: list[str]
-) -> Iterator[Probe]:
+) -> Iterator[JointProbe]:
     """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
 
     `stored`: zero and direction as its servo stores them; a measurement may begin from any. Raises RobotError for a
@@ -378,16 +365,11 @@ def probe(
     bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True)
     try:
         bus.connect()
-        yield Probe(name, joint, bus, clock)
+        yield JointProbe(name, joint, bus, clock)
     finally:
         bus.stop("release")
         unconfirmed += bus.statistics()["torque_unconfirmed"]
         bus.close()
-
-
-def jumps(head: Head, name: str) -> bool:
-    """Whether the servo comes on with a jump: one that does not tell where it stands."""
-    return family_named(head.buses[head.joints[name].bus].family).board
 
 
 def _ticks_per_deg(joint: Joint) -> float:
@@ -395,7 +377,7 @@ def _ticks_per_deg(joint: Joint) -> float:
 
 
 def _travel_ticks(joint: Joint) -> tuple[int, int]:
-    """First and last tick that the servo, or a common one on a board, may be sent to."""
+    """Return the first and last tick that the servo, or a common one on a board, may be sent to."""
     firmware = load_firmware_map(joint.model)
     if firmware.pulse_us is not None and firmware.tick_us is not None:
         shortest, longest = max(firmware.pulse_us.min, _PULSE_US[0]), min(firmware.pulse_us.max, _PULSE_US[1])

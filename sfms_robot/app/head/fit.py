@@ -1,12 +1,16 @@
-"""`head fit`: a recording of a head's joints, and of what a face tracker saw on it -> drives that look as asked.
+"""`head fit`: a recording of a head's joints, and a face tracker's track of it -> drives that show each expression.
 
 A recording is a folder: `run.mcap` as `run --record` and `head fit --babble` write it, and beside it `face.csv` (or
-.csv.gz), the track of the robot's own face on the same clock. How late the tracker is, is found from the two.
+.csv.gz), the track of the robot's face on the same clock. The delay of the tracker is found from the two.
+
+`--babble` moves every channel that the head follows up and down once, alone; then several at a time, at random, as
+faces do. Poses of the head stay at rest, so that a camera in front of it sees the face throughout.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -14,22 +18,80 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.head.pose import FaceTrack
+from sfms_robot.app.listen.report import Drove
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import drives
 from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.tracker import Skin, Tracker
+from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import Units
 from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
+from sfms_robot.runtime.recorder import Recorder
+from sfms_robot.runtime.safety import EASE_S
+from sfms_robot.signals.spaces import bounded_least_squares
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
 FACE_FILES: Final = ("face.csv", "face.csv.gz")
 PRACTICE_NOISE: Final = 0.01
+ALONE_S: Final = 1.6  # of a channel, up and down again
+TOGETHER_S: Final = 1.0  # from one random face to the next
+AT_ONCE: Final = 6  # channels in a random face
 _DELAYS_S: Final = np.arange(-0.1, 0.41, 0.02)
 _BLOCK: Final = 50  # frames; every fifth block is held out
 _MOVING: Final = 0.05  # joint units
+_LEAST_MOTION_PRICE: Final = 0.002  # of skin motion, against a joint's value that is not explained
+_SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
+
+
+# --- babble -----------------------------------------------------------------------------------------------------------
+
+
+def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> tuple[Head, Drove]:
+    """Move, and write DIR/run.mcap. Block until then; return the head and the end of the drive.
+
+    Raises RobotError, the head at rest.
+    """
+    with ExitStack() as stack:
+        opened = stack.enter_context(open_head(options))
+        blind = set(opened.motion.retargeter.blind_channels)
+        faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
+        recorder = Recorder(
+            record,
+            list(opened.config.joints),
+            when_full="wait" if options.fast else "drop",
+            about={"head": opened.config.name},
+        )
+        stack.callback(recorder.close)
+        drove = faces.play(opened, recorder)
+    if drove.error is not None:
+        raise drove.error
+    return opened.config, drove
+
+
+def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceTrack:
+    """Return each channel alone, then random faces until the time is over; neutral at both ends."""
+    rng = np.random.default_rng(seed)
+    times_s, shapes = [EASE_S], [np.zeros(len(BLENDSHAPES))]
+    for channel in channels:
+        for value in (1.0, 0.0):
+            times_s.append(times_s[-1] + ALONE_S / 2)
+            shapes.append(np.eye(len(BLENDSHAPES))[channel] * value)
+    while channels and times_s[-1] < duration_s - TOGETHER_S:
+        face = np.zeros(len(BLENDSHAPES))
+        face[rng.permutation(channels)[:AT_ONCE]] = rng.uniform(0.0, 1.0, min(AT_ONCE, len(channels)))
+        times_s.append(times_s[-1] + TOGETHER_S)
+        shapes.append(face)
+    motion = np.zeros((len(shapes) + 1, MOTION_DIM), dtype=np.float32)
+    motion[:-1, SHAPES] = shapes
+    return FaceTrack(np.array([*times_s, times_s[-1] + TOGETHER_S]), motion, smooth=True)
+
+
+# --- fit --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -43,7 +105,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class FitRow:
-    """One joint, rms errors in joint units on held-out frames: what it looked like against what it was told.
+    """One joint: rms errors in joint units on held-out frames, of the seen value against the commanded one.
 
     `before` with the drive of the file, `after` with the response learnt; None for a joint that hardly moved.
     """
@@ -54,28 +116,26 @@ class FitRow:
     after: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HeadFit:
-    """What was learnt. `file` is where it was written."""
+    """The result of a fit; `file` is where it was written."""
 
     head: str
     frames: int
     delay_s: float
     before: float
     after: float
-    rows: Sequence[FitRow]
+    joints: Sequence[FitRow]
     file: str
 
     def as_dict(self) -> dict[str, Any]:
-        told = asdict(self)
-        told["joints"] = told.pop("rows")
-        return told
+        return asdict(self)
 
 
 def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:
-    """Learn from a recording and write the overlay's fit layer. Raises ConfigError for what cannot be used.
+    """Learn from a recording and write the overlay's fit layer. Raises ConfigError for a recording that cannot be used.
 
-    `practice`: what was seen is the virtual head; the overlay goes beside that of the real one and is never used.
+    `practice`: the track is of the virtual head; the overlay goes beside that of the real one and is never used.
     """
     shipped, sha256 = load_head(name), head_hash(name)
     file = overlay_file(shipped.name, practice)
@@ -102,7 +162,15 @@ def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:
     layered(shipped, changed := overlay.model_copy(update={"fit": layer}), sha256)  # refuses what is not sound
     save_overlay(changed, file)
     before, after = (rms(np.array([getattr(row, key) for row in measured])) for key in ("before", "after"))
-    return HeadFit(head.name, len(has), pairs.delay_s, before, after, rows, str(file))
+    return HeadFit(
+        head=head.name,
+        frames=len(has),
+        delay_s=pairs.delay_s,
+        before=before,
+        after=after,
+        joints=rows,
+        file=str(file),
+    )
 
 
 def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[FitRow]:
@@ -118,7 +186,7 @@ def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks:
 
 
 def read_pairs(head: Head, folder: Path) -> Pairs:
-    """Joints and face of a recording at the instants of its face track. Raises ConfigError."""
+    """Return joints and face of a recording at the instants of its face track. Raises ConfigError."""
     run = read_recording(folder)
     if missing := [joint for joint in head.joints if joint not in run.joints]:
         recorded = run.about.get("head", "?")
@@ -146,7 +214,7 @@ def _at(at_s: Doubles, times_s: Doubles, values: Doubles) -> Doubles:
 
 
 def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes: Floats) -> float:
-    """How late the tracker is: where joints and looks go together best."""
+    """Return the delay of the tracker [s]: the one at which joints and faces correlate best."""
     units = Units.of(head)
     looks = looks_like(head, shapes)
     moving = np.flatnonzero((np.ptp(units.values(angles), axis=0) > _MOVING) & (np.ptp(looks, axis=0) > _MOVING))
@@ -163,7 +231,7 @@ def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes:
 
 
 def see_virtual_face(head: Head, folder: Path, seed: int = 1) -> None:
-    """Beside a recorded run on emulated servos, what a tracker would have seen: a face with a skin of its own."""
+    """Write the track of a virtual face, with a random skin, beside a recorded run on emulated servos."""
     run = read_recording(folder)
     columns = [run.joints.index(joint) for joint in head.joints]
     step = max(1, round(0.04 / float(np.median(np.diff(run.times_s)))))
@@ -171,15 +239,86 @@ def see_virtual_face(head: Head, folder: Path, seed: int = 1) -> None:
     tracker = virtual_tracker(head, Skin.hidden(len(columns), seed), PRACTICE_NOISE)
     motion = np.zeros((len(angles), MOTION_DIM), dtype=np.float32)
     motion[:, SHAPES] = tracker.seen(Units.of(head).values(angles), np.random.default_rng(seed))
-    known = frozenset(BLENDSHAPES)
-    write_track(folder / FACE_FILES[0], Track(run.times_s[::step], motion, known))
+    write_track(folder / FACE_FILES[0], Track(run.times_s[::step], motion, frozenset(BLENDSHAPES)))
 
 
 def virtual_tracker(head: Head, skin: Skin, noise: float = 0.0) -> Tracker:
-    """A tracker that sees the virtual face of this head."""
-    return Tracker(showing(head), skin, noise)
+    """Return a tracker that sees the virtual face of this head."""
+    return Tracker(looks_like(head, np.eye(len(BLENDSHAPES), dtype=np.float32)).T, skin, noise)
 
 
-def showing(head: Head) -> Doubles:
-    """(J, 52) the value that every blendshape, alone and at 1, asks of every joint."""
-    return looks_like(head, np.eye(len(BLENDSHAPES), dtype=np.float32)).T
+# --- a virtual tracker ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Skin:
+    """The response of a skin to each joint's value: gain x (|value| beyond a dead band)^power, on its own side of rest.
+
+    Each is (2, J): below rest, above rest.
+    """
+
+    gain: Doubles
+    power: Doubles
+    dead_band: Doubles
+
+    @classmethod
+    def plain(cls, joints: int) -> Skin:
+        """Return the skin that the head's file assumes."""
+        ones = np.ones((2, joints))
+        return cls(ones, ones, 0 * ones)
+
+    @classmethod
+    def hidden(cls, joints: int, seed: int) -> Skin:
+        """Return a random skin."""
+        rng = np.random.default_rng(seed)
+        shape = (2, joints)
+        return cls(rng.uniform(0.85, 1.3, shape), rng.uniform(0.5, 2.0, shape), rng.uniform(0.0, 0.06, shape))
+
+    def __call__(self, values: Doubles) -> Doubles:
+        """Return the look (N, J) of values (N, J) in joint units."""
+        gain, power, dead = (np.where(values > 0, each[1], each[0]) for each in (self.gain, self.power, self.dead_band))
+        beyond = np.maximum(np.abs(values) - dead, 0.0) / (1.0 - dead)
+        out: Doubles = np.sign(values) * gain * beyond**power
+        return out
+
+
+class Tracker:
+    """A face tracker before the robot's face: joint values in, blendshapes out.
+
+    It reports the face that explains the look of the joints: of all blendshapes 0..1 that would drive the joints so,
+    those that move the virtual head's skin least. Then it adds noise.
+
+    showing: (J, 52) the value of each joint for each blendshape at 1. noise: of a blendshape, 1 sigma.
+    """
+
+    def __init__(self, showing: Doubles, skin: Skin, noise: float = 0.0, human: HumanHead | None = None) -> None:
+        self._skin, self._noise = skin, noise
+        motion = skin_motion(human)
+        prices = [
+            np.sqrt(_LEAST_MOTION_PRICE) * np.linalg.cholesky(motion + 1e-9 * np.eye(len(motion))).T,
+            _SIZE_PRICE * np.eye(len(motion)),
+        ]
+        self._matrix = np.concatenate([showing, *prices])
+
+    def face(self, values: Doubles) -> Doubles:
+        """Return blendshapes (N, 52) 0..1 for joint values (N, J), without noise."""
+        shown = self._skin(values)
+        none, all_ = np.zeros(len(BLENDSHAPES)), np.ones(len(BLENDSHAPES))
+        wanted = np.pad(shown, ((0, 0), (0, len(self._matrix) - shown.shape[1])))
+        return bounded_least_squares(self._matrix, wanted, none, all_)
+
+    def seen(self, values: Doubles, rng: np.random.Generator) -> Floats:
+        """Return `face` with noise."""
+        face = self.face(values)
+        return np.clip(face + rng.normal(0.0, self._noise, face.shape), 0.0, 1.0).astype(np.float32)
+
+
+def skin_motion(human: HumanHead | None = None) -> Doubles:
+    """Return (52, 52) how much two blendshapes move the skin alike; the mean of its diagonal is 1.
+
+    For blendshapes b, b skin_motion b is the mean square way of the vertices, in units of that of one shape.
+    """
+    deltas = (human or load_human()).deltas.reshape(len(BLENDSHAPES), -1).astype(np.float64)
+    gram = deltas @ deltas.T
+    out: Doubles = gram * (len(BLENDSHAPES) / np.trace(gram))
+    return out

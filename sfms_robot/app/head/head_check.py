@@ -1,7 +1,14 @@
-"""What a head makes of recorded faces, joint by joint: what `sfms-robot head check` tells.
+"""Recorded faces on a head: the demands on its joints (`head check`), the share it can show (`evaluate fidelity`).
 
-Every problem of the file comes first, all at once; a sound head is then shown recorded faces, without its limits, and
-what its joints would have to do is held against what they may.
+`head check` first reports every problem of the head's file. A sound head is then shown recorded faces, without its
+limits, and the demands on its joints are compared with those limits.
+
+For the fidelity the head's joints follow a face, without limits and servos; their positions are a face again (the one
+that explains them while moving the virtual head's skin least); and the loss is measured on that skin:
+
+    share = 1 - sum over frames of |motion of the skin that is missing or wrong|^2 / sum of |motion of the skin|^2
+
+0 where a head shows nothing, or more wrong than right. For the head's pose it is the same with angles of rotation.
 """
 
 from __future__ import annotations
@@ -14,19 +21,22 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sfms_robot.app.head.faces import recorded_faces
+from sfms_robot.app.head.fit import Skin, skin_motion, virtual_tracker
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
-from sfms_robot.app.out_files import INK, new_figure, plain, save
-from sfms_robot.app.wiring import firmware_maps
+from sfms_robot.app.output_paths import INK, new_figure, plain, save
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head
 from sfms_robot.config.head import drives
+from sfms_robot.data import data_dir, head_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats
 from sfms_robot.motion.limits import JointLimits
 from sfms_robot.retarget.head_retargeter import HeadRetargeter, Neck
+from sfms_robot.retarget.response_fit import asked
+from sfms_robot.signals.motion_primitives import read_motions
+from sfms_robot.signals.tracks import face_stretches, folder_takes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,16 +51,29 @@ _WIDTH_IN: Final = 9.0
 _ROW_IN: Final = 0.22
 _DPI: Final = 80
 
+SHORTEST = 4  # frames that a curve can be laid through
+_PARTS = {  # kinds of recorded motion, and the channels that they give
+    "faces": SHAPES,
+    "talk": SHAPES,
+    "smiles": SHAPES,
+    "brows": SHAPES,
+    "blinks": SHAPES,
+    "heads": POSE,
+    "sway": slice(0, 3),
+}
+_ANGLES = slice(0, 3)
+_EVERY = 5  # frames: faces of two neighbours hardly differ
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class JointCheck:
-    """One row of the table.
+    """The demands of recorded faces on one joint.
 
     Attributes:
-        channels: what moves it, by its drive or by the neck.
+        channels: that move it, by its drive or by the neck.
         used: share of its range that the recorded faces move it through, 0..1.
         clipped: share of the time it is at an end of its range that is not its rest, 0..1.
-        speed, jerk: 99th percentile of what the faces ask of it, as a share of its limit; over 1 the limiter lags.
+        speed, jerk: 99th percentile of the demand, as a share of its limit; over 1 the limiter lags.
     """
 
     joint: str
@@ -69,9 +92,9 @@ class JointCheck:
     jerk: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NeckCheck:
-    """How far the neck goes along each axis from home [deg or mm], and the share of recorded poses in its reach.
+    """The reach of a neck along each axis from home [deg or mm], and the share of recorded poses within it.
 
     `reached` is None where no recorded face moves its head.
     """
@@ -80,11 +103,11 @@ class NeckCheck:
     reached: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HeadCheck:
-    """Everything about one head; after `problems` there is nothing else.
+    """The check of one head; one with `problems` has no other values.
 
-    `limitation`: what the listener that was named cannot show on any head, or None.
+    `limitation`: channels that the named listener shows on no head, or None.
     """
 
     name: str
@@ -110,41 +133,41 @@ def check(name: str, data: Path | None = None, listener: str | None = None, pack
     limited = limitation(listener) if listener is not None else None
     problems = check_head(name)
     if problems:
-        return HeadCheck(name, problems)
+        return HeadCheck(name=name, problems=problems)
     head = load_head(name)
     try:
-        check_safety(head, head.joints, firmware_maps(head.joints))
+        check_safety(head, head.joints)
         retargeter = HeadRetargeter(head, 1.0 / _TICK_HZ)
         scene = scene_of(head, packages)
     except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
-        return HeadCheck(head.name, [str(error)])
+        return HeadCheck(name=head.name, problems=[str(error)])
     if scene and scene.left_out:
-        return HeadCheck(head.name, scene.left_out)
-    clips = recorded_faces(data)
+        return HeadCheck(name=head.name, problems=scene.left_out)
+    clips = [clip for _, clip in named_faces(data)]
     angles = [_angles(retargeter, _at_ticks(clip)) for clip in clips]
     neck = _neck(retargeter.neck, clips) if retargeter.neck else None
     return HeadCheck(
-        head.name,
-        (),
-        _rows(head, retargeter, angles),
-        retargeter.blind_channels,
-        retargeter.dead_joints,
-        neck,
-        head.calibrate_first,
-        round(sum(len(clip) for clip in clips) * FRAME_S, 1),
-        limited,
+        name=head.name,
+        problems=(),
+        joints=_rows(head, retargeter, angles),
+        blind_channels=retargeter.blind_channels,
+        dead_joints=retargeter.dead_joints,
+        neck=neck,
+        calibrate_first=head.calibrate_first,
+        seconds=round(sum(len(clip) for clip in clips) * FRAME_S, 1),
+        limitation=limited,
     )
 
 
 def _at_ticks(clip: Floats) -> Doubles:
-    """A clip (T, 58) at the tick rate, as a curve without kinks; expressions stay within 0..1."""
+    """Return a clip (T, 58) at the tick rate, as a curve without kinks; expressions stay within 0..1."""
     times_s = np.arange(len(clip)) * FRAME_S
     ticks_s = np.arange(int((len(clip) - 1) * _TICK_HZ / FRAME_HZ) + 1) / _TICK_HZ
     return np.asarray(CubicSpline(times_s, clip.astype(np.float64))(ticks_s))
 
 
 def _angles(retargeter: HeadRetargeter, motion: Doubles) -> Doubles:
-    """Motion (N, 58) -> angles (N, J), as if every frame were held."""
+    """Return angles (N, J) for motion (N, 58), as if every frame were held."""
     count = len(retargeter.joints)
     parts = [
         retargeter.angles(np.broadcast_to(part[:, None], (len(part), count, part.shape[1])))
@@ -166,27 +189,27 @@ def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> l
     channels = _channels(head, retargeter)
     return [
         JointCheck(
-            name,
-            joint.model,
-            joint.bus,
-            joint.id,
-            joint.min_deg,
-            joint.rest_deg,
-            joint.max_deg,
-            channels[name],
-            float((high[j] - low[j]) / (limits.high[j] - limits.low[j])),
-            float(np.degrees(low[j])),
-            float(np.degrees(high[j])),
-            float(at_end[:, j].mean()),
-            float(speed[j]),
-            float(jerk[j]),
+            joint=name,
+            servo=joint.model,
+            bus=joint.bus,
+            id=joint.id,
+            min_deg=joint.min_deg,
+            rest_deg=joint.rest_deg,
+            max_deg=joint.max_deg,
+            channels=channels[name],
+            used=float((high[j] - low[j]) / (limits.high[j] - limits.low[j])),
+            low_deg=float(np.degrees(low[j])),
+            high_deg=float(np.degrees(high[j])),
+            clipped=float(at_end[:, j].mean()),
+            speed=float(speed[j]),
+            jerk=float(jerk[j]),
         )
         for j, (name, joint) in enumerate(head.joints.items())
     ]
 
 
 def _largest(clips: Sequence[Doubles], order: int) -> Doubles:
-    """99th percentile (J,) of a derivative over all clips."""
+    """Return the 99th percentile (J,) of a derivative over all clips."""
     found = np.concatenate([np.diff(clip, order, axis=0) for clip in clips]) * _TICK_HZ**order
     return np.asarray(np.percentile(np.abs(found), _PERCENTILE, axis=0))
 
@@ -201,7 +224,7 @@ def _channels(head: Head, retargeter: HeadRetargeter) -> dict[str, Sequence[str]
 
 
 def _axes_of(head: Head, neck: Neck, joint: str) -> Sequence[str]:
-    """The axes of a serial neck that a joint has a part in; of a platform, all, and yaw for the body."""
+    """Return the axes of a serial neck that a joint takes part in; of a platform, all, and yaw for the body."""
     kinematics = head.kinematics
     if kinematics is None or kinematics.kind == "stewart":
         body = kinematics is not None and kinematics.body_yaw is not None and kinematics.body_yaw.joint == joint
@@ -219,14 +242,14 @@ def _axes_of(head: Head, neck: Neck, joint: str) -> Sequence[str]:
 def _neck(neck: Neck, clips: Sequence[Floats]) -> NeckCheck:
     poses = np.concatenate([clip[:, : len(POSE_CHANNELS)] for clip in clips]).astype(np.float64)
     shown = np.array([channel in neck.axes for channel in POSE_CHANNELS])
-    moved = np.abs(poses).max(axis=1) > 0  # clips without a head say nothing about the neck
-    asked = np.where(shown, poses, 0.0)[moved]
-    reached = float(neck.solve(asked).reached.mean()) if len(asked) else None
-    return NeckCheck({axis: _reach(neck, axis) for axis in POSE_CHANNELS if axis in neck.axes}, reached)
+    moved = np.abs(poses).max(axis=1) > 0  # clips without head motion do not count
+    wanted = np.where(shown, poses, 0.0)[moved]
+    reached = float(neck.solve(wanted).reached.mean()) if len(wanted) else None
+    return NeckCheck(reach={axis: _reach(neck, axis) for axis in POSE_CHANNELS if axis in neck.axes}, reached=reached)
 
 
 def _reach(neck: Neck, axis: str) -> tuple[float, float]:
-    """How far the head goes along one axis from home, in whole degrees or millimetres."""
+    """Return how far the head moves along one axis from home, in whole degrees or millimetres."""
     turn = axis in ("roll", "pitch", "yaw")
     steps = np.arange(1, 181 if turn else 101)
     poses = np.zeros((2, len(steps), len(POSE_CHANNELS)))
@@ -239,7 +262,7 @@ def _reach(neck: Neck, axis: str) -> tuple[float, float]:
 
 
 def plot(checked: HeadCheck, png: Path) -> None:
-    """Draw the check of a sound head: ranges, what recorded faces use of them, and how fast they ask joints to be.
+    """Draw the check of a sound head: ranges, the part that recorded faces use, and the speed and jerk they demand.
 
     Raises ConfigError where the file cannot be written, MissingExtra without matplotlib.
     """
@@ -269,3 +292,90 @@ def _demand(axes: Axes, checked: HeadCheck) -> None:
     axes.axvline(100, color=INK, linewidth=1)
     axes.set_xlabel("% of the limit: speed (upper), jerk (lower)", color=INK)
     plain(axes, grid="x")
+
+
+# --- fidelity ---------------------------------------------------------------------------------------------------------
+
+
+def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, Any]:
+    """Score every shipped head (or those named) on every recorded face, and on all together. Raises ConfigError.
+
+    A row has shares 0..1 of expression and pose; None where the recording has no such motion.
+    """
+    names = list(heads) or head_names()
+    faces: dict[str, list[Floats]] = {}
+    for face, clip in named_faces(data):
+        faces.setdefault(face, []).append(clip)
+    return {"version": 1, "rows": [row for name in names for row in _fidelity(name, faces)]}
+
+
+def _fidelity(name: str, faces: dict[str, list[Floats]]) -> list[dict[str, Any]]:
+    """Return one row per face, then one for all of them."""
+    head = load_head(name)
+    retargeter = HeadRetargeter(head)
+    tracker = virtual_tracker(head, Skin.plain(len(head.joints)))
+    skin = skin_motion()
+    motions = {face: np.concatenate(clips) for face, clips in faces.items()}
+    rows, sums = [], []
+    for face, motion in motions.items():
+        wanted = motion[::_EVERY, SHAPES].astype(np.float64)
+        lost = tracker.face(asked(head, wanted)) - wanted
+        energy = [_energy(lost, skin), _energy(wanted, skin), *_turns(retargeter, motion[:, POSE])]
+        sums.append(energy)
+        rows.append(_row(head.name, face, len(motion), energy))
+    total = np.sum(sums, axis=0).tolist()
+    return [*rows, _row(head.name, "all", sum(map(len, motions.values())), total)]
+
+
+def _energy(shapes: Doubles, skin: Doubles) -> float:
+    return float(np.einsum("ni,ij,nj->", shapes, skin, shapes, optimize=True))
+
+
+def _turns(retargeter: HeadRetargeter, pose: Floats) -> tuple[float, float]:
+    """Return the sums of squares of the missing angles, and of all; a head without a neck misses them all."""
+    turns = np.zeros((len(pose), len(POSE_CHANNELS)))
+    turns[:, _ANGLES] = pose[:, _ANGLES]
+    wanted = float((turns[:, _ANGLES] ** 2).sum())
+    if retargeter.neck is None:
+        return wanted, wanted
+    return float((retargeter.neck.solve(turns).residual_rad ** 2).sum()), wanted
+
+
+def _row(head: str, face: str, frames: int, energy: Sequence[float]) -> dict[str, Any]:
+    return {
+        "head": head,
+        "face": face,
+        "seconds": round(frames * FRAME_S, 1),
+        "expression": _share(*energy[:2]),
+        "pose": _share(*energy[2:]),
+    }
+
+
+def _share(lost: float, wanted: float) -> float | None:
+    return round(max(0.0, 1.0 - lost / wanted), 3) if wanted > 1e-9 else None
+
+
+# --- recorded faces ---------------------------------------------------------------------------------------------------
+
+
+def named_faces(folder: Path | None = None) -> list[tuple[str, Floats]]:
+    """Return (name, clip) of recorded faces, (T, 58) at 25 fps: the bundled ones, or every CSV track in a folder.
+
+    Raises ConfigError for a folder without tracks, and for a track that cannot be read.
+    """
+    found = _bundled() if folder is None else [(take.name, take.motion) for take in folder_takes(folder)]
+    return [(name, clip) for name, clip in found if len(clip) >= SHORTEST]
+
+
+def _bundled() -> list[tuple[str, Floats]]:
+    sim = data_dir("sim")
+    speakers = sorted(sim.glob("speakers/*/face.csv.gz"))
+    clips = [(take.name, take.motion) for track in speakers for take in face_stretches(track, track.parent.name)]
+    for motions in read_motions(sim / "listeners" / "motions.npz").values():
+        for kind, columns in _PARTS.items():
+            for piece in getattr(motions, kind):
+                clip = np.zeros((len(piece), MOTION_DIM), dtype=np.float32)
+                clip[:, columns] = piece
+                clip[:, SHAPES] = np.clip(clip[:, SHAPES], 0.0, 1.0)
+                clips.append((kind, clip))
+    return clips

@@ -17,7 +17,7 @@ _COLUMNS: Final = 3
 
 
 def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene | None:
-    """Return the robot to be drawn; None for a head that is not shipped and names no URDF. Raises ConfigError.
+    """Return the scene of a head; None for one that is not shipped and names no URDF. Raises ConfigError.
 
     `packages`: folders outside the head's that meshes may come from.
     """
@@ -26,17 +26,17 @@ def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene | None:
 
 
 def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, Any]:
-    """Draw a head at rest; return which URDF it is, what its joints follow, and the meshes that were left out.
+    """Draw a head at rest; return its URDF, the joints that follow those of the head, and the meshes left out.
 
     `packages` as for `scene_of`. Raises ConfigError, MissingExtra.
     """
     head = load_head(name)
     scene = scene_of(head, packages)
     if scene is None:
-        raise ConfigError(f"{head.folder or name}/head.yaml: urdf says what the head looks like, and is not there")
-    from sfms_robot.face.robot_drawing import render_robot
+        raise ConfigError(f"{head.folder or name}/head.yaml: urdf: expected a file that draws the head, got none")
+    from sfms_robot.face.drawing import render_robots
 
-    render_robot(png, scene, scene.rest())
+    render_robots(png, [("", scene, scene.rest())])
     return {
         "name": name,
         "urdf": str(scene.urdf),
@@ -49,8 +49,8 @@ def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, 
 
 
 def draw_shipped_heads(png: Path) -> None:
-    """Every shipped head at rest, side by side. Raises ConfigError, MissingExtra."""
-    from sfms_robot.face.robot_drawing import render_robots
+    """Draw every shipped head at rest, side by side. Raises ConfigError, MissingExtra."""
+    from sfms_robot.face.drawing import render_robots
 
     robots = []
     for name in head_names():

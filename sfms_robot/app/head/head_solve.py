@@ -1,12 +1,10 @@
-"""A table of head poses -> the joints of a head's neck: what `sfms-robot head solve` prints."""
+"""`head solve`: a table of head poses -> the joints of a head's neck."""
 
 from __future__ import annotations
 
 import csv
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +15,18 @@ from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
-from sfms_robot.retarget.neck import Solved
 
 POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
 BODY_COLUMN = "body_yaw_rad"
-_FARTHEST = 1e6  # rad or m: squares of what is asked must not overflow
+_FARTHEST = 1e6  # rad or m: squares must not overflow
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class SolvedPoses:
-    """One row per pose: the neck's joints in its own order (`solved.angles_rad` is (N, J))."""
+def solve_poses(head_name: str, file: Path) -> dict[str, Any]:
+    """Solve every row of a CSV file, a pose that is held, for a head by name or folder.
 
-    head: str
-    joints: Sequence[str]
-    solved: Solved
-
-    def as_dict(self) -> dict[str, Any]:
-        """For `--json`: the joints, and of each pose their angles [rad], whether it is reached, and what is missing."""
-        columns = (each.tolist() for each in (self.solved.reached, self.solved.residual_rad, self.solved.residual_m))
-        rows = zip(self.solved.angles_rad.tolist(), *columns, strict=True)
-        keys = ("angles_rad", "reached", "residual_rad", "residual_m")
-        poses = [dict(zip(keys, row, strict=True)) for row in rows]
-        return {"version": 1, "head": self.head, "joints": list(self.joints), "poses": poses}
-
-
-def solve_poses(head_name: str, file: Path) -> SolvedPoses:
-    """Solve every row of a CSV file for a head by name or folder; each row is a pose held for ever.
+    Returns the joints of the neck, and for each pose their angles [rad], whether it is reached, and what is missing.
 
     Raises ConfigError for a head without a neck, and for a file that lacks a column, a row or a number.
     """
@@ -59,11 +41,15 @@ def solve_poses(head_name: str, file: Path) -> SolvedPoses:
         if body_yaw_rad.any():
             raise ConfigError(f"{file}: {BODY_COLUMN}: head {head.name!r} has no joint that turns its body")
         body_yaw_rad = None
-    return SolvedPoses(head.name, neck.joints, neck.solve(poses, body_yaw_rad))
+    solved = neck.solve(poses, body_yaw_rad)
+    keys = ("angles_rad", "reached", "residual_rad", "residual_m")
+    rows = zip(*(getattr(solved, key).tolist() for key in keys), strict=True)
+    found = [dict(zip(keys, row, strict=True)) for row in rows]
+    return {"version": 1, "head": head.name, "joints": list(neck.joints), "poses": found}
 
 
 def read_poses(file: Path) -> tuple[Doubles, Doubles | None]:
-    """Poses (N, 6) and body yaws (N,), None without that column. Other columns are named in the log and left."""
+    """Read poses (N, 6) and body yaws (N,), None without that column. Other columns are named in the log."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream)

@@ -1,25 +1,26 @@
 """`head pose`: one expression, or a few channels, on a head that otherwise rests.
 
-It is a run without a listener: the face asked for rises, stays and falls on the timeline, and everything behind the
-timeline is what a run has, so the limits, the way in and the way to rest are the same.
+It is a run without a listener: the face rises, stays and falls on the timeline, and everything behind the timeline is
+that of a run, so the limits, the way in and the way to rest are the same.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.open_head import HeadOptions, open_head
-from sfms_robot.app.session import Programme, drive_head
-from sfms_robot.app.wiring import SIM
+from sfms_robot.app.listen.report import Drove, outcome
+from sfms_robot.app.open_head import OpenHead, open_head
+from sfms_robot.app.options import HeadOptions
+from sfms_robot.app.session import drive_head, parts_of
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
+from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.safety import EASE_S, Interrupt
 from sfms_robot.signals.minimum_jerk import ease
 
@@ -27,44 +28,27 @@ RISE_S: Final = 0.5
 MOVED_DEG: Final = 0.1
 _BOUNDS: Final = {"roll": 1.0, "pitch": 1.0, "yaw": 1.6, "x": 0.1, "y": 0.1, "z": 0.1}  # rad and m, either way
 
+
+def _both(**values: float) -> dict[str, float]:
+    """Return the values of pairs of channels, left and right."""
+    return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
+
+
 EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
-    "smile": {
-        "mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "cheekSquintLeft": 0.4, "cheekSquintRight": 0.4,
-        "eyeSquintLeft": 0.2, "eyeSquintRight": 0.2,
-    },
-    "frown": {"mouthFrownLeft": 0.8, "mouthFrownRight": 0.8, "browDownLeft": 0.6, "browDownRight": 0.6},
-    "surprise": {
-        "browInnerUp": 0.9, "browOuterUpLeft": 0.8, "browOuterUpRight": 0.8, "eyeWideLeft": 0.8, "eyeWideRight": 0.8,
-        "jawOpen": 0.4,
-    },
-    "anger": {
-        "browDownLeft": 1.0, "browDownRight": 1.0, "noseSneerLeft": 0.6, "noseSneerRight": 0.6,
-        "mouthPressLeft": 0.5, "mouthPressRight": 0.5,
-    },
-    "blink": {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
+    "smile": _both(mouthSmile=0.9, cheekSquint=0.4, eyeSquint=0.2),
+    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "surprise": {**_both(browOuterUp=0.8, eyeWide=0.8), "browInnerUp": 0.9, "jawOpen": 0.4},
+    "anger": _both(browDown=1.0, noseSneer=0.6, mouthPress=0.5),
+    "blink": _both(eyeBlink=1.0),
     "kiss": {"mouthPucker": 1.0, "mouthFunnel": 0.2},
     "nod": {"pitch": 0.2},
-    "look_left": {
-        "eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3,
-    },
+    "look_left": {"eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3},
     "look_right": {"eyeLookInLeft": 0.7, "eyeLookOutRight": 0.7, "yaw": -0.3},
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """The flags of `sfms-robot head pose`."""
-
-    head: str
-    face: tuple[str, ...]
-    port: str = SIM
-    hold_s: float = 2.0
-    fast: bool = False
-    yes: bool = False
+}
 
 
 def parse_face(words: Sequence[str]) -> Floats:
-    """Expressions and CHANNEL=VALUE, later ones over earlier ones -> motion (58,). Raises ConfigError."""
+    """Return motion (58,) of expressions and CHANNEL=VALUE; later words replace earlier ones. Raises ConfigError."""
     motion = np.zeros(MOTION_DIM, np.float32)
     for word in words:
         name, equals, text = word.partition("=")
@@ -92,37 +76,55 @@ def _value(channel: str, text: str) -> float:
     return value
 
 
-def pose_head(options: PoseOptions) -> dict[str, Any]:
-    """Rise to the face, hold it, return to rest. Reports how far each joint went, and torque not confirmed off.
+def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
+    """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
-    Raises any other RobotError, the head at rest.
+    Blocks until then. Raises any other RobotError, the head at rest.
     """
-    face = parse_face(options.face)
-    held = HeldFace(face, options.hold_s)
-    with open_head(HeadOptions(options.head, options.port, options.fast, options.yes)) as opened:
+    face = parse_face(words)
+    timeline = held_face(face, hold_s)
+    with open_head(options) as opened:
         motion = opened.motion
         furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        alone = NobodyThere()
-        drove = drive_head(opened, Programme(alone, alone, held.duration_s, held, observers=[furthest]), Interrupt())
+        drove = timeline.play(opened, furthest)
     if drove.error is not None and not isinstance(drove.error, TorqueError):
         raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
     return {
-        "version": 1,
-        "head": opened.config.name,
-        "face": list(options.face),
-        "port": options.port,
-        "exit": drove.outcome,
-        "exit_code": drove.exit_code,
-        "error": drove.error and str(drove.error),
-        "torque_unconfirmed": drove.log.torque_unconfirmed,
+        **outcome(opened, drove),
+        "face": list(words),
         "joints": furthest.moved(),
         "blind": [name for name in shown if name in motion.retargeter.blind_channels],
     }
 
 
-class WholeTimeline:
-    """A `ports.Timeline` whose future is known: it takes no plans, and there is nothing to remember."""
+class FaceTrack:
+    """A `Timeline` through motion (K, 58) at rising times (K,), which takes no plans.
+
+    Between two times it is linear, or a smooth step; before the first and after the last it stays.
+    """
+
+    def __init__(self, times_s: Doubles, motion: Floats, *, smooth: bool = False) -> None:
+        self.duration_s = float(times_s[-1])
+        if len(times_s) == 1:
+            times_s, motion = times_s + np.arange(2.0), np.repeat(motion, 2, axis=0)
+        self._times_s, self._motion, self._smooth = times_s, motion, smooth
+
+    def play(
+        self,
+        opened: OpenHead,
+        observer: Observer,
+        interrupt: Interrupt | None = None,
+        *,
+        signals: bool = True,
+        log: RunLog | None = None,
+        **more: Any,
+    ) -> Drove:
+        """Drive a head with this track once, without a person or a listener. `more`: see `parts_of`."""
+        alone = NobodyThere()
+        parts = parts_of(opened, alone, alone, timeline=self, observers=[observer], **more)
+        duration_s = self.duration_s
+        return drive_head(opened, parts, interrupt or Interrupt(), duration_s=duration_s, signals=signals, log=log)
 
     def start(self) -> None:
         return None
@@ -133,23 +135,25 @@ class WholeTimeline:
     def lead_limit_s(self, state: None) -> float:
         return float("inf")
 
-
-class HeldFace(WholeTimeline):
-    """A timeline of one face: torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
-
-    def __init__(self, face: Floats, hold_s: float) -> None:
-        self._face = face
-        self._falls_s = EASE_S + RISE_S + hold_s
-        self.duration_s = self._falls_s + RISE_S
-
     def sample(self, times_s: Doubles, now_s: float, state: None) -> tuple[Floats, None]:
-        """Motion (N, 58) at each of (N,) instants."""
-        share = ease((times_s - EASE_S) / RISE_S) - ease((times_s - self._falls_s) / RISE_S)
-        return (share[:, None] * self._face).astype(np.float32), None
+        """Return motion (N, 58) at each of (N,) instants."""
+        times_s = np.clip(times_s, self._times_s[0], self._times_s[-1])
+        after = np.clip(np.searchsorted(self._times_s, times_s), 1, len(self._times_s) - 1)
+        begins, ends = self._times_s[after - 1], self._times_s[after]
+        share = (times_s - begins) / (ends - begins)
+        share = (ease(share) if self._smooth else share)[:, None]
+        return ((1 - share) * self._motion[after - 1] + share * self._motion[after]).astype(np.float32), None
+
+
+def held_face(face: Floats, hold_s: float) -> FaceTrack:
+    """Return a track of one face (58,): torque comes on and settles, the face rises, stays for `hold_s`, and falls."""
+    neutral = np.zeros_like(face)
+    times_s = np.cumsum([0.0, EASE_S, RISE_S, hold_s, RISE_S])
+    return FaceTrack(times_s, np.stack([neutral, neutral, face, face, neutral]), smooth=True)
 
 
 class NobodyThere(Source):
-    """The empty source and the empty feed: nobody speaks, nobody listens."""
+    """An empty source and an empty feed: no person, no listener."""
 
     lost = False
 
@@ -157,7 +161,7 @@ class NobodyThere(Source):
         return ()
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
-        """There is nobody to hear it."""
+        """Drop the frame."""
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         return ()
@@ -167,7 +171,7 @@ class NobodyThere(Source):
 
 
 class Furthest(Observer):
-    """How far from rest each joint was sent once the face began to rise, and how far it went."""
+    """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
 
     def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
         self._joints, self._rest_rad = tuple(joints), rest_rad
@@ -185,7 +189,7 @@ class Furthest(Observer):
                 self._reached[joint] = float(at - rest)
 
     def moved(self) -> dict[str, dict[str, float | None]]:
-        """Joints that were sent away from rest, in degrees from there; None where a servo does not tell."""
+        """Return the joints that were sent away from rest, in degrees; None where a servo reports no position."""
         rows: dict[str, dict[str, float | None]] = {}
         for joint, sent in zip(self._joints, np.degrees(self._sent), strict=True):
             if abs(sent) >= MOVED_DEG:

@@ -1,10 +1,10 @@
-"""`sfms-robot demo`: a bundled person talks, an emulated head listens, and a page or two pictures show what it did."""
+"""`sfms-robot demo`: a bundled person talks, an emulated head listens, and a page or two pictures show the run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +13,7 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.listen.page_session import page_session
-from sfms_robot.app.listen.preflight import open_browser
+from sfms_robot.app.options import RunOptions, open_browser
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -22,73 +22,66 @@ from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = "sfms-demo"
 PLOT, SHEET = "run.png", "head.png"
+_KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "seed", "duration_s")
 
 
-@dataclass(frozen=True)
-class DemoOptions:
-    """The flags of `sfms-robot demo`. `duration_s` None: the whole of what the person says, 47.7 s."""
-
-    head: str = "face28"
-    listener: str = "sfms-small"
-    seed: int = 0
-    duration_s: float | None = None
-    fast: bool = False
-    folder: Path | None = None
-    overwrite: bool = False
-
-    def run(self, seed: int, record: Path | None) -> session.RunOptions:
-        """The person's voice alone: it is what any microphone gives."""
-        return session.RunOptions(
-            self.head, listener=self.listener, audio=DEFAULT_SPEAKER, face="none", duration_s=self.duration_s,
-            fast=self.fast, seed=seed, record=record, overwrite=self.overwrite,
-        )  # fmt: skip
-
-
-def demo(options: DemoOptions, panel: session.Panel | None = None, page: PageProcess | None = None) -> dict[str, Any]:
+def demo(
+    options: RunOptions,
+    folder: Path | None = None,
+    panel: session.Panel | None = None,
+    page: PageProcess | None = None,
+) -> dict[str, Any]:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
-    Blocks for the length of the run and some seconds; with a page for as long as somebody looks at it. What visitors
-    choose there is run behind it, unrecorded. Without the packages that a picture needs, it is left out and `"missing"`
-    names the pip install.
+    Blocks for the length of the run and some seconds; with a page for as long as a visitor looks at it. Further runs
+    that visitors choose there are not recorded. Without the packages that a picture needs, it is left out and
+    `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
     """
-    folder = options.folder if options.folder is not None else free_folder(Path(FOLDER))
+    folder = folder if folder is not None else free_folder(Path(FOLDER))
+    options = replace(_with_voice(options), record=folder)
     seen = False
     if page is None:
-        report = session.run(options.run(options.seed, folder), panel)
+        report = session.run(options, panel)
     else:
-        report, seen = _watched(options.run(options.seed, folder), panel, page)
-    told = {**_summary(options, report), "folder": str(folder), "pictures": [], "missing": None, "report": report}
+        with page_session(page, options, choices=True) as pages:
+            opened = open_browser(page.url)
+            report = pages.run(panel)
+            with suppress(KeyboardInterrupt):  # which ends the page; the head rests
+                while pages.next(stay=report["exit"] == "done" or pages.released):
+                    report = pages.run(panel)
+            seen = opened or page.visited.is_set()
+    pictures: list[str] = []
+    shown = {
+        **_summary(options, report),
+        "folder": str(folder),
+        "pictures": pictures,
+        "missing": None,
+        "report": report,
+    }
     if seen or report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
-        return told
-    from sfms_robot.app.replay import replay_run  # scipy: not while servos move
+        return shown
+    from sfms_robot.app.replay.pictures import replay_run  # scipy: not while servos move
 
     try:
         for plot, sheet in ((folder / PLOT, None), (None, folder / SHEET)):
             replay_run(folder, plot, sheet)
-            told["pictures"].append(str(plot or sheet))
+            pictures.append(str(plot or sheet))
     except MissingExtra as error:
-        told["missing"] = str(error)
-    return told
+        shown["missing"] = str(error)
+    return shown
 
 
-def _watched(
-    options: session.RunOptions, panel: session.Panel | None, page: PageProcess
-) -> tuple[dict[str, Any], bool]:
-    """Report of the last run behind a page, and whether anybody looked."""
-    with page_session(page, options, choices=True) as pages:
-        opened = open_browser(page.url)
-        report = pages.run(panel)
-        with suppress(KeyboardInterrupt):  # which ends the page; the head rests
-            while pages.next(stay=report["exit"] == "done" or pages.released):
-                report = pages.run(panel)
-        return report, opened or page.visited.is_set()
+def _with_voice(options: RunOptions) -> RunOptions:
+    """Add the bundled person, by voice alone, which is what a microphone gives."""
+    return replace(options, audio=DEFAULT_SPEAKER, face="none")
 
 
-def compare_seeds(options: DemoOptions, seeds: int, each: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Seeds 0 to `seeds` - 1 one after the other, nothing recorded; `each` hears of every one. Raises RobotError."""
+def compare_seeds(options: RunOptions, seeds: int, each: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Run seeds 0 to `seeds` - 1 one after the other, without recording; call `each` with each. Raises RobotError."""
     rows = []
     for seed in range(seeds):
-        rows.append(_summary(options, session.run(options.run(seed, None))) | {"seed": seed})
+        seeded = replace(_with_voice(options), seed=seed)
+        rows.append(_summary(seeded, session.run(seeded)))
         each(rows[-1])
         if rows[-1]["exit"] != "done":
             break
@@ -102,34 +95,26 @@ def compare_seeds(options: DemoOptions, seeds: int, each: Callable[[dict[str, An
 
 
 def nods_over_seeds(counts: Sequence[int]) -> dict[str, float | int | None]:
-    """Mean, variance over mean (1 is Poisson's; None of one seed, or of no nod), and how many seeds have none."""
+    """Return mean, variance over mean (1 is Poisson's; None for one seed or no nod), and how many seeds have none."""
     mean = float(np.mean(counts))
-    told = len(counts) > 1 and mean > 0
-    scatter = round(float(np.var(counts, ddof=1)) / mean, 2) if told else None
+    scatter = round(float(np.var(counts, ddof=1)) / mean, 2) if len(counts) > 1 and mean > 0 else None
     return {"mean": round(mean, 2), "variance_over_mean": scatter, "seeds_without": sum(one == 0 for one in counts)}
 
 
 def free_folder(folder: Path) -> Path:
-    """`folder`, or the first of folder-2, folder-3, ... that is not there yet."""
+    """Return `folder`, or the first of folder-2, folder-3, ... that does not exist yet."""
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in count(2))
     return next(each for each in chain([folder], numbered) if not each.exists())
 
 
-def _summary(options: DemoOptions, report: dict[str, Any]) -> dict[str, Any]:
-    """What a person in front of the head would have seen."""
+def _summary(options: RunOptions, report: dict[str, Any]) -> dict[str, Any]:
+    """Return what a person in front of the head would have seen."""
     head = load_head(options.head)
     retargeter = HeadRetargeter(head)
     neck = [retargeter.joints[int(column)] for column in retargeter.neck_columns]
     travel_rad = sum(report["joints"][joint]["travel_rad"] for joint in neck if joint in report["joints"])
     return {
-        "version": 1,
-        "exit": report["exit"],
-        "exit_code": report["exit_code"],
-        "error": report.get("error"),
-        "head": report["head"],
-        "listener": report["listener"],
-        "seed": options.seed,
-        "duration_s": report["duration_s"],
+        **{key: report[key] for key in _KEPT},
         **report["motion"],
         "neck_travel_deg": round(float(np.degrees(travel_rad)), 1),
     }

@@ -1,4 +1,4 @@
-"""How much each region of a head shows, turned while it runs; `--intensity`, `--style` and `--calmness` of a run."""
+"""The scale of each region of a head, set while it runs; `--intensity`, `--style` and `--calmness` of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ADDRESSED: Final[tuple[str, ...]] = get_args(Calmness.model_fields["addressed"].
 
 
 class Knob:
-    """`intensity` and `style` of one region, 0..2, 1 for as it is. What is set holds from the next tick on.
+    """The `intensity` and `style` of one region, 0..2; 1 changes nothing. A new value holds from the next tick on.
 
     Setting raises InputError for a value outside 0..2.
     """
@@ -29,7 +29,7 @@ class Knob:
 
     @property
     def intensity(self) -> float:
-        """How large: 0 nothing, 1 as mapped, 2 twice, within the range of every joint."""
+        """Scale of all motion: 0 nothing, 1 as mapped, 2 twice, within the range of every joint."""
         return self._knobs.values["intensity"][self._region]
 
     @intensity.setter
@@ -38,7 +38,7 @@ class Knob:
 
     @property
     def style(self) -> float:
-        """How small motion comes out: 0 it vanishes, 1 as mapped, 2 doubled; large motion stays as it is."""
+        """Scale of small motion: 0 it vanishes, 1 as mapped, 2 doubled; large motion is unchanged."""
         return self._knobs.values["style"][self._region]
 
     @style.setter
@@ -50,11 +50,11 @@ class Knob:
 
 
 class LiveKnobs:
-    """Regions of a head by name. May be turned from any thread.
+    """The regions of a head by name. May be set from any thread.
 
     Attributes:
         values: region -> value, of "intensity" and of "style".
-        now: what the loop asks for at every tick.
+        now: what the loop reads at every tick.
     """
 
     def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
@@ -71,14 +71,14 @@ class LiveKnobs:
                 self.set(kind, region, value)
 
     def set(self, kind: str, region: str, value: float) -> None:
-        """Raises InputError for a value outside 0..2."""
+        """Set a value. Raises InputError for one outside 0..2."""
         if not 0 <= value <= MOST:
             raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
         with self._lock:
             self._turn({**self.values, kind: {**self.values[kind], region: float(value)}})
 
     def turn_all(self, by: float) -> None:
-        """Intensity of every region up or down; none leaves 0..2."""
+        """Change the intensity of every region by `by`; none leaves 0..2."""
         with self._lock:
             louder = {name: round(min(max(at + by, 0.0), MOST), 3) for name, at in self.values["intensity"].items()}
             self._turn({**self.values, "intensity": louder})
@@ -92,7 +92,7 @@ class LiveKnobs:
         return name
 
     def __getitem__(self, region: str) -> Knob:
-        """Raises InputError for a name that is no region."""
+        """Return a region. Raises InputError for a name that is not one."""
         return Knob(self, self._region(region))
 
     def __iter__(self) -> Iterator[str]:
@@ -103,20 +103,21 @@ class LiveKnobs:
 
 
 def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> LiveKnobs:
-    """`--intensity REGION=V` and `--style REGION=V`, over the head's file. Raises ConfigError for an unknown region or
-    a value outside 0..2.
+    """Return the knobs after `--intensity REGION=V` and `--style REGION=V`, which replace values of the head's file.
+
+    Raises ConfigError for an unknown region or a value outside 0..2.
     """
     return LiveKnobs(head, _values("--intensity", intensity), _values("--style", style))
 
 
 def calmed(per_minute: Sequence[str] = (), addressed: str = "sense") -> Calmness:
-    """What `--calmness` and `--addressed` ask for. Raises ConfigError for an unknown kind or a rate that cannot be."""
-    asked = _values("--calmness", per_minute, "KIND=EVENTS A MINUTE")
-    if unknown := [kind for kind in asked if kind not in EVENT_KINDS]:
+    """Return the rates of `--calmness` and `--addressed`. Raises ConfigError for an unknown kind or an invalid rate."""
+    rates = _values("--calmness", per_minute, "KIND=EVENTS A MINUTE")
+    if unknown := [kind for kind in rates if kind not in EVENT_KINDS]:
         raise ConfigError(f"--calmness {unknown[0]}: no kind of event ({', '.join(EVENT_KINDS)})")
     if addressed not in ADDRESSED:
         raise ConfigError(f"--addressed {addressed}: none of {', '.join(ADDRESSED)}")
-    return parse(Calmness, {**asked, "addressed": addressed}, "--calmness")
+    return parse(Calmness, {**rates, "addressed": addressed}, "--calmness")
 
 
 def _values(option: str, given: Sequence[str], form: str = "REGION=VALUE with a value from 0 to 2") -> dict[str, float]:

@@ -21,6 +21,8 @@ from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_commands import PageCommands, Reach
 from sfms_robot.app.listen.page_facts import page_facts, people_per_minute
 from sfms_robot.app.listen.page_observer import PageObserver
+from sfms_robot.app.listen.report import run_facts
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
@@ -58,13 +60,13 @@ class PageSession:
         released: a visitor has ended that run.
     """
 
-    def __init__(self, page: PageProcess, options: session.RunOptions, folder: Path, choices: bool) -> None:
+    def __init__(self, page: PageProcess, options: RunOptions, folder: Path, choices: bool) -> None:
         self.page, self.options, self.released = page, options, False
         self._folder, self._choices = folder, choices
         self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
         self._person = Visitor()
         self._interrupt: Interrupt | None = None
-        self._wanted: session.RunOptions | None = None
+        self._wanted: RunOptions | None = None
         self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
         self._commands = PageCommands(self._choose, self._feeds, self._person)
@@ -99,7 +101,7 @@ class PageSession:
             self.page.say(
                 "begin", scene=str(options.head), packages=options.packages, **self._facts(head, knobs, calmness)
             )
-            recorder = PageRecorder(self.page, self._folder, list(head.joints), options.facts(head))
+            recorder = PageRecorder(self.page, self._folder, list(head.joints), run_facts(head, options))
             lonely = self._lonely(interrupt)
             stack.callback(recorder.close)
             self._commands.reach = Reach(halt, puppet, knobs, calmness, feed.calm, recorder.record, self._release)
@@ -227,7 +229,7 @@ class EndsAlone(Observer):
 
 
 @contextmanager
-def page_session(page: PageProcess, options: session.RunOptions, choices: bool = False) -> Iterator[PageSession]:
+def page_session(page: PageProcess, options: RunOptions, choices: bool = False) -> Iterator[PageSession]:
     """What runs behind a page whose process has begun, while inside. Blocks until the page can be opened.
 
     Raises PortError, ConfigError where it cannot.
@@ -238,7 +240,7 @@ def page_session(page: PageProcess, options: session.RunOptions, choices: bool =
         yield PageSession(page, options, Path(folder), choices)
 
 
-def _taken_of_visitors(options: session.RunOptions) -> dict[str, bool]:
+def _taken_of_visitors(options: RunOptions) -> dict[str, bool]:
     """Which of voice and face a visitor brings."""
     return {"voice": split_kind(options.hears)[0] == BROWSER, "face": split_kind(options.face)[0] == BROWSER}
 

@@ -1,12 +1,13 @@
-"""How a run is, on the terminal: the status document four times a second, and keys that halt, resume and end it.
+"""A panel of a run on the terminal: its status four times a second, and keys that halt, resume and end the run.
 
-Nothing of it happens in the loop's thread: one thread draws, one reads keys, and what is logged meanwhile waits for the
-one that draws. Nothing is shown where stderr is no terminal, nor while another program has the terminal.
+The loop's thread does none of this: one thread draws, one reads keys, and log lines wait for the thread that draws.
+Nothing is shown where stderr is not a terminal, nor while another program has the terminal.
 """
 
 from __future__ import annotations
 
 import logging
+import logging.handlers
 import os
 import queue
 import select
@@ -42,13 +43,13 @@ _COLORS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 _KEYS: Final = "space halt, r resume, + - intensity, q end, ? help"
 _HELP: Final = (
-    "space, h, Esc: emergency stop; r: go on after one; + and -: intensity of all regions, a tenth; "
+    "space, h, Esc: emergency stop; r: resume after one; + and -: intensity of all regions, a tenth; "
     "q: come to rest and end; Ctrl-C twice: torque off at once"
 )
 _NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
 _ESCAPE: Final = "\x1b"
 _LOOK_S: Final = 0.2  # between two looks at whether this program has come to the foreground
-_LOCAL, _CONTROL = 3, 6  # of what `tcgetattr` gives
+_LOCAL, _CONTROL = 3, 6  # places in the list of `tcgetattr`
 
 Document = Callable[[], Mapping[str, Any]]
 Turn = Callable[[float], None]
@@ -56,9 +57,9 @@ Turn = Callable[[float], None]
 
 @contextmanager
 def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> Iterator[None]:
-    """Shown while inside; afterwards the terminal is as it was, whatever happens. Main thread only.
+    """Show the panel while inside, and restore the terminal afterwards. Main thread only.
 
-    turn: makes the face show more, or less, by so much.
+    turn: changes the intensity of all regions by so much.
     """
     console = Console(stderr=True)
     if not console.is_terminal or console.is_dumb_terminal:
@@ -78,7 +79,7 @@ def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, t
         halt.close("key")
     elif key == "r":
         resume_here(halt)
-    elif key == "q" and not interrupt():  # a key that is held down asks once, and releases nothing
+    elif key == "q" and not interrupt():  # a key that is held down interrupts once, and releases nothing
         interrupt.ask()
     elif key in "+=-":  # "=": the key of "+", without shift
         turn(-STEP if key == "-" else STEP)
@@ -88,24 +89,24 @@ def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, t
 
 
 class _Screen:
-    """What is drawn, and by whom: `draw` in a thread of its own, `erase` from any.
+    """The panel and the log lines above it. `draw` is called in one thread, `erase` in any.
 
     Attributes:
-        help: every key is told.
+        help: True shows the meaning of every key.
         look: set to draw at once.
     """
 
     def __init__(self, console: Console, document: Document, interrupt: Interrupt, keys: bool) -> None:
         self.help = False
         self.look = threading.Event()
-        self.lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
         self._console, self._document, self._interrupt, self._keys = console, document, interrupt, keys
         self._live = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False,
                           redirect_stderr=False, vertical_overflow="crop")  # fmt: skip
-        self.lock = threading.RLock()  # a signal handler may interrupt who holds it
+        self.lock = threading.RLock()  # a signal handler may interrupt the thread that holds it
 
     def draw(self) -> None:
-        """What was logged, and below it how the run is."""
+        """Print the new log lines, and below them the status of the run."""
         with self.lock:
             for line in self.logged():
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -117,21 +118,21 @@ class _Screen:
                 self._live.refresh()
 
     def erase(self) -> None:
-        """The cursor is back, where the panel began."""
+        """Remove the panel, and show the cursor again."""
         with self.lock:
             self._live.update("")
             self._live.stop()
 
     def logged(self) -> Iterator[str]:
-        """Lines that nobody has seen yet."""
+        """Yield the log lines that have not been printed yet."""
         with suppress(queue.Empty):
             while True:
-                yield self.lines.get_nowait()
+                yield self.lines.get_nowait().getMessage()
 
 
 @contextmanager
 def _drawing(console: Console, document: Document, interrupt: Interrupt, keys: bool) -> Iterator[_Screen]:
-    """A thread that draws while inside. It also erases: a second Ctrl-C cuts short what the main thread does."""
+    """Draw in a thread while inside. The thread erases too: a second Ctrl-C interrupts the main thread."""
     screen, over = _Screen(console, document, interrupt, keys), threading.Event()
 
     def work() -> None:
@@ -157,11 +158,15 @@ def _drawing(console: Console, document: Document, interrupt: Interrupt, keys: b
 
 @contextmanager
 def _logging_to(screen: _Screen) -> Iterator[None]:
-    """What is logged to stderr while inside waits for who draws: a line in the middle of a panel would break it."""
+    """Queue log lines for stderr while inside, for the thread that draws: a line inside the panel would break it."""
     root = logging.getLogger()
     usual = [each for each in root.handlers if isinstance(each, logging.StreamHandler) and each.stream is sys.stderr]
-    queued = [_Queued(each, screen.lines) for each in usual]
-    for before, after in zip(usual, queued, strict=True):
+    queued = []
+    for before in usual:
+        after = logging.handlers.QueueHandler(screen.lines)
+        after.setLevel(before.level)
+        after.setFormatter(before.formatter)
+        queued.append(after)
         root.removeHandler(before)
         root.addHandler(after)
     try:
@@ -174,21 +179,9 @@ def _logging_to(screen: _Screen) -> Iterator[None]:
             sys.stderr.write(line + "\n")
 
 
-class _Queued(logging.Handler):
-    """Formats as another handler does, and writes nothing."""
-
-    def __init__(self, like: logging.Handler, lines: queue.SimpleQueue[str]) -> None:
-        super().__init__(like.level)
-        self.setFormatter(like.formatter)
-        self._lines = lines
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._lines.put(self.format(record))
-
-
 @contextmanager
 def _suspending(screen: _Screen, found: Keyboard | None) -> Iterator[None]:
-    """Ctrl-Z hands the terminal over as it was; who draws and who reads take it again in the foreground."""
+    """Restore the terminal at Ctrl-Z; the threads that draw and read take it again in the foreground."""
     if not hasattr(signal, "SIGTSTP"):
         yield
         return
@@ -205,25 +198,34 @@ def _suspending(screen: _Screen, found: Keyboard | None) -> Iterator[None]:
         signal.signal(signal.SIGTSTP, before)
 
 
-# --- what is drawn --------------------------------------------------------------------------------------------------
+# --- the lines of the panel -----------------------------------------------------------------------------------------
 
 
 def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool = False) -> RenderableType:
-    """A status document as lines no wider than the terminal. `ending`: somebody has asked for the end."""
+    """Return a status document as lines no wider than the terminal. `ending`: the run was interrupted."""
     rows = Table.grid(padding=(0, 1))
     rows.add_column(style="dim", no_wrap=True)
     rows.add_column()
     meter = max(4, min(_METER, console.width - 22))
-    person = document.get("person") or {}
+    person, tick = document.get("person") or {}, document.get("tick") or {}
+    attention, hottest = person.get("attention"), document.get("hottest")
+    seen = "  seen" if person.get("seen") else ""
+    rates = "" if not tick else "in virtual time"
+    if tick.get("achieved_hz") is not None:
+        rates = f"{tick['achieved_hz']:.1f} of {tick['target_hz']:g} Hz, {tick['late']} late"
     for name, text in (
         ("", document.get("note")),
-        ("person", _level(person.get("voice_db"), meter, console) + _attention(person)),
+        (
+            "person",
+            _level(person.get("voice_db"), meter, console)
+            + (seen if attention is None else f"  attention {attention:.0%}"),
+        ),
         ("robot", _level(person.get("own_voice_db"), meter, console)),
-        ("face", _motion(document.get("motion") or {})),
+        ("face", ", ".join(f"{count} {name}" for name, count in (document.get("motion") or {}).items())),
         ("intensity", _intensity(document.get("intensity") or {})),
-        ("ticks", _ticks(document.get("tick") or {})),
+        ("ticks", rates),
         ("latency", _latency(document.get("latency_ms") or {})),
-        ("hottest", _hottest(document.get("hottest"))),
+        ("hottest", hottest and f"{hottest['joint']} {hottest['temperature_C']:.0f} C"),
         ("faults", _faults(document.get("faults") or {})),
     ):
         if text:
@@ -248,47 +250,27 @@ def _clock(time_s: float) -> str:
 
 
 def _level(level_db: float | None, width: int, console: Console) -> str:
-    """A meter from -60 dB to full scale."""
+    """Return a meter from -60 dB to full scale."""
     full, empty = ("#", ".") if console.options.ascii_only else ("\u2588", "\u2591")
     filled = 0 if level_db is None else round(width * min(1.0, max(0.0, 1.0 - level_db / _QUIET_DB)))
     return full * filled + empty * (width - filled) + ("  no sound" if level_db is None else f" {level_db:5.0f} dB")
 
 
-def _attention(person: Mapping[str, Any]) -> str:
-    if (attention := person.get("attention")) is not None:
-        return f"  attention {attention:.0%}"
-    return "  seen" if person.get("seen") else ""
-
-
-def _motion(motion: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in motion.items())
-
-
 def _intensity(regions: Mapping[str, float]) -> str:
-    """Of the regions that are not as mapped; one number where all are the same."""
+    """Return the regions whose intensity is not 1; one number where all are equal."""
     if len(regions) > 1 and len(set(regions.values())) == 1 and 1.0 not in regions.values():
         return f"{next(iter(regions.values())):g}"
     return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
 
 
-def _ticks(tick: Mapping[str, Any]) -> str:
-    if tick.get("achieved_hz") is None:
-        return "in virtual time" if tick else ""
-    return f"{tick['achieved_hz']:.1f} of {tick['target_hz']:g} Hz, {tick['late']} late"
-
-
 def _latency(latency_ms: Mapping[str, Mapping[str, float | None]]) -> str:
-    """Medians, and in brackets how late the latest come."""
-    told = []
+    """Return medians, and in brackets the last percentiles."""
+    parts = []
     for name, ms in latency_ms.items():
         middle, *tails = [f"{value:.0f}" for value in ms.values() if value is not None] or [""]
         if middle:
-            told.append(f"{name.replace('_', ' ')} {middle} ms" + "".join(f" ({tail})" for tail in tails))
-    return ", ".join(told)
-
-
-def _hottest(hottest: Mapping[str, Any] | None) -> str:
-    return "" if hottest is None else f"{hottest['joint']} {hottest['temperature_C']:.0f} C"
+            parts.append(f"{name.replace('_', ' ')} {middle} ms" + "".join(f" ({tail})" for tail in tails))
+    return ", ".join(parts)
 
 
 def _faults(faults: Mapping[str, str]) -> str:
@@ -297,27 +279,25 @@ def _faults(faults: Mapping[str, str]) -> str:
     return "; ".join([*named, f"and {more} more"] if more else named)
 
 
-# --- single keys, while a run goes on -------------------------------------------------------------------------------
+# --- single keys during a run ---------------------------------------------------------------------------------------
 
 
 class Keyboard:
-    """The terminal behind a file descriptor: `take` for single keys, `give_back` for lines. From any thread.
+    """The terminal of a file descriptor: `take` for single keys, `give_back` for lines. From any thread.
 
-    No Enter is needed, nothing is echoed, and afterwards the terminal is as it was. It is in cbreak mode while this
-    program is in its foreground, so Ctrl-C, Ctrl-\\ and Ctrl-Z stay signals. In the background it belongs to other
-    programs: it is left alone, and nothing is read.
-
-    `leave` gives it back for good: a thread that was about to take it does not.
+    No Enter is needed, nothing is echoed, and the terminal is restored afterwards. It is in cbreak mode while this
+    program is in its foreground, so Ctrl-C, Ctrl-\\ and Ctrl-Z stay signals. In the background the terminal belongs to
+    other programs: it is not changed, and nothing is read. After `leave` it cannot be taken again.
     """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._usual: list[Any] | None = None
         self._left = False
-        self._lock = threading.RLock()  # a signal handler may interrupt who holds it
+        self._lock = threading.RLock()  # a signal handler may interrupt the thread that holds it
 
     def take(self) -> bool:
-        """Single keys from now on; False in the background. Asked again and again: a shell may set it otherwise."""
+        """Switch to single keys; return False in the background. Called repeatedly: a shell may change the mode."""
         with self._lock:
             if self._left or in_background(self._fd):
                 return False
@@ -332,7 +312,7 @@ class Keyboard:
             return True
 
     def give_back(self) -> None:
-        """As it was found. Idempotent."""
+        """Restore the mode that was found. Idempotent."""
         with self._lock:
             if self._usual is not None and not in_background(self._fd):
                 termios.tcsetattr(self._fd, termios.TCSANOW, self._usual)
@@ -351,7 +331,7 @@ class Keyboard:
             yield
 
     def wait(self, over: int) -> str | None:
-        """Blocks until keys are pressed or `_LOOK_S` is over: the keys, or "". None once `over` is readable.
+        """Block until keys are pressed or `_LOOK_S` is over; return the keys, or "". None once `over` is readable.
 
         A sequence of several bytes (an arrow, Alt with a key) counts as the Esc that it begins with, and as that alone.
         """
@@ -373,7 +353,7 @@ def in_background(fd: int) -> bool:
 
 
 def keyboard(stream: TextIO | None) -> Keyboard | None:
-    """Return the keyboard of a terminal; None where `stream` is no terminal, or the system (Windows) has none."""
+    """Return the keyboard of a terminal; None where `stream` is not a terminal, and on Windows."""
     if termios is None or stream is None or stream.closed or not stream.isatty():
         return None
     return Keyboard(stream.fileno())
@@ -381,8 +361,8 @@ def keyboard(stream: TextIO | None) -> Keyboard | None:
 
 @contextmanager
 def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[None]:
-    """Call `pressed(key)` in a thread of its own, for every key while inside."""
-    ours, theirs = os.pipe()  # readable once it is over
+    """Call `pressed(key)` in a separate thread, for every key while inside."""
+    ours, theirs = os.pipe()  # readable at the end
 
     def work() -> None:
         try:

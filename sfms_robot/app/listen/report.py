@@ -1,4 +1,4 @@
-"""What a run says of itself: its report (`run --json`), to its recording, and to the programs that it works with.
+"""The report of a run (`run --json`), the facts in its recording, and the messages to the programs it works with.
 
 Every figure of the report is from the run's own log, the bus's counters or the listener.
 """
@@ -8,8 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +16,7 @@ import yaml
 
 from sfms_robot import __version__
 from sfms_robot.config import Head, load_listener
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import INTERRUPTED, ConfigError
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
@@ -27,12 +26,12 @@ from sfms_robot.runtime.planned_events import EventWatch
 
 if TYPE_CHECKING:
     from sfms_robot.app.open_head import OpenHead
+    from sfms_robot.app.options import RunOptions
 
-INTERRUPTED: Final = 130  # exit code
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Drove:
     """The end of a drive: "done", "interrupted" or "failed", and then the error."""
 
@@ -44,33 +43,40 @@ class Drove:
 
     @property
     def exit_code(self) -> int:
-        """Of the process: see `errors`."""
+        """Exit code of the process: see `errors`."""
         if self.outcome == "interrupted":
             return INTERRUPTED
         return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
+def outcome(opened: OpenHead, drove: Drove) -> dict[str, Any]:
+    """Return the head, its port and the end of a drive, which begin every report."""
+    return {
+        "version": 1,
+        "head": opened.config.name,
+        "port": opened.options.port,
+        "exit": drove.outcome,
+        "exit_code": drove.exit_code,
+        "error": None if drove.error is None else str(drove.error),
+        "torque_unconfirmed": drove.log.torque_unconfirmed,
+    }
+
+
 def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
     """Return version 1 of the report. In virtual time wall-clock figures are null."""
     log = drove.log
-    real = drove.elapsed_s is not None
     heard = dict(feed.statistics())
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
-        "version": 1,
-        "head": opened.config.name,
+        **outcome(opened, drove),
         "listener": listener,
-        "port": opened.options.port,
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
-        "exit": drove.outcome,
-        "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
         "tick": log.tick_report(opened.rate_hz, drove.elapsed_s),
-        "latency_ms": _latency(log, real),
+        "latency_ms": _latency(log, drove.elapsed_s is not None),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
@@ -88,12 +94,11 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
         "priority": drove.priority,
-        "exit_code": drove.exit_code,
     }
 
 
 def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]:
-    """Those figures of the report that are known while it runs, under the report's names. From any thread.
+    """Return the figures of the report that are known while it runs, under the report's names. From any thread.
 
     `real` False means virtual time.
     """
@@ -118,35 +123,38 @@ def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
     return {name: int(getattr(state, name)) for name in names if hasattr(state, name)}
 
 
-# --- what a recording says of its run -------------------------------------------------------------------------------
+# --- the facts in a recording ---------------------------------------------------------------------------------------
 
 
-def run_facts(head: Head, listener: str, options: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a recording says of its run, text by text, for `Recorder(about=...)`: what ran, on what, and how.
+def run_facts(head: Head, options: RunOptions) -> dict[str, str]:
+    """Return the facts that a recording keeps of its run, text by text, for `Recorder(about=...)`.
 
     `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
     folder there are its configuration and the SHA-256 of its weights.
     """
-    shown = {name: value for name, value in options.items() if value not in (None, (), False)}
+    calmness = None if options.calmness is None else options.calmness.model_dump(exclude_none=True)
+    values = {**asdict(options), "audio": options.hears, "calmness": calmness}
+    given = {name: value for name, value in values.items() if value not in (None, (), False)}
     return {
         "head": head.name,
-        "listener": Path(listener).name,
-        **{name: str(options[name]) for name in ("seed", "port")},
-        "audio": Path(options["audio"]).name,
+        "listener": Path(options.listener).name,
+        "seed": str(options.seed),
+        "port": options.port,
+        "audio": Path(options.hears).name,
         "version": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "options": json.dumps(shown, default=str),
+        "options": json.dumps(given, default=str),
         "head_yaml": yaml.safe_dump(head.model_dump(mode="json", exclude_defaults=True), sort_keys=False),
-        **_listener(listener),
+        **_listener_facts(options.listener),
     }
 
 
-def _listener(name: str) -> dict[str, str]:
+def _listener_facts(name: str) -> dict[str, str]:
     try:
         folder = listener_folder(name)
-    except ConfigError:  # an object that a program handed over
-        return {}
+    except ConfigError:  # an object of a program's own
+        folder = None
     if folder is None:
         return {}
     facts = {"listener_config": (folder / "config.yaml").read_text(encoding="utf-8")}
@@ -157,21 +165,19 @@ def _listener(name: str) -> dict[str, str]:
 
 
 def limitation(listener: str) -> str | None:
-    """Return one line about what a listener, by name or folder, cannot show on any head.
+    """Return the channels that a listener, by name or folder, shows on no head, as one line; None if there are none.
 
-    None: it can show all channels, or another package brings it.
-
-    Raises ConfigError.
+    None too for a listener of another package. Raises ConfigError.
     """
     folder = listener_folder(listener)
     return None if folder is None else MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation
 
 
-# --- what the programs that a run works with receive ---------------------------------------------------------------
+# --- messages to the programs that a run works with -----------------------------------------------------------------
 
 
-class RunTeller:
-    """`ports.Observer`: sound as it is heard, events as they are decided or planned, states as they change."""
+class OutletObserver:
+    """An `Observer` that sends sound, planned events and changes of state to one outlet of a source."""
 
     def __init__(self, outlet: Outlet) -> None:
         self._outlet = outlet
@@ -197,7 +203,7 @@ class RunTeller:
         self._events.close()
 
     def _event(self, event: ListenerEvent) -> None:
-        told = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
+        sent = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
         if event.probability is not None:
-            told["probability"] = round(event.probability, 5)
-        self._outlet.tells("event", event.start_s, event=event.kind, **told)
+            sent["probability"] = round(event.probability, 5)
+        self._outlet.tells("event", event.start_s, event=event.kind, **sent)

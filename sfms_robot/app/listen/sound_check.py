@@ -1,4 +1,4 @@
-"""How good the sound is that a head would hear: `run --audio mic --check`. No servo is touched."""
+"""The quality of the sound for a head, with a level meter meanwhile: `run --audio mic --check`. No servo is touched."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from contextlib import closing
 from typing import Any, Final
 
 import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, Floats
@@ -18,21 +21,27 @@ CHECK_S: Final = 3.0
 CLIPPED: Final = 0.99  # of full scale
 MOST_CLIPPED: Final = 1e-3  # of the samples
 QUIET_DB: Final = -45.0  # of full scale; speech of a person at arm's length is at -35 to -15
-NOISY_DB: Final = 10.0  # speech less far above the noise than this is hard to understand
-SILENT_DB: Final = -95.0  # no room and no microphone is as quiet as this
+NOISY_DB: Final = 10.0  # speech closer to the noise than this is hard to understand
+SILENT_DB: Final = -95.0  # quieter than any room or microphone
 _NOISE_PERCENT, _SPEECH_PERCENT = 10, 95  # of the frames, by their level
-_ASK_S: Final = 0.01
+_POLL_S: Final = 0.01
+_QUIETEST_DB: Final = -60.0  # an empty meter
+_WIDTH: Final = 40
+_LOUD_DB: Final = -12.0
+_FALLS_DB_S: Final = 20.0  # of the mark at the loudest level, as meters do
 
-OnLevel = Callable[[float, bool], None]  # dB of full scale of the newest frame, and whether it clips
 
+def check_sound(
+    audio: str, duration_s: float | None = None, on_level: Callable[[float, bool], None] | None = None
+) -> dict[str, Any]:
+    """Listen to `audio` (as `run --audio`) for `duration_s` (`CHECK_S`), in real time, and judge it; see `judge_sound`.
 
-def check_sound(audio: str, duration_s: float = CHECK_S, on_level: OnLevel | None = None) -> dict[str, Any]:
-    """Listen to `audio` (as `run --audio`) for `duration_s`, in real time, and judge what came; see `judge_sound`.
-
-    `on_level` is called for every frame. Raises what opening the source raises; ConfigError for "none".
+    `on_level` is called for every frame with its level [dB of full scale] and whether it clips. Raises an error of the
+    source; ConfigError for "none".
     """
     if audio == "none":
         raise ConfigError("--check: there is nothing to listen to with --audio none (mic, FILE.wav)")
+    duration_s = duration_s or CHECK_S
     frames: list[Floats] = []
     with closing(open_source(audio, "none", duration_s)) as source:
         origin_s = time.monotonic()
@@ -41,21 +50,23 @@ def check_sound(audio: str, duration_s: float = CHECK_S, on_level: OnLevel | Non
             for frame in source.read(time.monotonic() - origin_s):
                 frames.append(frame.audio)
                 if on_level is not None:
-                    on_level(energy_db(frame.audio), _clips(frame.audio))
-            time.sleep(_ASK_S)
-        told = dict(source.statistics())
-    return {"version": 1, "audio": audio, **judge_sound(frames), "source": told}
+                    on_level(energy_db(frame.audio), bool(np.abs(frame.audio).max(initial=0.0) >= CLIPPED))
+            time.sleep(_POLL_S)
+        statistics = dict(source.statistics())
+    return {"version": 1, "audio": audio, **judge_sound(frames), "source": statistics}
 
 
 def judge_sound(frames: Sequence[Floats]) -> dict[str, Any]:
-    """Frames (640,), empty where nothing came -> seconds, missing_frames, level_dbfs (of the loudest part: speech),
-    noise_floor_dbfs, peak, clipped (share of the samples) and findings: a line for whatever is not as it should be.
+    """Judge frames (640,), which are empty where nothing came.
+
+    Returns seconds, missing_frames, level_dbfs (of the loudest part: speech), noise_floor_dbfs, peak, clipped (share of
+    the samples) and findings: a line for each problem.
     """
     heard = [frame for frame in frames if len(frame)]
     levels = [energy_db(frame) for frame in heard] or [-100.0]
     samples = np.abs(np.concatenate(heard)) if heard else np.zeros(1, np.float32)
     noise_db, speech_db = (float(each) for each in np.percentile(levels, (_NOISE_PERCENT, _SPEECH_PERCENT)))
-    told = {
+    found = {
         "seconds": round(len(frames) * FRAME_S, 2),
         "missing_frames": len(frames) - len(heard),
         "level_dbfs": round(speech_db, 1),
@@ -63,26 +74,65 @@ def judge_sound(frames: Sequence[Floats]) -> dict[str, Any]:
         "peak": round(float(samples.max()), 4),
         "clipped": round(float(np.mean(samples >= CLIPPED)), 5),
     }
-    return {**told, "findings": _findings(told)}
+    return {**found, "findings": _findings(found)}
 
 
-def _findings(told: dict[str, Any]) -> list[str]:
-    if not told["seconds"] or told["missing_frames"] * FRAME_S >= told["seconds"]:
+def _findings(found: dict[str, Any]) -> list[str]:
+    if not found["seconds"] or found["missing_frames"] * FRAME_S >= found["seconds"]:
         return ["nothing came: is it plugged in, does another program hold it?"]
     findings = []
-    if told["level_dbfs"] < SILENT_DB:
+    if found["level_dbfs"] < SILENT_DB:
         findings.append("digital silence: it is muted, or another device is the right one (sfms-robot port list)")
-    elif told["level_dbfs"] < QUIET_DB:
-        findings.append(f"very quiet: nobody spoke, or its gain is too low (speech is above {QUIET_DB:g} dBFS)")
-    elif told["level_dbfs"] - told["noise_floor_dbfs"] < NOISY_DB:
-        above = told["level_dbfs"] - told["noise_floor_dbfs"]
+    elif found["level_dbfs"] < QUIET_DB:
+        findings.append(f"very quiet: no speech, or its gain is too low (speech is above {QUIET_DB:g} dBFS)")
+    elif found["level_dbfs"] - found["noise_floor_dbfs"] < NOISY_DB:
+        above = found["level_dbfs"] - found["noise_floor_dbfs"]
         findings.append(f"speech is {above:.0f} dB above the noise, {NOISY_DB:g} are needed: nearer, or a quieter room")
-    if told["clipped"] > MOST_CLIPPED:
-        findings.append(f"{told['clipped']:.1%} of the samples clip: turn its gain down")
-    if told["missing_frames"]:
-        findings.append(f"{told['missing_frames']} frames of 40 ms did not come in time: the computer is too busy")
+    if found["clipped"] > MOST_CLIPPED:
+        findings.append(f"{found['clipped']:.1%} of the samples clip: turn its gain down")
+    if found["missing_frames"]:
+        findings.append(f"{found['missing_frames']} frames of 40 ms did not come in time: the computer is too busy")
     return findings
 
 
-def _clips(audio: Floats) -> bool:
-    return bool(len(audio) and np.abs(audio).max() >= CLIPPED)
+# --- a level meter on one line ----------------------------------------------------------------------------------------
+
+
+class LevelMeter:
+    """A level meter on stderr, removed at the end; nothing is shown where stderr is not a terminal."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._loudest_db, self._since_s = _QUIETEST_DB, 0.0
+        self._clipped = False
+
+    def __enter__(self) -> LevelMeter:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def __call__(self, level_db: float, clips: bool) -> None:
+        """Show the level of the newest frame, and whether any has clipped."""
+        now_s = time.monotonic()
+        self._loudest_db = max(level_db, self._loudest_db - _FALLS_DB_S * (now_s - self._since_s))
+        self._since_s = now_s
+        self._clipped |= clips
+        if self._live.is_started:
+            self._live.update(meter_line(level_db, self._loudest_db, self._clipped), refresh=True)
+
+
+def meter_line(level_db: float, loudest_db: float, clipped: bool) -> Text:
+    """Return a bar from -60 to 0 dB of full scale, a mark at the loudest level, and a note after clipping."""
+    full, mark = _cells(level_db), max(_cells(loudest_db) - 1, 0)
+    cells = ["█" if cell < full else " " for cell in range(_WIDTH)]
+    cells[mark] = "│" if mark >= full else cells[mark]
+    colour = "red" if clipped else "yellow" if level_db > _LOUD_DB else "green"
+    return Text.assemble(("".join(cells), colour), f" {level_db:6.1f} dBFS", (" clips" if clipped else "", "bold red"))
+
+
+def _cells(level_db: float) -> int:
+    return round(_WIDTH * min(max(1.0 - level_db / _QUIETEST_DB, 0.0), 1.0))

@@ -1,4 +1,4 @@
-"""DIR/run.mcap, and the files that it goes on in -> arrays. A run that was killed is read up to where its file ends."""
+"""Read DIR/run.mcap, and the files that continue it, into arrays; a file that was cut off up to where it ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 import struct
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +35,7 @@ class RunRecording:
     """A run as arrays: N ticks, J joints, M speaker frames.
 
     Attributes:
-        about: what the run wrote about itself (head, listener, seed, ...).
+        about: facts of the run (head, listener, seed, ...).
         joints: (J,) names.
         times_s: (N,) of the ticks. motion: (N, 58) the face asked for.
         goals_rad, present_rad: (N, J) float32; present is NaN where nothing was read within `AWAY_S`.
@@ -47,8 +47,7 @@ class RunRecording:
         plans: how many the listener made.
         states: (time_s, name, why) of every change, in order; none in a file of version 0.1.
         events: (start_s, kind) of the nods, blinks and smiles that plans held.
-        servos_s: (K,) when servos told the rest of what they tell. servos: (K, J) by name, such as temperature_C; NaN
-            where one did not.
+        servos_s: (K,) times of the other readings. servos: (K, J) by name, such as temperature_C; NaN if not reported.
         whole: the file has its end.
     """
 
@@ -85,12 +84,12 @@ class RunRecording:
 
     @property
     def has_voice(self) -> bool:
-        """Something was heard."""
+        """True if there is any sound."""
         return bool(np.any(self.energy_db > _FLOOR_DB))
 
     @property
     def talking(self) -> NDArray[np.bool_]:
-        """(M,) the speaker is in a phrase: loud against his own level, pauses under 0.2 s closed."""
+        """(M,) True in a phrase of the speaker: loud against their own level, pauses under 0.2 s closed."""
         if not self.has_voice:
             return np.zeros(len(self.heard_s), dtype=np.bool_)
         loud = self.energy_db > max(_FLOOR_DB, float(np.percentile(self.energy_db, 95)) - _BELOW_LOUD_DB)
@@ -101,7 +100,7 @@ class RunRecording:
         return loud
 
     def talks_at(self, times_s: Doubles) -> NDArray[np.bool_]:
-        """(N,) whether the speaker is in a phrase at some instants."""
+        """Return (N,) whether the speaker is in a phrase at the instants."""
         if not len(self.heard_s):
             return np.zeros(len(times_s), dtype=np.bool_)
         frame = np.searchsorted(self.heard_s, np.asarray(times_s) - 1e-9)
@@ -142,18 +141,20 @@ def read_recording(folder: Path | str) -> RunRecording:
 
 
 def states_of(folder: Path) -> list[tuple[float, str, tuple[str, ...]]]:
-    """Every state of a recorded run: since when, its name, why."""
+    """Return (time_s, name, why) of every change of state in a recorded run."""
     records = (each for file in parts_of(folder) for each in _records(file))
-    return [(told["time_s"], told["state"], tuple(told["why"])) for kind, told in records if kind == "/state"]
+    return [_state(value) for kind, value in records if kind == "/state"]
 
 
 def summary(recording: RunRecording) -> dict[str, Any]:
-    """What is in a recording, for the command line."""
-    told: dict[str, Any] = {key: value for key, value in recording.about.items() if key not in LONG}
-    if told.get("seed", "").isdecimal():  # what a run writes about itself is text
-        told["seed"] = whole_number(told["seed"])
+    """Return a summary of a recording, for the command line."""
+    facts: dict[str, Any] = {key: value for key, value in recording.about.items() if key not in LONG}
+    if facts.get("seed", "").isdecimal():  # facts are text
+        facts["seed"] = whole_number(facts["seed"])
+    warmth_C = recording.servos.get("temperature_C", np.full(1, np.nan))
+    hottest_C = None if np.isnan(warmth_C).all() else round(float(np.nanmax(warmth_C)), 1)
     return {
-        **told,
+        **facts,
         "duration_s": round(recording.listened_s, 3),
         "ticks": len(recording.times_s),
         "speaker_frames": len(recording.heard_s),
@@ -162,19 +163,13 @@ def summary(recording: RunRecording) -> dict[str, Any]:
         "states": [name for _, name, _ in recording.states],
         "joints": len(recording.joints),
         "faults": int(recording.faults.any(axis=0).sum()),
-        "hottest_C": _hottest(recording.servos.get("temperature_C")),
+        "hottest_C": hottest_C,
         "whole": recording.whole,
     }
 
 
-def _hottest(temperatures_C: Floats | None) -> float | None:
-    if temperatures_C is None or np.isnan(temperatures_C).all():
-        return None
-    return round(float(np.nanmax(temperatures_C)), 1)
-
-
 def _records(file: Path) -> Iterator[tuple[str, Any]]:
-    """(topic, body), ("about", metadata) and, when the file has one, ("end", None)."""
+    """Yield (topic, body), ("about", metadata) and, when the file has one, ("end", None)."""
     topics: dict[int, str] = {}
     with file.open("rb") as stream:
         for record in StreamReader(stream, validate_crcs=True).records:
@@ -189,29 +184,28 @@ def _records(file: Path) -> Iterator[tuple[str, Any]]:
 
 
 class _Found:
-    """What was read so far, number by number: messages as they come take twenty times as much."""
+    """The values read so far, as flat arrays by name: messages take twenty times as much memory."""
 
     def __init__(self) -> None:
         self.about: dict[str, str] = {}
         self.whole = False
         self._joints: tuple[str, ...] = ()
         self._plans = 0
-        self._times_s, self._heard_s, self._energy_db = (array("d") for _ in range(3))
-        self._motion, self._goals_rad, self._present_rad, self._speaker, self._jaw_rad = (array("f") for _ in range(5))
+        self._doubles: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
+        self._floats: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
+        self._servos: dict[str, array[float]] = {}
         self._faults, self._pcm16, self._agent_pcm16 = bytearray(), bytearray(), bytearray(2 * FRAME_SAMPLES)
         self._speaks = False
         self._states: list[tuple[float, str, tuple[str, ...]]] = []
         self._events: list[tuple[float, str]] = []
-        self._servos_s = array("d")
-        self._servos: dict[str, array[float]] = {}
 
     @property
     def ticks(self) -> int:
-        """Whole ones: a cut may fall between the face and the joints of one."""
-        return min(len(self._times_s), len(self._motion) // MOTION_DIM)
+        """Number of whole ticks: a cut may fall between the face and the joints of one."""
+        return min(len(self._doubles["times_s"]), len(self._floats["motion"]) // MOTION_DIM)
 
     def take(self, kind: str, value: Any) -> None:
-        """One record of `_records`."""
+        """Add one record of `_records`."""
         if kind == "about":  # at the beginning of every part
             self.about, self.whole = self.about or value, False
             self._joints = tuple(json.loads(value["joints"]))
@@ -220,65 +214,72 @@ class _Found:
         elif kind == "/plan":
             self._plans += 1
         elif kind == "/face":
-            self._motion.extend(_by_channel(value))
+            self._floats["motion"].extend(_by_channel(value))
         elif kind == "/joints":
-            self._tick(value["time_s"], [value["joints"][name] for name in self._joints])
+            joints = [value["joints"][name] for name in self._joints]
+            self._doubles["times_s"].append(value["time_s"])
+            self._floats["goals_rad"].extend(joint["goal_rad"] for joint in joints)
+            self._floats["present_rad"].extend(_read_rad(joint) for joint in joints)
+            self._faults += bytes(joint["fault"] is not None for joint in joints)
         elif kind == "/speaker":
-            self._heard_s.append(value["time_s"])
-            self._energy_db.append(value["energy_db"])
-            self._speaker.extend(_by_channel(value["face"]))
-            self._jaw_rad.extend(value.get("jaw_rad") or [math.nan] * 3)  # no key in a recording of version 0.1
+            for name in ("time_s", "energy_db"):
+                self._doubles[name].append(value[name])
+            self._floats["speaker"].extend(_by_channel(value["face"]))
+            self._floats["jaw_rad"].extend(value.get("jaw_rad") or [math.nan] * 3)  # no key before version 0.2
+            said = value.get("agent_audio_pcm16")
+            self._speaks |= said is not None
             self._pcm16 += _samples(value["audio_pcm16"])
-            self._speaks |= (said := value.get("agent_audio_pcm16")) is not None
             self._agent_pcm16 += _samples(said or "")
         elif kind == "/state":
-            self._states.append((value["time_s"], value["state"], tuple(value["why"])))
+            self._states.append(_state(value))
         elif kind == "/event":
             self._events.append((value["start_s"], value["kind"]))
         elif kind == "/servos":
-            self._told(value["time_s"], value["servos"])
+            self._take_servos(value["time_s"], value["servos"])
 
-    def _tick(self, time_s: float, joints: Sequence[Mapping[str, Any]]) -> None:
-        self._times_s.append(time_s)
-        self._goals_rad.extend(joint["goal_rad"] for joint in joints)
-        self._present_rad.extend(_read_rad(joint) for joint in joints)
-        self._faults += bytes(joint["fault"] is not None for joint in joints)
-
-    def _told(self, time_s: float, servos: Mapping[str, Mapping[str, Any]]) -> None:
-        """A row of J for every name that any servo ever told, NaN before it was first told."""
-        before = len(self._servos_s) * len(self._joints)
-        for name in {name for told in servos.values() for name in told} - {"fault", *self._servos}:
+    def _take_servos(self, time_s: float, servos: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add a row of J for every name that any servo has reported, NaN before its first value."""
+        before = len(self._doubles["servos_s"]) * len(self._joints)
+        for name in {name for reported in servos.values() for name in reported} - {"fault", *self._servos}:
             self._servos[name] = array("f", [math.nan] * before)
         for name, values in self._servos.items():
             values.extend(_or_nan(servos.get(joint, {}).get(name)) for joint in self._joints)
-        self._servos_s.append(time_s)
+        self._doubles["servos_s"].append(time_s)
 
     def recording(self) -> RunRecording:
+        """Return all that was read."""
         count, ticks = len(self._joints), self.ticks
-        by_joint = [np.array(values, dtype=np.float32) for values in (self._goals_rad, self._present_rad)]
-        goals_rad, present_rad = (values.reshape(-1, count)[:ticks] for values in by_joint)
+        times = {name: np.array(self._doubles[name]) for name in ("times_s", "time_s", "energy_db", "servos_s")}
+
+        def rows(values: array[float], width: int) -> Floats:
+            return np.array(values, dtype=np.float32).reshape(-1, width)
+
         return RunRecording(
             about=self.about,
             joints=self._joints,
-            times_s=np.array(self._times_s)[:ticks],
-            motion=np.array(self._motion, dtype=np.float32).reshape(-1, MOTION_DIM)[:ticks],
-            goals_rad=goals_rad,
-            present_rad=present_rad,
+            times_s=times["times_s"][:ticks],
+            motion=rows(self._floats["motion"], MOTION_DIM)[:ticks],
+            goals_rad=rows(self._floats["goals_rad"], count)[:ticks],
+            present_rad=rows(self._floats["present_rad"], count)[:ticks],
             faults=np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
-            heard_s=np.array(self._heard_s),
+            heard_s=times["time_s"],
             audio=_sound(self._pcm16),
-            # A frame holds what the robot says after it: the sound of the frame itself stands in the one before.
-            agent_audio=_sound(self._agent_pcm16)[: len(self._heard_s) * FRAME_SAMPLES] if self._speaks else None,
-            energy_db=np.array(self._energy_db),
-            speaker=np.array(self._speaker, dtype=np.float32).reshape(-1, MOTION_DIM),
-            speaker_jaw_rad=np.array(self._jaw_rad, dtype=np.float32).reshape(-1, 3),
+            # A frame holds the robot's sound after it: the sound of the frame itself is in the one before.
+            agent_audio=_sound(self._agent_pcm16)[: len(times["time_s"]) * FRAME_SAMPLES] if self._speaks else None,
+            energy_db=times["energy_db"],
+            speaker=rows(self._floats["speaker"], MOTION_DIM),
+            speaker_jaw_rad=rows(self._floats["jaw_rad"], 3),
             plans=self._plans,
             states=self._states,
             events=self._events,
-            servos_s=np.array(self._servos_s),
-            servos={name: np.array(values, np.float32).reshape(-1, count) for name, values in self._servos.items()},
+            servos_s=times["servos_s"],
+            servos={name: rows(values, count) for name, values in self._servos.items()},
             whole=self.whole,
         )
+
+
+def _state(value: Mapping[str, Any]) -> tuple[float, str, tuple[str, ...]]:
+    return value["time_s"], value["state"], tuple(value["why"])
 
 
 def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
@@ -286,7 +287,7 @@ def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
 
 
 def _read_rad(joint: Mapping[str, Any]) -> float:
-    """A position that is older than the servo may be away is none."""
+    """Return a position, NaN where it is so old that the servo counts as away."""
     return math.nan if (joint.get("age_s") or 0.0) > AWAY_S else _or_nan(joint["present_rad"])
 
 

@@ -15,7 +15,7 @@ from typing import Any, Final, Literal
 
 import yaml
 
-from sfms_robot.app.out_files import checked_file
+from sfms_robot.app.output_paths import checked_file
 from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
 from sfms_robot.config.base import Model, load
 from sfms_robot.emulator.faults import parse_ids

@@ -9,7 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.lab.bench.measure import HEAD
 from sfms_robot.listeners.process import threads
 from sfms_robot.sources.speakers import DEFAULT_SPEAKER

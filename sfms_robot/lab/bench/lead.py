@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.open_head import HeadOptions, open_head
-from sfms_robot.app.session import Programme, drive_head
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import HeadOptions
+from sfms_robot.app.session import drive_head, parts_of
 from sfms_robot.app.wiring import calibration_of
 from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain
@@ -125,12 +126,13 @@ def lead(head: str = HEAD) -> dict[str, Row]:
 def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], Doubles, Doubles]:
     """Joints, their leads, and how late they are when they are led by `share` of those."""
     waves = Waves()
-    with open_head(HeadOptions(name, fast=True, yes=True)) as opened:
+    with open_head(HeadOptions(head=name, fast=True, yes=True)) as opened:
         motion, rate_hz = opened.motion, opened.rate_hz
         led = replace(opened, motion=replace(motion, leads_s=share * motion.leads_s))
         chains = {bus: chain for bus, chain in opened.opened.items() if isinstance(chain, Chain)}
         seen = Onlooker(opened.config, chains, opened.clock)
-        drove = drive_head(led, Programme(NobodyThere(), waves, duration_s, observers=[seen]), Interrupt())
+        parts = parts_of(led, NobodyThere(), waves, observers=[seen])
+        drove = drive_head(led, parts, Interrupt(), duration_s=duration_s)
     if drove.error is not None:
         raise drove.error
     times_s = np.array(seen.times_s)

@@ -31,7 +31,8 @@ from typing import Any, Final, Literal
 import numpy as np
 import yaml
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
@@ -270,7 +271,9 @@ def measured_run() -> None:
         with TemporaryDirectory() as folder, launch(emulated(load_head(HEAD))["main"], timing="wire") as chain:
             head = str(patient_head(Path(folder), chain.read_deadline_s))
             report = run(
-                RunOptions(head, port=chain.device, yes=True, **how), source=source, observers=[stamps, memory, cpu]
+                RunOptions(head=head, port=chain.device, yes=True, **how),
+                source=source,
+                observers=[stamps, memory, cpu],
             )
     finally:
         over.set()

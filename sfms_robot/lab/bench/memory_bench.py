@@ -11,7 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.errors import BusError
 from sfms_robot.lab.bench.lead import Waves
 from sfms_robot.lab.bench.measure import Row, row

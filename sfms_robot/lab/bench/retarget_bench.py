@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from sfms_robot.app.head.faces import recorded_faces
+from sfms_robot.app.head.head_check import named_faces
 from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.errors import ConfigError
@@ -79,7 +79,7 @@ def _plans(ticks: int) -> list[Plan]:
     need = int(ticks / RATE_HZ / FRAME_S) + 2 * _HORIZON
     clips: list[Floats] = []
     while sum(map(len, clips)) < need:
-        clips += [clip for clip in recorded_faces() if len(clip) > _HORIZON]
+        clips += [clip for _, clip in named_faces() if len(clip) > _HORIZON]
     faces = np.concatenate(clips)
     return [
         Plan(k * FRAME_S, FRAME_S * np.arange(k + 1.0, k + _HORIZON + 1), faces[k : k + _HORIZON])

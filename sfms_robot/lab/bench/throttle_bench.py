@@ -24,7 +24,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch

@@ -28,8 +28,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import page_session
-from sfms_robot.app.listen.preflight import begin_page
-from sfms_robot.app.session import Document, RunOptions, run
+from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.app.session import Document, run
 from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan, SpeakerFrame

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sfms_robot.app.out_files import INK, RULE, SERIES, new_figure, plain, save
+from sfms_robot.app.output_paths import INK, RULE, SERIES, new_figure, plain, save
 from sfms_robot.lab.evaluate import trajectory_plots
 from sfms_robot.lab.evaluation.paper import score_history as history
 from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel

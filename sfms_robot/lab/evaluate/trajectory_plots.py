@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import torch
 
-from sfms_robot.app.out_files import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
+from sfms_robot.app.output_paths import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain
 from sfms_robot.frames import CHANNELS, FRAME_S, Floats
 from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.lab.evaluation.paper.restoration import Windows

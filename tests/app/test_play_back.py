@@ -1,14 +1,21 @@
-"""A recorded run drives a head again: the same one as it did, another one as that one can, and within its limits."""
+"""A recorded run again: on the same head and on another, within its limits; and on a page."""
 
 import json
+from contextlib import closing
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from websockets.sync.client import connect
 
+from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.app.replay.play_back import pictures, play_back, recorded_face, show_recording
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.replay.run_playback import PlaybackOptions, RecordedFace, play_back
-from sfms_robot.app.session import RunOptions, run
-from sfms_robot.runtime.recorder import RUN_FILE
+from sfms_robot.app.session import run
+from sfms_robot.frames import MOTION_DIM, Reading
+from sfms_robot.ports import Tick
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder
+from sfms_robot.viewer.frame_record import frame_json
 
 HEAD, SECONDS = "interbotix_wxxms", 4.0
 
@@ -22,7 +29,7 @@ def recorded(tmp_path_factory):
 
 def test_the_same_head_does_what_it_did(recorded):
     folder, report = recorded
-    played = play_back(folder, PlaybackOptions(fast=True))
+    played = play_back(folder, fast=True)
     assert (played["head"], played["exit"], played["error"]) == (HEAD, "done", None)
     assert played["duration_s"] == pytest.approx(SECONDS) and played["limits"]["violations"] == 0
     assert played["motion"] == report["motion"]
@@ -32,7 +39,7 @@ def test_the_same_head_does_what_it_did(recorded):
 
 
 def test_another_head_does_what_it_can(recorded):
-    played = play_back(recorded[0], PlaybackOptions("poppy_head", fast=True))
+    played = play_back(recorded[0], head="poppy_head", fast=True)
     assert played["head"] == "poppy_head" and played["exit"] == "done"
     assert played["limits"]["violations"] == 0
     assert any(joint["travel_rad"] > 0.01 for joint in played["joints"].values())
@@ -41,7 +48,7 @@ def test_another_head_does_what_it_can(recorded):
 def test_what_a_killed_run_left_plays_up_to_its_end(recorded, tmp_path):
     whole = (recorded[0] / RUN_FILE).read_bytes()
     (tmp_path / RUN_FILE).write_bytes(whole[: len(whole) // 2])
-    played = play_back(tmp_path, PlaybackOptions(fast=True))
+    played = play_back(tmp_path, fast=True)
     assert not played["whole"] and 0.5 < played["recorded_s"] < SECONDS
     assert played["duration_s"] == pytest.approx(played["recorded_s"], abs=0.02)
 
@@ -50,7 +57,7 @@ def test_a_face_is_that_of_its_tick_and_between_two_between_them(recorded):
     recording = read_recording(recorded[0])
     listened = recording.times_s <= recording.listened_s
     assert recording.listened_s == SECONDS and not listened.all()  # a head that plays it has a way to rest of its own
-    timeline, times_s, motion = RecordedFace(recording), recording.times_s[listened], recording.motion[listened]
+    timeline, times_s, motion = recorded_face(recording), recording.times_s[listened], recording.motion[listened]
     np.testing.assert_array_equal(timeline.sample(times_s, 0.0, None)[0], motion)
     between, _ = timeline.sample((times_s[1:] + times_s[:-1]) / 2, 0.0, None)
     np.testing.assert_allclose(between, (motion[1:] + motion[:-1]) / 2, atol=1e-6)
@@ -72,8 +79,8 @@ def test_the_seed_is_a_number_as_in_the_report(recorded, command_line):
 
 def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
     (tmp_path / "head.yaml").write_text(read_recording(recorded[0]).about["head_yaml"])
-    played = play_back(recorded[0], PlaybackOptions(str(tmp_path), fast=True))
-    assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], PlaybackOptions(fast=True))["joints"]
+    played = play_back(recorded[0], head=str(tmp_path), fast=True)
+    assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], fast=True)["joints"]
 
 
 def test_what_is_wrong_is_said_in_one_line(recorded, command_line):
@@ -89,3 +96,44 @@ def test_what_is_wrong_is_said_in_one_line(recorded, command_line):
 def test_the_command_says_what_was_played(recorded, command_line):
     ended = command_line("replay", recorded[0], "--port", "sim", "--fast", "--json")
     assert ended.code == 0 and ended.told["exit"] == "done" and ended.told["recording"]["head"] == HEAD
+
+
+def test_twenty_five_pictures_a_second_are_what_was_recorded(recorded):
+    folder = recorded[0]
+    recording = read_recording(folder)
+    told = [json.loads(frame_json(record)) for record in pictures(recording)]
+    assert len(told) == pytest.approx(25 * recording.duration_s, abs=2)
+    middle = told[25]
+    row = int(np.argmin(np.abs(recording.times_s - middle["t"])))
+    assert np.allclose(middle["m"], recording.motion[row], atol=6e-5)
+    assert np.allclose(middle["j"], recording.goals_rad[row], atol=6e-5)
+    assert [told[0]["s"], told[-1]["s"]] == ["starting", "stopping"] and middle["db"] is not None
+
+
+def test_a_position_that_was_old_is_not_shown_as_read(tmp_path):
+    recorder = Recorder(tmp_path / "run", ("slow", "away"), when_full="wait")
+    for index in range(50):
+        readings = {"slow": Reading(0.11, 0.04 * (index % 25)), "away": Reading(0.12, 0.04 * index)}
+        recorder.tick(Tick(0.04 * index, np.zeros(MOTION_DIM, np.float32), np.array([0.1, 0.2]), readings))
+    recorder.close()
+    told = [json.loads(frame_json(record)) for record in pictures(read_recording(tmp_path / "run"))]
+    assert all(each["r"][0] == 0.11 for each in told)
+    assert told[20]["r"] == [0.11, 0.12] and told[-1]["r"] == [0.11, None] and told[-1]["u"] == [0.11, 0.2]
+
+
+def test_the_page_has_all_of_it(recorded):
+    folder = recorded[0]
+    page = begin_page("0")
+    with closing(page):
+        page.wait()
+        show_recording(folder, page)
+        with connect(page.url.replace("http", "ws", 1) + "ws") as visitor:  # the page's process may still be reading
+            told = json.loads(visitor.recv(timeout=30))
+            while not told.get("over") and told["type"] != "over":
+                told = json.loads(visitor.recv(timeout=30))
+        with urlopen(page.url + "runs/last", timeout=30) as answer:
+            lines = [json.loads(line) for line in answer.read().splitlines()]
+        assert lines[0]["head"] == HEAD and lines[0]["replay"] is True
+        count = sum(line["type"] == "frame" for line in lines)
+        assert count == len(list(pictures(read_recording(folder))))
+        assert lines[-1]["report"]["ticks"] > 200

@@ -1,4 +1,4 @@
-"""Files that a command will write, checked before the work for them begins; and how pictures look."""
+"""Files that a command will write, checked before the work begins; and the style of pictures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def made_folder(folder: Path, option: str) -> Path:
 def checked_png(png: Path, option: str) -> Path:
     """Return the file, before the work for it begins. Raises ConfigError where no PNG can be written there."""
     if png.suffix.lower() != ".png":
-        raise ConfigError(f"{option} {png}: is no name of a picture (FILE.png)")
+        raise ConfigError(f"{option} {png}: expected the name of a picture, FILE.png")
     return checked_file(png, option)
 
 

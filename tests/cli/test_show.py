@@ -11,11 +11,10 @@ from ended import Ended
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.cli import json_line
+from sfms_robot.cli import show
 from sfms_robot.cli.main import app
-from sfms_robot.cli.show import cell
 
-FILES = sorted(Path(json_line.__file__).parent.glob("*.py"))
+FILES = sorted(Path(show.__file__).parent.glob("*.py"))
 FIGURES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.lists(inner).map(tuple) | st.dictionaries(st.text(), inner),
@@ -35,15 +34,15 @@ def finite(value):
 @given(told=st.dictionaries(st.text(), FIGURES))
 def test_whatever_a_command_tells_is_one_line_of_json(told):
     with redirect_stdout(io.StringIO()) as out:
-        json_line.print_json(told)
+        show.print_json(told)
     assert out.getvalue().count("\n") == 1 and Ended(0, out.getvalue(), "").told == finite(told)
 
 
 def test_figures_that_cannot_be_told_are_null(capsys):
     nothing = float("nan")
-    json_line.print_json({"auc": nothing, "interval": (nothing, float("inf")), "rows": [{"share": -float("inf")}]})
+    show.print_json({"auc": nothing, "interval": (nothing, float("inf")), "rows": [{"share": -float("inf")}]})
     assert capsys.readouterr().out == '{"auc": null, "interval": [null, null], "rows": [{"share": null}]}\n'
-    assert cell(nothing) == "-" == cell(None)
+    assert show.cell(nothing) == "-" == show.cell(None)
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -54,7 +53,7 @@ def test_json_is_printed_in_one_place(file):
         if isinstance(node, ast.Import)
         for alias in node.names
     }
-    assert not found & {"json", "orjson"} or file.stem == "json_line"
+    assert not found & {"json", "orjson"} or file.stem == "show"
 
 
 def commands(command, words=()):

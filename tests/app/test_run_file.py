@@ -1,3 +1,5 @@
+"""A recording read back: what was recorded, whatever is missing at its end."""
+
 import base64
 import json
 import tracemalloc
@@ -7,36 +9,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from recorded_runs import JOINTS, record
 
-from sfms_robot.app.replay import plot, read_recording, sheet, summary
+from sfms_robot.app.replay.run_file import read_recording, summary
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, FaceFrame, Plan, Reading, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, FaceFrame, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.runtime import recorder as recorder_module
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
-
-JOINTS = ("neck_pitch", "jaw", "brow")
-
-
-def record(folder, seconds=2.0, voice=True):
-    """A run at 100 Hz: the speaker talks in the first half."""
-    recorder = Recorder(folder, JOINTS, when_full="wait", about={"head": "face28", "seed": "3"})
-    rng = np.random.default_rng(0)
-    for n in range(round(seconds * 100)):
-        time_s = n / 100
-        if n % 4 == 0:
-            loud = 0.2 if voice and time_s < seconds / 2 else 0.0
-            audio = (loud * rng.uniform(-1, 1, 640 if voice else 0)).astype(np.float32)
-            face = FaceFrame.of(time_s + 0.04, np.full(58, 0.25)) if n % 8 == 0 else None
-            recorder.heard(SpeakerFrame(time_s + 0.04, audio, face))
-            recorder.planned(Plan(time_s, np.array([time_s + 0.04]), np.zeros((1, 58), dtype=np.float32)))
-        goals = np.array([0.2 * np.sin(time_s), time_s / 10, 0.0])
-        warmth = {"temperature_C": 40.0 + round(time_s)}
-        readings = {"neck_pitch": Reading(goals[0], 0.01, extra=warmth), "jaw": Reading(None, float("inf"), "silent")}
-        state, why = ("listening", ()) if n < 150 else ("halted", ("key",))
-        recorder.tick(Tick(time_s, rng.uniform(0, 1, 58).astype(np.float32), goals, readings, state, why))
-    recorder.close()
-    return folder
 
 
 def test_what_was_recorded_is_read_back(tmp_path):
@@ -174,28 +154,6 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
     Recorder(tmp_path / "short", JOINTS).close()
     with pytest.raises(ConfigError, match="the run never began"):
         read_recording(tmp_path / "short")
-
-
-@pytest.mark.parametrize(("seconds", "voice"), [(2.0, True), (2.0, False), (0.01, True)])
-def test_a_plot_is_1600_by_1200(tmp_path, seconds, voice):
-    pytest.importorskip("matplotlib")
-    plot(read_recording(record(tmp_path, seconds, voice)), tmp_path / "a.png")
-    data = (tmp_path / "a.png").read_bytes()
-    assert (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) == (1600, 1200)
-
-
-def test_pictures_need_a_folder_to_go_to(tmp_path):
-    pytest.importorskip("matplotlib")
-    run = read_recording(record(tmp_path, 0.1))
-    with pytest.raises(ConfigError, match="no folder"):
-        plot(run, tmp_path / "none" / "a.png")
-
-
-def test_the_sheet_of_a_run_is_drawn(tmp_path):
-    pytest.importorskip("vtkmodules")
-    run = read_recording(record(tmp_path, 0.3))
-    assert len(sheet(run, tmp_path / "a.png")) == 12
-    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_a_recording_in_several_files_is_read_as_one(tmp_path, monkeypatch):

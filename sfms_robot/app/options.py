@@ -1,0 +1,185 @@
+"""The options of a run, and everything that can be checked or started from them before anything is loaded.
+
+One model serves `sfms-robot run` and `demo`, `Robot(...)` and the report. The checks use the functions of the run
+itself; `session.run` checks the rest. Standard library only: a wrong name is reported as soon as Python has started.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sfms_robot.data import find
+from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.network import Router
+from sfms_robot.plugins import listener_folder
+from sfms_robot.servo.discovery import access_problem, is_address
+from sfms_robot.sources.registry import BROWSER, check_source, split_kind
+
+if TYPE_CHECKING:
+    from sfms_robot.config import Calmness
+    from sfms_robot.listeners.engine import EngineName
+    from sfms_robot.listeners.remote import NamedFeed
+    from sfms_robot.viewer.page_process import PageProcess
+
+SIM: Final = "sim"  # the port of emulated servos
+ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
+PAGE: Final = "sfms_robot.app.listen.page_scene:main"
+_IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadOptions:
+    """A head and its servos.
+
+    Attributes:
+        head: shipped name, or a folder with a head.yaml.
+        port: "sim", "auto", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
+        fast: virtual time; needs emulated servos.
+        yes: hobby servos may jump when they come on.
+        without: joints whose servos are not addressed at all.
+    """
+
+    head: str = "face28"
+    port: str = SIM
+    fast: bool = False
+    yes: bool = False
+    without: tuple[str, ...] = ()
+
+    @property
+    def confirmed(self) -> bool:
+        """True if hobby servos may be connected, which makes them jump."""
+        return self.yes
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(HeadOptions):
+    """The options of `sfms-robot run`; None where a default depends on other options."""
+
+    listener: str = "sfms-small"
+    audio: str = "default"
+    face: str = "auto"
+    agent_audio: str = "none"
+    play: str | None = None
+    duration_s: float | None = None
+    seed: int = 0
+    engine: EngineName = "auto"
+    intensity: tuple[str, ...] = ()
+    style: tuple[str, ...] = ()
+    calmness: Calmness | None = None
+    record: Path | None = None
+    overwrite: bool = False
+    dry_run: bool = False
+    halt_on: str | None = None
+    status: str | None = None
+    fleet: str | None = None
+    fleet_key: Path | None = None
+    zenoh: Path | None = None
+    insecure: bool = False
+    packages: tuple[str, ...] = ()
+
+    @property
+    def confirmed(self) -> bool:
+        """True in a dry run too: no servo comes on."""
+        return self.yes or self.dry_run
+
+    @property
+    def router(self) -> Router:
+        """Router of a fleet, or of a listener on another machine."""
+        return Router(self.zenoh, self.insecure)
+
+    @property
+    def hears(self) -> str:
+        """`audio`, where "default" is the microphone for servos that are not emulated here."""
+        return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
+
+
+_DEFAULTS: Final = RunOptions()
+
+
+def check_names(options: RunOptions) -> None:
+    """Check that head, listener, port and files exist, and the port of the status is free.
+
+    Raises ConfigError, PortError.
+    """
+    find("heads", options.head, "head.yaml")
+    listener_folder(options.listener)
+    check_source(options.audio, options.face, options.agent_audio, play=options.play)
+    if options.status is not None:
+        from sfms_robot.app.loopback_server import status_server  # http.server: only for a run that serves it
+
+        status_server(options.status).close()
+    for part in options.port.split(","):
+        device = part.rpartition("=")[2]
+        if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
+            raise PortError(f"--port {device}: {problem}")
+
+
+def engine_named(name: str) -> EngineName:
+    """Return the engine of that name. Raises ConfigError."""
+    for known in ENGINES:
+        if name == known:
+            return known
+    raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+
+
+def begin_listening(options: RunOptions) -> NamedFeed:
+    """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it."""
+    from sfms_robot.listeners.remote import open_feed
+
+    return open_feed(options.listener, options.seed, options.calmness, options.router, options.engine)
+
+
+def begin_page(
+    address: str | None,
+    certificate: Path | None = None,
+    key: Path | None = None,
+    *,
+    options: RunOptions = _DEFAULTS,
+) -> PageProcess | None:
+    """Return the page's process, which starts from now on; None where no page is wanted. The caller closes it.
+
+    `address`: of `--view`; a run that takes a visitor as its person has a page without one. Raises ConfigError for
+    what no page can show.
+    """
+    if address is None:
+        if BROWSER not in (split_kind(options.audio)[0], split_kind(options.face)[0]):
+            if certificate is not None or key is not None:
+                raise ConfigError("--view-cert, --view-key: no page is served (--view)")
+            return None
+        address = "auto"
+    if options.fast:
+        raise ConfigError(f"--view {address}: a page shows what takes real time, --fast has none")
+    if options.dry_run:
+        raise ConfigError(f"--view {address}: nothing moves in a --dry-run")
+    from sfms_robot.viewer.page_process import Address, PageProcess  # only for a run with a page
+
+    return PageProcess(Address.parsed(address, certificate, key), PAGE)
+
+
+def can_open(environment: Mapping[str, str], platform: str) -> bool:
+    """Return whether there is a screen, and the user of this program sits in front of it."""
+    if "SSH_CONNECTION" in environment:
+        return False
+    return platform in ("darwin", "win32") or any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def open_browser(url: str) -> bool:
+    """Show `url` in a browser window of this computer; return whether that can be. Never blocks, raises nothing."""
+    if not can_open(os.environ, sys.platform):
+        return False
+    import webbrowser  # only for the one command that opens a window
+
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return False
+    if getattr(browser, "name", "") in _IN_TERMINALS:
+        return False
+    threading.Thread(target=browser.open, args=(url,), name="browser", daemon=True).start()
+    return True

@@ -1,0 +1,163 @@
+"""A recorded run played again: by a head, or on a page where no head moves.
+
+A head plays the recorded face, not the recorded joint angles, through the retargeter and limits of the head at hand: so
+one recording suits every head, and neither another calibration nor another servo can take a joint where it must not go.
+Torque comes on and goes off as in `sfms-robot run`; there is no listener, and nothing is added to the recording.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.app.head.pose import FaceTrack
+from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.app.listen.report import figures_so_far, outcome
+from sfms_robot.app.open_head import open_head
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
+from sfms_robot.app.session import Panel, run_log
+from sfms_robot.config import Calmness, load_head
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
+from sfms_robot.runtime.halt import HaltLatch, halt_signals
+from sfms_robot.runtime.observers import RunStatus
+from sfms_robot.runtime.safety import Interrupt, signals_to
+from sfms_robot.signals.audio import energy_db
+from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
+from sfms_robot.viewer.page_process import PageProcess
+
+LEFT_S: Final = 5.0  # without a visitor, after which the page ends
+_LOOK_S: Final = 0.5
+FAULTY: Final = "faulty"  # the name of every fault: a recording has only whether there was one
+
+
+def recorded_face(recording: RunRecording) -> FaceTrack:
+    """Return the face of a recording up to its way to rest, interpolated between ticks."""
+    listened = recording.times_s <= recording.listened_s
+    return FaceTrack(recording.times_s[listened], recording.motion[listened])
+
+
+def play_back(
+    folder: Path,
+    panel: Panel | None = None,
+    *,
+    head: str | None = None,
+    port: str = SIM,
+    fast: bool = False,
+    yes: bool = False,
+) -> dict[str, Any]:
+    """Drive a head as long as the recording lasts, also one that was cut off. Block until then; return a report.
+
+    `head` None: the recorded one, by its shipped name. Raises RobotError before torque came on; after that the head is
+    at rest, and "error" says why.
+    """
+    recording = read_recording(folder)
+    head = head or recording.about.get("head")
+    if head is None:
+        raise ConfigError(f"{folder}: does not say which head it is of: --head NAME or DIR")
+    interrupt, halt = Interrupt(), HaltLatch()
+    servos = HeadOptions(head=head, port=port, fast=fast, yes=yes)
+    with signals_to(interrupt), halt_signals(halt), open_head(servos) as opened:
+        log, knobs = run_log(opened), turned(opened.config)
+
+        def figures() -> dict[str, Any]:
+            intensity = knobs.values["intensity"]
+            return {**figures_so_far(log, opened.rate_hz, real=not fast), "intensity": intensity}
+
+        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.listened_s}
+        status = RunStatus(list(opened.config.joints), facts, figures)
+        face = recorded_face(recording)
+        with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
+            drove = face.play(opened, status, interrupt, signals=False, log=log, knobs=lambda: knobs.now, halt=halt)
+            status.ended(log.states[-1][1])
+    return {
+        **outcome(opened, drove),
+        "recorded_s": round(recording.listened_s, 3),
+        "duration_s": round(log.listened_s, 3),
+        "whole": recording.whole,
+        "ticks": log.ticks,
+        "limits": {"violations": log.audited.violations if log.audited else 0},
+        "motion": log.motion_report(),
+        "joints": log.joint_report(),
+    }
+
+
+# --- on a page --------------------------------------------------------------------------------------------------------
+
+
+def show_recording(folder: Path, page: PageProcess) -> None:
+    """Put the run in `folder` on a page whose process has begun. Blocks until it is there.
+
+    Raises ConfigError for a folder without one, and where the recorded head is not at hand or has other joints now.
+    """
+    recording = read_recording(folder)
+    page.say("begin", scene=recording.about["head"], **_facts(recording))
+    for time_s, kind in recording.events:
+        page.say("event", event=kind, at_s=round(time_s, 3))
+    for record in pictures(recording):
+        page.keep(record)
+    page.say("end", report=summary(recording))
+
+
+def wait_for_visitors(page: PageProcess) -> None:
+    """Block until a visitor has come, and all have been away for `LEFT_S`. Ctrl-C ends it."""
+    alone_s, pause = 0.0, threading.Event()
+    page.visited.wait()
+    while alone_s < LEFT_S:
+        pause.wait(_LOOK_S)
+        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+
+
+def pictures(recording: RunRecording) -> Iterator[bytes]:
+    """Yield the frames of the page, packed: 25 a second."""
+    times_s = np.arange(recording.times_s[0], recording.duration_s + 1e-9, 1.0 / FRAME_HZ)
+    rows = np.minimum(np.searchsorted(recording.times_s, times_s - 1e-9), len(recording.times_s) - 1)
+    talks = recording.talks_at(times_s)
+    heard = np.searchsorted(recording.heard_s, times_s, side="right") - 1
+    said = recording.agent_audio
+    states = [(-np.inf, "starting", ()), *recording.states]
+    for time_s, row, talking, frame in zip(times_s.tolist(), rows.tolist(), talks, heard.tolist(), strict=True):
+        while len(states) > 1 and states[1][0] <= time_s:
+            states.pop(0)
+        faults = {recording.joints[joint]: FAULTY for joint in np.flatnonzero(recording.faults[row])}
+        yield pack_picture(
+            Picture(
+                time_s=time_s,
+                motion=recording.motion[row],
+                asked_rad=recording.goals_rad[row].astype(np.float64),
+                read_rad=recording.present_rad[row],
+                rare=rare_json(states[0][1], states[0][2], faults, None),
+                voice_db=float(recording.energy_db[frame]) if 0 <= frame < len(recording.heard_s) else NOTHING,
+                own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
+                talking=bool(talking),
+            )
+        )
+
+
+def _facts(recording: RunRecording) -> dict[str, Any]:
+    about = recording.about
+    head = load_head(about["head"])
+    if tuple(head.joints) != recording.joints:
+        raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
+    speaker = about.get("audio")
+    facts = page_facts(
+        head,
+        port=about["port"],
+        listener=about["listener"],
+        seed=int(about["seed"]),
+        speaker=DEFAULT_SPEAKER if speaker == "default" else speaker,
+        calmness=Calmness(),
+        people={},
+        knobs=turned(head),
+        source={"voice": False, "face": False},
+        choices=False,
+    )
+    return facts | {"replay": True}

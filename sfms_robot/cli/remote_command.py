@@ -1,0 +1,150 @@
+"""`sfms-robot serve` and `fleet`: one listener for many heads, and heads that were started with `run --fleet NAME`."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+from typer import Argument, Context, Exit, Option, Typer
+
+from sfms_robot.cli.show import JSON, print_json, show
+from sfms_robot.data import listener_names
+from sfms_robot.errors import ConfigError
+
+app = Typer(help="Heads that run with --fleet: list, halt, resume, a page.", no_args_is_help=False)
+
+_ZENOH = Option(None, "--zenoh", metavar="FILE", help="zenoh's configuration. Default: tcp/127.0.0.1:7447.")
+_INSECURE = Option(False, "--insecure", help="Allow endpoints of --zenoh beyond loopback without TLS.")
+_KEY = Option(None, "--fleet-key", metavar="FILE", help="Key of the fleet. Default: fleet.key of this user.")
+_HEADS = Argument(None, metavar="[NAME]...", help="Heads; default: all.")
+
+
+@app.callback(invoke_without_command=True)
+def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
+    """List the heads of the fleet, and their states."""
+    if context.invoked_subcommand is not None:
+        if zenoh is not None or json or insecure:
+            flag = "--zenoh" if zenoh is not None else "--json" if json else "--insecure"
+            raise ConfigError(f"fleet {flag}: stands behind the command: fleet {context.invoked_subcommand} {flag} ...")
+        return
+    from sfms_robot.app.fleet.fleet_client import Fleet, tile
+
+    with Fleet(zenoh, insecure) as found:
+        tiles = [tile(str(each.get("name")), each) for each in found.states()]
+    show({"heads": tiles, "malformed": found.malformed}, json)
+    if not tiles:
+        print("no head answers (start one with: sfms-robot run --fleet NAME)", file=sys.stderr)
+
+
+@app.command()
+def halt(heads: list[str] = _HEADS, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
+    """Halt heads, by default all of them. They stay halted until they are resumed."""
+    from sfms_robot.app.fleet.fleet_client import Fleet
+
+    with Fleet(zenoh, insecure) as found:
+        _show_answers(found.halt(heads or [], f"{getpass.getuser()} by fleet"), heads or [], json)
+
+
+@app.command()
+def resume(
+    heads: list[str] = _HEADS,
+    zenoh: Path | None = _ZENOH,
+    insecure: bool = _INSECURE,
+    key: Path | None = _KEY,
+    json: bool = JSON,
+) -> None:
+    """Let halted heads continue: be sure that no hand is inside one."""
+    from sfms_robot.app.fleet.fleet_client import Fleet
+
+    with Fleet(zenoh, insecure, key) as found:
+        _show_answers(found.resume(heads or []), heads or [], json)
+
+
+@app.command()
+def page(
+    port: int = Option(8776, min=0, max=65535, help="TCP port on loopback; 0: any free one."),
+    zenoh: Path | None = _ZENOH,
+    insecure: bool = _INSECURE,
+    key: Path | None = _KEY,
+    json: bool = JSON,
+) -> None:
+    """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
+    from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
+
+    with Fleet(zenoh, insecure, key) as found, closing(fleet_page(found, port)) as served, suppress(KeyboardInterrupt):
+        if json:
+            print_json({"version": 1, "url": served.url})
+        else:
+            print(f"fleet: {served.url}", file=sys.stderr, flush=True)
+        threading.Event().wait()
+
+
+def _show_answers(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], json: bool) -> None:
+    """Print the answers of heads; exit code 1 when a named head did not answer, or none did."""
+    silent = [name for name in asked if name not in {each.get("name") for each in answers}]
+    show({"answers": list(answers), "silent": silent}, json)
+    if silent or not answers:
+        if not answers and not silent:
+            print("no head answers", file=sys.stderr)
+        raise Exit(1)
+
+
+# --- serve ------------------------------------------------------------------------------------------------------------
+
+
+def serve(
+    listener: str = Option(
+        "sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder with config.yaml and weights."
+    ),
+    name: str | None = Option(None, help="The name for robots, zenoh/NAME. Default: the listener's name."),
+    zenoh: Path | None = Option(
+        None, metavar="FILE", help="zenoh's configuration (JSON5: endpoints, TLS). Default: tcp/127.0.0.1:7447."
+    ),
+    insecure: bool = Option(
+        False, "--insecure", help="Allow endpoints beyond loopback without TLS: anyone on that network may listen in."
+    ),
+    metrics: str | None = Option(
+        None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
+    ),
+    hop: int | None = Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
+    processes: int | None = Option(
+        None, min=1, max=256, help="Processes, each with the listener in its memory. Default: one for each core."
+    ),
+    everybody: bool = Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
+    engine: str = Option("auto", metavar="auto|onnx|torch", help="Engine of the listener, as of `run`."),
+    json: bool = JSON,
+) -> None:
+    """Serve a listener to robots elsewhere, `sfms-robot run --listener zenoh/NAME`, until Ctrl-C."""
+    from sfms_robot.app.options import engine_named
+    from sfms_robot.app.serve.batch_process import Served
+    from sfms_robot.app.serve.service import serve as serve_until
+
+    over = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: over.set())
+    served = Served(
+        listener=listener,
+        name=name or Path(listener).name,
+        server=os.uname().nodename,
+        engine=engine_named(engine),
+        hop=hop,
+        all_heads=everybody,
+    )
+    figures = serve_until(
+        served,
+        over,
+        lambda line: print(line, file=sys.stderr, flush=True),
+        router=zenoh,
+        insecure=insecure,
+        metrics=metrics,
+        processes=processes,
+    )
+    if json:
+        print_json(figures)

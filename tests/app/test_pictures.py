@@ -1,0 +1,91 @@
+"""Pictures of a recording: the plot, and the sheet with its twelve instants."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from recorded_runs import record
+
+from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.replay.pictures import pick_instants, plot, render_sheet, sheet
+from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.config import load_head
+from sfms_robot.frames import CHANNEL_INDEX
+
+
+@pytest.mark.parametrize(("seconds", "voice"), [(2.0, True), (2.0, False), (0.01, True)])
+def test_a_plot_is_1600_by_1200(tmp_path, seconds, voice):
+    pytest.importorskip("matplotlib")
+    plot(read_recording(record(tmp_path, seconds, voice)), tmp_path / "a.png")
+    assert Image.open(tmp_path / "a.png").size == (1600, 1200)
+
+
+def test_the_sheet_of_a_run_is_drawn(tmp_path):
+    pytest.importorskip("vtkmodules")
+    run = read_recording(record(tmp_path, 0.3))
+    assert len(sheet(run, tmp_path / "a.png")) == 12
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def run_with_events():
+    times_s = np.arange(500) / 25
+    frames = np.zeros((500, 58), dtype=np.float32)
+
+    def bump(name, at_s, height, width_s):
+        frames[:, CHANNEL_INDEX[name]] += height * np.exp(-(((times_s - at_s) / width_s) ** 2))
+
+    bump("pitch", 4.0, 0.2, 0.15)
+    bump("pitch", 14.0, 0.1, 0.15)
+    for side in ("Left", "Right"):
+        bump(f"eyeBlink{side}", 7.0, 1.0, 0.08)
+        bump(f"mouthSmile{side}", 11.0, 0.8, 0.8)
+    bump("eyeLookInLeft", 17.0, 0.6, 0.3)
+    bump("eyeLookOutRight", 17.0, 0.6, 0.3)
+    return times_s, frames
+
+
+def test_a_sheet_shows_what_happened():
+    instants = pick_instants(*run_with_events())
+    labels = {instant.label: instant.time_s for instant in instants}
+    assert len(instants) == 12 and sorted(i.time_s for i in instants) == [i.time_s for i in instants]
+    assert labels["nod, lowest"] == pytest.approx(4.0, abs=0.05)
+    assert 3.4 < labels["nod begins"] < labels["nod, lowest"] < labels["nod ends"] < 4.6
+    assert labels["blink"] == pytest.approx(7.0, abs=0.05)
+    assert labels["smile"] == pytest.approx(11.0, abs=0.1)
+    assert labels["looks right"] == pytest.approx(17.0, abs=0.1)
+    assert max(np.diff([i.time_s for i in instants])) < 4.0
+
+
+def test_a_still_face_gives_evenly_spread_instants():
+    instants = pick_instants(np.arange(500) / 25, np.zeros((500, 58), dtype=np.float32))
+    assert {instant.label for instant in instants} == {"-"}
+    assert max(np.diff([instant.time_s for instant in instants])) < 3.0
+
+
+@pytest.mark.parametrize("frames", [1, 5, 12])
+def test_a_short_run_gives_every_frame_once(frames):
+    instants = pick_instants(np.arange(frames) / 25, np.zeros((frames, 58), dtype=np.float32))
+    assert [instant.row for instant in instants] == list(range(frames))
+
+
+def test_pictures_are_drawn_without_a_display(tmp_path):
+    pytest.importorskip("vtkmodules")
+    times_s, frames = run_with_events()
+    instants = render_sheet(tmp_path / "sheet.png", times_s, frames, times_s > 5, "a run")
+    width, height = Image.open(tmp_path / "sheet.png").size
+    assert width == pytest.approx(1600, abs=20) and 1000 < height < 1400
+    assert instants == pick_instants(times_s, frames)
+
+
+def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
+    pytest.importorskip("vtkmodules")
+    scene = scene_of(load_head("op3_head"))
+    times_s, frames = run_with_events()
+    angles_rad = np.zeros((len(times_s), 2))
+    for name, tilt_rad in (("still", 0.0), ("down", 0.4)):
+        angles_rad[:, 1] = tilt_rad
+        render_sheet(tmp_path / f"{name}.png", times_s, frames, None, "a run", (scene, angles_rad))
+    still, down = (np.asarray(Image.open(tmp_path / f"{name}.png")).astype(float) for name in ("still", "down"))
+    change = np.abs(still - down).mean(axis=2)
+    first = slice(8, 260), slice(268, 440)  # the virtual head and the robot, of the first instant
+    face, robot = (change[80:360, columns] for columns in first)
+    assert robot.mean() > 2 and face.max() == 0
