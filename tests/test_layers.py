@@ -21,7 +21,6 @@ BASE = {
     "ranges",
     "child_process",
     "endpoint",
-    "origin",
     "network",
     "plugins",
     "realtime",

@@ -10,8 +10,8 @@ from sfms_robot.config import load_head
 from sfms_robot.config.listener_kinds import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
 from sfms_robot.servo.discovery import ports_data
-from sfms_robot.sources.sound_devices import SoundDevice
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import shipped_speaker
+from sfms_robot.sources.sound_devices import SoundDevice, sound_devices
 
 
 def shipped_heads() -> list[dict[str, Any]]:
@@ -75,8 +75,6 @@ def microphones() -> list[dict[str, Any]]:
 
     Raises ConfigError without PortAudio.
     """
-    from sfms_robot.sources.microphone import sound_devices
-
     return [
         {
             **_row(device),
@@ -88,8 +86,6 @@ def microphones() -> list[dict[str, Any]]:
 
 def loudspeakers() -> list[dict[str, Any]]:
     """As `microphones`; `name` is what to give to --play NAME."""
-    from sfms_robot.sources.microphone import sound_devices
-
     return [{**_row(device), "description": f"--play {device.name}"} for device in sound_devices("playing")]
 
 

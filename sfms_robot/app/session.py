@@ -17,12 +17,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
+from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import Drove, RunTeller, figures_so_far, limitation, run_facts, run_report
-from sfms_robot.app.loopback_server import LoopbackServer, status_server
 from sfms_robot.app.open_head import HeadOptions, OpenHead, open_head, prepare_head
 from sfms_robot.app.wiring import SIM
 from sfms_robot.config import Calmness, Head
@@ -46,6 +45,9 @@ from sfms_robot.runtime.recorder import FullPolicy, Recorder, check_folder, writ
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.runtime.service_notify import NotifyingObserver, ServiceManager
 from sfms_robot.sources.registry import open_source, split_kind
+
+if TYPE_CHECKING:
+    from sfms_robot.viewer.web_server import LocalServer
 
 logger = logging.getLogger(__name__)
 
@@ -296,10 +298,12 @@ def _enter_halts(options: RunOptions, halt: HaltLatch, signals: bool, stack: Exi
         stack.enter_context(halt_switch(options.halt_on, halt))
 
 
-def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> LoopbackServer | None:
+def _status_server(options: RunOptions, facts: Mapping[str, Any], stack: ExitStack) -> LocalServer | None:
     """Serves that a run begins; a port that is taken is found before a listener is loaded."""
     if options.status is None:
         return None
+    from sfms_robot.viewer.web_server import status_server  # a web server: only where one is asked for
+
     server = stack.enter_context(closing(status_server(options.status)))
     server.begin(RunStatus((), facts).document)
     logger.warning("status: %s%s", server.url, server.note)

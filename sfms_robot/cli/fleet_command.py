@@ -32,7 +32,7 @@ def fleet(context: typer.Context, zenoh: Path | None = _ZENOH, insecure: bool = 
             flag = "--zenoh" if zenoh is not None else "--json" if json else "--insecure"
             raise ConfigError(f"fleet {flag}: stands behind the command: fleet {context.invoked_subcommand} {flag} ...")
         return
-    from sfms_robot.app.fleet.fleet_client import Fleet, tile
+    from sfms_robot.app.fleet import Fleet, tile
 
     with Fleet(zenoh, insecure) as found:
         tiles = [tile(str(each.get("name")), each) for each in found.states()]
@@ -52,7 +52,7 @@ def halt(
     heads: list[str] = _HEADS, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = _JSON
 ) -> None:
     """Halt heads, by default all of them. They stay halted until they are resumed."""
-    from sfms_robot.app.fleet.fleet_client import Fleet
+    from sfms_robot.app.fleet import Fleet
 
     with Fleet(zenoh, insecure) as found:
         _told(found.halt(heads or [], f"{getpass.getuser()} by fleet"), heads or [], json)
@@ -67,7 +67,7 @@ def resume(
     json: bool = _JSON,
 ) -> None:
     """Let halted heads continue: be sure that no hand is inside one."""
-    from sfms_robot.app.fleet.fleet_client import Fleet
+    from sfms_robot.app.fleet import Fleet
 
     with Fleet(zenoh, insecure, key) as found:
         _told(found.resume(heads or []), heads or [], json)
@@ -82,7 +82,7 @@ def page(
     json: bool = typer.Option(False, "--json", help="Print its address as one JSON object when it is served."),
 ) -> None:
     """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
-    from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
+    from sfms_robot.app.fleet import Fleet, fleet_page
 
     with Fleet(zenoh, insecure, key) as found, closing(fleet_page(found, port)) as served, suppress(KeyboardInterrupt):
         if json:

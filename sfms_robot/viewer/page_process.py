@@ -18,7 +18,7 @@ import select
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
@@ -28,7 +28,6 @@ import orjson
 from sfms_robot.child_process import end_child, start_child
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
-from sfms_robot.viewer.visitor_commands import Command
 
 HEADER: Final = struct.Struct("<IBI")
 PICTURE, DOCUMENT, PERSON = b"PJV"
@@ -79,7 +78,7 @@ class Address:
 class Asked(Protocol):
     """Who does what visitors ask for. Called in a thread of the page's; may raise RobotError, told to the visitor."""
 
-    def command(self, visitor: int, command: Command) -> None: ...
+    def command(self, visitor: int, name: str, values: Mapping[str, Any]) -> None: ...
 
     def person(self, visitor: int, message: bytes) -> None:
         """Take a piece of the voice, or a face, of the visitor with the controls: a message of docs/protocol.md."""
@@ -212,8 +211,7 @@ class PageProcess:
         elif "left" in told:
             self._heed(visitor, lambda asked: asked.left(visitor))
         else:
-            command = Command(told["command"], told["values"])
-            self._heed(visitor, lambda asked: asked.command(visitor, command))
+            self._heed(visitor, lambda asked: asked.command(visitor, told["command"], told["values"]))
 
     def _heed(self, visitor: int, do: Callable[[Asked], None]) -> None:
         asked = self._asked

@@ -45,7 +45,7 @@ def check_names(
     listener_folder(listener)
     check_source(audio, face, agent_audio, play=play)
     if status is not None:
-        from sfms_robot.app.loopback_server import status_server  # http.server: only for who wants it
+        from sfms_robot.viewer.web_server import status_server  # a web server: only where one is asked for
 
         status_server(status).close()
     for part in port.split(","):

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.app.serve.worker_pool import WorkerPool
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
-from sfms_robot.errors import ConfigError, PortError, optional
+from sfms_robot.errors import ConfigError, optional
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.serving.stream_server import DEADLINE_S
 from sfms_robot.listeners.zenoh_link import ROOT, down_key, join_key
@@ -25,6 +24,8 @@ from sfms_robot.network import Router, check_name, check_zenoh, close_session, s
 
 if TYPE_CHECKING:
     import zenoh
+
+    from sfms_robot.viewer.web_server import Document, LocalServer
 
 _MS: Final = 1e-3
 
@@ -156,30 +157,33 @@ def serve(options: ServeOptions, over: threading.Event, say: Callable[[str], Non
 # --- figures for Prometheus -----------------------------------------------------------------------------------------
 
 
-def metrics_server(wanted: str) -> LoopbackServer:
+def metrics_server(wanted: str) -> LocalServer:
     """Bind the port of `serve --metrics [HOST:]PORT`: figures for Prometheus, by prometheus_client.
 
     `wanted`: a port, "0" for any that is free; HOST:PORT beyond loopback. Raises ConfigError, MissingExtra, PortError.
     """
     with optional("--metrics"):
-        import prometheus_client  # noqa: F401
+        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route
+
+    from sfms_robot.viewer.web_server import LocalServer
+
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:
         raise ConfigError(f"--metrics {wanted}: is no TCP port (0 to {HIGHEST_PORT}, 0 for a free one, or HOST:PORT)")
-    try:
-        server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
-    except OSError as error:
-        raise PortError(f"--metrics {wanted}: {error.strerror or error}") from error
+
+    def routes(statistics: Document) -> list[Route]:
+        def metrics(request: Request) -> Response:
+            return Response(generate_latest(_Collector(statistics)), media_type=CONTENT_TYPE_LATEST)
+
+        return [Route("/{path:path}", metrics)]
+
+    server = LocalServer("--metrics", routes, host or LOOPBACK, port)
     server.url += "metrics"
     return server
-
-
-class _Answer(Answer):
-    def do_GET(self) -> None:
-        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-
-        self.answer(200, generate_latest(_Collector(self.server.document)), CONTENT_TYPE_LATEST)
 
 
 class _Collector:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from sfms_robot.app.session import RunOptions, run
 from sfms_robot.lab.bench.measure import HEAD
 from sfms_robot.listeners.process_child import threads
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 RUN_S: Final = 8.0
 VOICE: Final = "katie"
