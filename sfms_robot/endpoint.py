@@ -1,10 +1,21 @@
-"""Numbers and addresses as people and programs write them: PORT, or HOST:PORT ([HOST]:PORT for IPv6), else loopback."""
+"""Addresses: parsing them, listening at them, and which clients a server of this program admits.
+
+A browser says whose page it shows (Origin) and which name it was given for this machine (Host). A name that a stranger
+gives to this machine's address proves nothing: a page of theirs would be of "the same origin". So a name that is not
+loopback must be an address, or a name that no stranger can own: one of the local network (.local, RFC 6762), or this
+machine's own.
+"""
 
 from __future__ import annotations
 
+import errno
+import hmac
+import ipaddress
+import socket
 from typing import Final
+from urllib.parse import urlsplit
 
-from sfms_robot.errors import InputError
+from sfms_robot.errors import InputError, PortError
 
 LOOPBACK: Final = "127.0.0.1"
 HIGHEST_PORT: Final = 65535
@@ -33,9 +44,91 @@ def port_number(text: str, least: int = 0) -> int | None:
 
 
 def host_and_port(text: str, least: int = 0) -> tuple[str, int] | None:
-    """Host and port of PORT or HOST:PORT; None for another form."""
+    """Return host and port of PORT, HOST:PORT or [HOST]:PORT (IPv6), loopback without a host; None for another form."""
     host, colon, number = text.rpartition(":")
     port = port_number(number, least)
     if port is None or (colon and not host):
         return None
     return host.strip("[]") if colon else LOOPBACK, port
+
+
+def shown(host: str, port: int) -> str:
+    """Return an address as people write it: an IPv6 host in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
+    """Return a TCP socket that listens at an address, or on the first free one of the next `others` ports.
+
+    Port 0: any that is free, which is also the last resort where there are `others`. `flag` names the option in the
+    error. Raises PortError.
+    """
+    further = [*range(port + 1, min(port + others, HIGHEST_PORT + 1)), 0] if port and others else []
+    ports = [port, *further]
+    for each in ports:
+        try:
+            family, _, _, _, where = socket.getaddrinfo(host, each, type=socket.SOCK_STREAM)[0]
+            return socket.create_server(where[:2], family=family, backlog=128)
+        except (OSError, UnicodeError) as error:
+            code = getattr(error, "errno", None)
+            if each != ports[-1] and code in (errno.EADDRINUSE, errno.EACCES):
+                continue
+            used = "is used by another program (choose another port; 0: any free one)"
+            problem = used if code == errno.EADDRINUSE else getattr(error, "strerror", None) or error
+            raise PortError(f"{flag}: TCP port {each} on {host}: {problem}") from error
+    raise AssertionError("no port was tried")
+
+
+def origin_problem(origin: str | None, host: str) -> str | None:
+    """Return why a page may not connect; None where it may, and for clients that are not browsers (`origin` None).
+
+    `host`: the name of this machine in the request, with or without a port.
+    """
+    if origin is None:
+        return None
+    page = _host(origin)
+    if page == "localhost" or (
+        page is not None and (is_loopback(page) or (page == _host(f"//{host}") and _ours(page)))
+    ):
+        return None
+    return f"a page of {origin[:80]!r} may not connect"
+
+
+def host_problem(host: str) -> str | None:
+    """Return why a request that calls this machine `host` is not answered; None where it is."""
+    name = _host(f"//{host}")
+    return None if name is not None and (name == "localhost" or _ours(name)) else f"{host[:80]!r} is not here"
+
+
+def token_admits(given: str, token: str | None) -> bool:
+    """Return whether a client with this token is admitted; `token` None: any. Takes as long for any wrong one."""
+    return token is None or hmac.compare_digest(given.encode(), token.encode())
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether `host` is an address of this machine alone."""
+    address = _address(host)
+    return address is not None and address.is_loopback
+
+
+def is_address(host: str) -> bool:
+    """Return whether `host` is an IPv4 or IPv6 address, not a name."""
+    return _address(host) is not None
+
+
+def _host(url: str) -> str | None:
+    try:
+        return urlsplit(url).hostname
+    except ValueError:
+        return None
+
+
+def _ours(name: str) -> bool:
+    return is_address(name) or name.endswith(".local") or name == socket.gethostname().lower()
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None

@@ -1,7 +1,7 @@
-"""Sessions of zenoh (zenoh.io), which carries what robots and servers say to one another.
+"""Sessions of zenoh (zenoh.io), which carries the messages between robots and servers.
 
-Without a configuration everything stays on this machine: who serves listens on 127.0.0.1:7447, who calls connects
-there, and nobody looks for others by multicast. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
+Without a configuration everything stays on this machine: a server listens on 127.0.0.1:7447, a robot connects there,
+without multicast scouting. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
 replaces all that; docs/remote.md has one for TLS with certificates of both sides. An endpoint that is neither
 on loopback nor encrypted needs `--insecure`.
 """
@@ -15,18 +15,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from sfms_robot.endpoint import is_loopback
 from sfms_robot.errors import ConfigError, PortError, optional
-from sfms_robot.origin import is_loopback
 
 if TYPE_CHECKING:
     import zenoh
 
 PORT: Final = 7447  # zenoh's own
 LOOPBACK: Final = f"tcp/127.0.0.1:{PORT}"
-LEASE_MS: Final = 2000  # a link that says nothing for so long is dead, and is made anew
+LEASE_MS: Final = 2000  # a link that is silent for so long is dead, and is opened again
 QUEUE: Final = 16  # messages that wait for a busy machine, the most that zenoh takes; with its own 2 frames are lost
 RETRY: Final = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1.0}
-AWAY_S: Final = 5.0  # after which somebody who waits for a router is told
+AWAY_S: Final = 5.0  # without a router, after which that is reported
 SAFE: Final = ("tls", "quic", "unixsock-stream", "unixpipe", "serial", "vsock")  # encrypted, or not a network
 NAME_CHARACTERS: Final = "letters, digits, '-', '_' and '.'"
 
@@ -53,15 +53,15 @@ LOCAL: Final = Router()
 
 
 def check_zenoh() -> None:
-    """Raises MissingExtra where zenoh is not installed."""
+    """Raise MissingExtra where zenoh is not installed."""
     with optional("listening from another machine"):
         import zenoh  # noqa: F401
 
 
 def check_name(name: str, what: str) -> str:
-    """`name`, which becomes a part of keys. Raises ConfigError for one that cannot."""
+    """Return `name`, which becomes a part of keys. Raises ConfigError for one that cannot."""
     if not name or not all(each.isascii() and (each.isalnum() or each in "-_.") for each in name):
-        raise ConfigError(f"{what} {name!r} is no name ({NAME_CHARACTERS})")
+        raise ConfigError(f"{what}: expected a name of {NAME_CHARACTERS}, got {name!r}")
     return name
 
 
@@ -131,7 +131,7 @@ def _is_secure(endpoint: str) -> bool:
 
 
 def serve_session(config: zenoh.Config) -> zenoh.Session:
-    """A session that others connect to. Raises PortError where it cannot listen."""
+    """Open a session that others connect to. Raises PortError where it cannot listen."""
     import zenoh
 
     try:
@@ -141,15 +141,15 @@ def serve_session(config: zenoh.Config) -> zenoh.Session:
 
 
 def close_session(session: Any) -> None:
-    """Idempotent. (`Any`: zenoh says nothing of the types of its own.)"""
+    """Close a session. Idempotent. (`Any`: zenoh declares no types.)"""
     session.close()
 
 
 class Connection:
-    """A session that is being opened in a thread of its own, for as long as its router is away.
+    """A session that is being opened in a thread, for as long as its router is away.
 
     Attributes:
-        problem: why it never will be there; None as long as it may.
+        problem: why it cannot be opened; None as long as it may.
     """
 
     def __init__(self, config: zenoh.Config) -> None:
@@ -162,11 +162,11 @@ class Connection:
 
     @property
     def session(self) -> zenoh.Session | None:
-        """None while nobody answers."""
+        """The session; None while no router answers."""
         return self._session
 
     def wait(self, limit_s: float) -> zenoh.Session | None:
-        """The session, waited for; None when it is not there by then. Raises PortError when it never will be."""
+        """Wait for the session; return None when it is not open by then. Raises PortError when it cannot be opened."""
         with self._changed:
             self._changed.wait_for(lambda: self._session is not None or self.problem is not None, limit_s)
         if self.problem is not None:
@@ -174,7 +174,7 @@ class Connection:
         return self._session
 
     def close(self) -> None:
-        """Idempotent; one that is still being opened is closed as soon as it is open."""
+        """Close the session, at once or when it opens. Idempotent."""
         with self._changed:
             self._closed = True
             session, self._session = self._session, None
@@ -200,6 +200,6 @@ class Connection:
 
 
 def _first_line(error: BaseException) -> str:
-    """What zenoh says, without the places in its source."""
+    """Return the message of zenoh, without the places in its source."""
     text = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return text.partition(" at /")[0].rstrip(".")

@@ -20,7 +20,6 @@ BASE = {
     "config",
     "ranges",
     "endpoint",
-    "origin",
     "network",
     "plugins",
     "processes",

@@ -8,7 +8,7 @@ from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
 from sfms_robot.servo.discovery import ports_data
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import shipped_speaker
 
 
 def shipped_heads() -> list[dict[str, Any]]:

@@ -111,7 +111,7 @@ def check_names(options: RunOptions) -> None:
     listener_folder(options.listener)
     check_source(options.audio, options.face, options.agent_audio, play=options.play)
     if options.status is not None:
-        from sfms_robot.app.loopback_server import status_server  # http.server: only for a run that serves it
+        from sfms_robot.viewer.web_server import status_server
 
         status_server(options.status).close()
     for part in options.port.split(","):

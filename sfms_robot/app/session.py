@@ -18,12 +18,18 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key, fleet_name
+from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
-from sfms_robot.app.loopback_server import status_server
+from sfms_robot.app.listen.report import (
+    Drove,
+    OutletObserver,
+    figures_so_far,
+    limitation,
+    run_facts,
+    run_report,
+)
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
 from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.errors import ConfigError, RobotError, TorqueError
@@ -43,6 +49,10 @@ from sfms_robot.runtime.observers import NotifyingObserver, RunStatus, ServiceMa
 from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
+from sfms_robot.viewer.web_server import status_server
+
+if TYPE_CHECKING:
+    pass
 
 logger = logging.getLogger(__name__)
 
@@ -239,6 +249,7 @@ def _status_server(options: RunOptions, stack: ExitStack) -> Callable[[Document]
     """Bind the port of `--status`, if wanted; return the function that serves a document there from now on."""
     if options.status is None:
         return lambda document: None
+
     server = stack.enter_context(closing(status_server(options.status)))
     logger.warning("status: %s%s", server.url, server.note)
     return server.begin

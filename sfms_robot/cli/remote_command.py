@@ -34,7 +34,7 @@ def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSEC
             flag = "--zenoh" if zenoh is not None else "--json" if json else "--insecure"
             raise ConfigError(f"fleet {flag}: stands behind the command: fleet {context.invoked_subcommand} {flag} ...")
         return
-    from sfms_robot.app.fleet.fleet_client import Fleet, tile
+    from sfms_robot.app.fleet import Fleet, tile
 
     with Fleet(zenoh, insecure) as found:
         tiles = [tile(str(each.get("name")), each) for each in found.states()]
@@ -46,7 +46,7 @@ def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSEC
 @app.command()
 def halt(heads: list[str] = _HEADS, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
     """Halt heads, by default all of them. They stay halted until they are resumed."""
-    from sfms_robot.app.fleet.fleet_client import Fleet
+    from sfms_robot.app.fleet import Fleet
 
     with Fleet(zenoh, insecure) as found:
         _show_answers(found.halt(heads or [], f"{getpass.getuser()} by fleet"), heads or [], json)
@@ -61,7 +61,7 @@ def resume(
     json: bool = JSON,
 ) -> None:
     """Let halted heads continue: be sure that no hand is inside one."""
-    from sfms_robot.app.fleet.fleet_client import Fleet
+    from sfms_robot.app.fleet import Fleet
 
     with Fleet(zenoh, insecure, key) as found:
         _show_answers(found.resume(heads or []), heads or [], json)
@@ -76,7 +76,7 @@ def page(
     json: bool = JSON,
 ) -> None:
     """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
-    from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
+    from sfms_robot.app.fleet import Fleet, fleet_page
 
     with Fleet(zenoh, insecure, key) as found, closing(fleet_page(found, port)) as served, suppress(KeyboardInterrupt):
         if json:

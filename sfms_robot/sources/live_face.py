@@ -1,4 +1,4 @@
-"""The face of a live person: what `--face` says of it, and from a tracker's faces, as they arrive, to `Sighting`s.
+"""The face of a live person: the value of `--face`, faces of a tracker as they arrive to `Sighting`s, and UDP senders.
 
 The flag is `--face KIND[:PLACE][,flip=CHANNEL+CHANNEL]`. PLACE is the kind's own: a UDP port, a camera. `flip` turns
 the sign of pose channels that a tracker has the other way round: `live-link:11111,flip=yaw+roll`.
@@ -6,15 +6,23 @@ the sign of pose channels that a tracker has the other way round: `live-link:111
 
 from __future__ import annotations
 
+import errno
+import logging
 import math
 import re
+import socket
+import struct
+import sys
+import time
 from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, host_and_port, is_address, is_loopback, shown
+from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import (
     BLENDSHAPES,
     CHANNEL_INDEX,
@@ -31,9 +39,11 @@ from sfms_robot.frames import (
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import angles_of
 
+logger = logging.getLogger(__name__)
+
 _OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
 _BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
-_WAITING: Final = 256  # faces; who is not asked for longer than these keeps the newest
+_WAITING: Final = 256  # faces; the newest are kept
 REMEMBERED_S: Final = 120.0
 AWAY_S: Final = 10.0
 _SAMPLE_S: Final = 0.5
@@ -42,6 +52,20 @@ _EASE_S: Final = 0.5  # time constant with which rest follows its estimate: a fa
 _SHAPE_QUANTILE: Final = 0.2
 _HIGHEST_REST: Final = 0.5  # a shape held above this is an expression, however long it lasts
 _MEDIANS: Final = [i for i, name in enumerate(CHANNELS) if name not in BLENDSHAPES or name.startswith("eyeLook")]
+
+PACKETS_PER_CALL: Final = 64
+LONGEST_CALL_S: Final = 0.002
+LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
+LOST_S: Final = 0.5  # five packets of one that sends ten a second
+SILENT_S: Final = 2.0  # after so long another sender may take over
+ANY: Final = ("0.0.0.0", "::")  # every address of this machine
+UNHEARD_S: Final = 5.0  # into a run without a sender, what to type there is logged
+_REASONS_SAID: Final = 4
+
+# Linux says when a datagram came in, to the nanosecond of the wall clock; Python has no name for the option.
+_SO_TIMESTAMPNS: Final = 35
+_TIMESPEC: Final = struct.Struct("@ll")
+_OLDEST_S: Final = 5.0  # a datagram that seems older, or of the future: the wall clock was set meanwhile
 
 
 @dataclass(frozen=True)
@@ -67,7 +91,9 @@ def parse_face_argument(kind: str, argument: str) -> FaceArgument:
             raise ConfigError(f"--face {kind}: option {name!r} is not known (flip)")
         for channel in channels:
             if channel not in POSE_CHANNELS:
-                raise ConfigError(f"--face {kind}: flip = {channel!r} is no pose channel ({', '.join(POSE_CHANNELS)})")
+                raise ConfigError(
+                    f"--face {kind}: flip = {channel!r}: expected a pose channel (valid: {', '.join(POSE_CHANNELS)})"
+                )
         place, flip = place[: option.start()], (*channels, *flip)
     return FaceArgument(place, flip)
 
@@ -89,19 +115,19 @@ class LiveFace:
         self._origin_s = 0.0
 
     def start(self, origin_s: float) -> None:
-        """Loop time 0 is `origin_s` of `time.monotonic`. What was learned of the person stays."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`. What was learned of the person stays."""
         self._origin_s, self._sighting = origin_s, None
 
     def forget(self) -> None:
-        """Another camera, or another person: what was learned of the last one does not hold."""
+        """Forget what was learned of the person: another camera, or another person."""
         self._neutral = None
 
     def put(self, time_s: float, motion: Floats, place_m: Floats | None = None) -> None:
-        """A face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
+        """Take a face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
         self._waiting.append((time_s, motion, place_m))
 
     def at(self, time_s: float) -> Sighting | None:
-        """See `ports.Sight.at`."""
+        """Return as `ports.Sight.at`."""
         seen = []
         while self._waiting and self._waiting[0][0] - self._origin_s <= time_s:
             seen.append(self._waiting.popleft())
@@ -131,7 +157,7 @@ class LiveFace:
 # - a face that was away for 10 s may come back as another person: learning begins again.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Neutral:
     """A memory of one person. A value: `relative_to_rest` gives a new one.
 
@@ -139,7 +165,7 @@ class Neutral:
         time_s: of the last face.
         sampled_s: of the last sample.
         samples: (n, 58) newest last, n <= 240.
-        estimate: (58,) rest, as the samples tell it.
+        estimate: (58,) rest, by the samples.
         rest: (58,) what is taken off now.
     """
 
@@ -162,18 +188,18 @@ def relative_to_rest(motion: Floats, time_s: float, state: Neutral | None) -> tu
 def _learned(motion: Floats, time_s: float, state: Neutral | None) -> Neutral:
     if state is None or not 0 <= time_s - state.time_s <= AWAY_S:
         rest = _rest(motion[None])
-        return Neutral(time_s, time_s, motion[None], rest, rest)
+        return Neutral(time_s=time_s, sampled_s=time_s, samples=motion[None], estimate=rest, rest=rest)
     samples, sampled_s, estimate = state.samples, state.sampled_s, state.estimate
     if time_s - sampled_s >= _SAMPLE_S:
         samples = np.concatenate([samples[1 - _SAMPLES :], motion[None]])
         sampled_s, estimate = time_s, _rest(samples)
     follow = 1.0 - math.exp((state.time_s - time_s) / _EASE_S)
     rest = state.rest + np.float32(follow) * (estimate - state.rest)
-    return Neutral(time_s, sampled_s, samples, estimate, rest)
+    return Neutral(time_s=time_s, sampled_s=sampled_s, samples=samples, estimate=estimate, rest=rest)
 
 
 def _rest(samples: Floats) -> Floats:
-    """Samples (n, 58) -> (58,)."""
+    """Return the rest (58,) of samples (n, 58)."""
     low, middle = int(_SHAPE_QUANTILE * (len(samples) - 1)), (len(samples) - 1) // 2
     ranked = np.partition(samples, (low, middle), axis=0)
     rest: Floats = np.clip(ranked[low], 0.0, _HIGHEST_REST)
@@ -183,7 +209,7 @@ def _rest(samples: Floats) -> Floats:
 
 
 def _relative(motion: Floats, rest: Floats) -> Floats:
-    """The pose seen from the resting one, R0^T R, and the shapes above their resting level."""
+    """Return the pose seen from the resting one, R0^T R, and the shapes above their resting level."""
     out = np.zeros(MOTION_DIM, dtype=np.float32)
     both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
     at_rest, now = rotation(both[:, :3])
@@ -192,3 +218,249 @@ def _relative(motion: Floats, rest: Floats) -> Floats:
     level = rest[SHAPES]
     out[SHAPES] = np.clip((motion[SHAPES] - level) / (1.0 - level), 0.0, 1.0)
     return out
+
+
+# --- a face that arrives as UDP datagrams, of any protocol -----------------------------------------------------------
+#
+# The socket is read without blocking inside `at`, for a bounded time: no thread, and a flood costs the loop 2 ms a call
+# and one packet. Packets that cannot be used are counted, never raised. One sender is used: another is refused until
+# the first has been silent for `SILENT_S`.
+
+Address = tuple[Any, ...]
+
+
+class Datagram(NamedTuple):
+    """One packet. `time_s`: of `time.monotonic` when it came in, where the system says so; else when it was read."""
+
+    data: bytes
+    sender: Address
+    time_s: float
+
+
+class DatagramSocket:
+    """A UDP socket that is read without blocking. Raises PortError when it cannot be bound.
+
+    Attributes:
+        address: host and port it is bound to.
+        errors: times the system could not read, as when a network goes down.
+    """
+
+    def __init__(self, kind: str, host: str, port: int) -> None:
+        """`kind`: of `--face`, for the error's text."""
+        self.errors = 0
+        where = f"--face {kind}: UDP port {port} on {host}"
+        try:
+            family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as error:
+            raise PortError(f"{where}: {getattr(error, 'strerror', None) or error}") from error
+        try:
+            self._socket.bind(address)
+            self._socket.setblocking(False)
+            bound = self._socket.getsockname()
+            self.address: tuple[str, int] = (str(bound[0]), int(bound[1]))
+            self._stamped = sys.platform == "linux" and _ask_for_stamps(self._socket)
+        except OSError as error:
+            self._socket.close()
+            if error.errno == errno.EADDRINUSE:
+                raise PortError(f"{where} is used by another program ({kind}:PORT takes another)") from error
+            raise PortError(f"{where}: {error.strerror or error}") from error
+
+    def waiting(self) -> Iterator[Datagram]:
+        """Yield what has come in, oldest first, no more than a call may take. Never blocks, never raises."""
+        wall_s, now_s = time.time(), time.monotonic()
+        for _ in range(PACKETS_PER_CALL):
+            try:
+                if sys.platform == "win32":
+                    data, sender = self._socket.recvfrom(LONGEST_PACKET)
+                    age_s = 0.0
+                else:
+                    data, extra, _, sender = self._socket.recvmsg(LONGEST_PACKET, 64 if self._stamped else 0)
+                    age_s = _age_s(extra, wall_s)
+            except BlockingIOError:
+                return
+            except OSError:  # a network that went down: the next call tries again
+                self.errors += 1
+                return
+            yield Datagram(data, sender, now_s - age_s)
+            if time.monotonic() - now_s > LONGEST_CALL_S:
+                return
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _ask_for_stamps(of: socket.socket) -> bool:
+    try:
+        of.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    except OSError:
+        return False
+    return True
+
+
+def _age_s(extra: list[tuple[int, int, bytes]], wall_s: float) -> float:
+    for level, kind, stamp in extra:
+        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(stamp) == _TIMESPEC.size:
+            seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+            age_s = wall_s - seconds - 1e-9 * nanoseconds
+            return float(age_s) if 0.0 <= age_s <= _OLDEST_S else 0.0
+    return 0.0
+
+
+class Decoder(Protocol):
+    """Reads the packets of one sender."""
+
+    def restart(self) -> None:
+        """Forget the last sender: another one begins."""
+
+    def decode(self, data: bytes, time_s: float) -> Floats | None:
+        """Return motion (58,) of a packet; None: it has no new face. Raises PacketError for other packets."""
+
+    def statistics(self) -> Mapping[str, Any]: ...
+
+
+class UdpSight:
+    """`ports.Sight` of one person, seen by another device. The time from lens to wire is not known here.
+
+    hint: what a person has to do when no packets come, in words.
+
+    Attributes:
+        lost: the sender is silent.
+    """
+
+    duration_s: float | None = None
+    latency_s = 0.0
+
+    def __init__(self, kind: str, opened: DatagramSocket, decoder: Decoder, face: LiveFace, hint: str) -> None:
+        self._kind = kind
+        self._socket = opened
+        self._decoder = decoder
+        self._face = face
+        self._hint: str | None = hint
+        self._sender: Address | None = None
+        self._heard_s, self._origin_s = -float("inf"), 0.0
+        self.lost = False
+        self._said: set[str] = set()
+        self._refusal_said = False
+        self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused"), 0)
+        logger.warning("%s: %s", kind, hint)
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port that are bound."""
+        return self._socket.address
+
+    def start(self, origin_s: float) -> None:
+        self._origin_s = origin_s
+        self._face.start(origin_s)
+
+    def at(self, time_s: float) -> Sighting | None:
+        for packet in self._socket.waiting():
+            self.feed(packet)
+        self.lost = self._sender is not None and self._origin_s + time_s - self._heard_s > LOST_S
+        if self._hint is not None and time_s > UNHEARD_S:
+            logger.warning("%s: no packets yet: %s", self._kind, self._hint)
+            self._hint = None
+        return self._face.at(time_s)
+
+    def feed(self, packet: Datagram) -> None:
+        """Take one packet, of any sender. Never raises."""
+        self._counts["packets"] += 1
+        # Stamps come from a clock that may be set: time goes forward here.
+        time_s = max(packet.time_s, self._heard_s) if packet.sender == self._sender else packet.time_s
+        if packet.sender != self._sender:
+            if time_s - self._heard_s < SILENT_S:
+                self._refuse(packet.sender)
+                return
+            self._sender = None
+            self._decoder.restart()
+        try:
+            motion = self._decoder.decode(packet.data, time_s)
+        except PacketError as error:
+            self._counts["malformed"] += 1
+            self._say(str(error), packet.sender)
+            return
+        if self._sender is None:
+            logger.info("%s: packets come from %s", self._kind, shown(*packet.sender[:2]))
+            self._refusal_said = False
+            self._face.forget()
+        self._sender, self._heard_s, self._hint = packet.sender, time_s, None
+        if motion is not None:
+            self._counts["faces"] += 1
+            self._face.put(time_s, motion)
+
+    def statistics(self) -> dict[str, Any]:
+        """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
+        sender = None if self._sender is None else shown(*self._sender[:2])
+        return {**self._counts, "errors": self._socket.errors, "sender": sender, **self._decoder.statistics()}
+
+    def close(self) -> None:
+        """Give the port back. Idempotent."""
+        self._socket.close()
+
+    def _refuse(self, sender: Address) -> None:
+        self._counts["refused"] += 1
+        if not self._refusal_said and self._sender is not None:
+            first = shown(*self._sender[:2])
+            text = "%s: %s sends too and is refused until %s is silent for %g s (said once)"
+            logger.warning(text, self._kind, shown(*sender[:2]), first, SILENT_S)
+            self._refusal_said = True
+
+    def _say(self, reason: str, sender: Address) -> None:
+        if reason not in self._said and len(self._said) < _REASONS_SAID:
+            logger.warning("%s: packets of %s are left out: %s (said once)", self._kind, shown(*sender[:2]), reason)
+            self._said.add(reason)
+
+
+def addresses_of_this_machine() -> list[str]:
+    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
+    if sys.platform != "linux":
+        try:
+            found = socket.gethostbyname_ex(socket.gethostname())[2]
+        except OSError:
+            return []
+        return [address for address in found if not address.startswith("127.")]
+    import fcntl
+
+    addresses = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asked, 0x8915, struct.pack("256s", name.encode()[:15]))  # SIOCGIFADDR
+            except OSError:  # an interface without an address
+                continue
+            addresses.append(socket.inet_ntoa(answer[20:24]))
+    return [address for address in addresses if not address.startswith("127.")]
+
+
+def open_udp_sight(
+    kind: str, argument: str, usual_port: int, decoder: Decoder, hint: Callable[[str, int, str], str]
+) -> UdpSight:
+    """Open `--face KIND[:PORT|HOST[:PORT]][,flip=...]`.
+
+    `hint`: returns what a person has to do when no packets come, for the bound host and port, and for the flag that
+    would also take packets from other machines ("" where this one does).
+
+    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    """
+    given = parse_face_argument(kind, argument)
+    opened = DatagramSocket(kind, *parse_endpoint(kind, given.place, usual_port))
+    host, port = opened.address
+    wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
+    return UdpSight(kind, opened, decoder, LiveFace(given.signs), hint(host, port, wider if is_loopback(host) else ""))
+
+
+def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:
+    """Return host and port of PORT, HOST:PORT ([HOST]:PORT for IPv6) or an address alone.
+
+    Loopback and `port` are what PLACE leaves out. Raises ConfigError.
+    """
+    if not place:
+        return LOOPBACK, port
+    if is_address(place.strip("[]")):
+        return place.strip("[]"), port
+    found = host_and_port(place, least=1)
+    if found is None:
+        choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {HIGHEST_PORT}"
+        raise ConfigError(f"--face {kind}:{place}: {place!r}: expected a UDP port (valid: {choices})")
+    return found

@@ -24,11 +24,11 @@ import numpy as np
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
 from sfms_robot.signals.tracks import SOURCES
-from sfms_robot.sources.udp_sight import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
+from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
 
 PORT: Final = 11111  # what the app suggests
 VERSION: Final = 6
-LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began anew
+LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began again
 
 _LENGTH: Final = struct.Struct(">i")
 _FRAME: Final = struct.Struct(">ifiiB")
@@ -61,7 +61,7 @@ class LiveLinkPacket(NamedTuple):
 
 
 def parse_packet(data: bytes) -> LiveLinkPacket:
-    """Raises PacketError, in one line, for everything else than a whole packet of version 6 with finite values."""
+    """Return a whole packet of version 6 with finite values. Raises PacketError, in one line, for any other."""
     if not data:
         raise PacketError("an empty packet")
     if data[0] != VERSION:
@@ -76,7 +76,7 @@ def parse_packet(data: bytes) -> LiveLinkPacket:
     if len(data) != start + _FRAME.size + 4 * count:
         raise PacketError("a packet that is cut off, or too long")
     if numerator <= 0 or denominator <= 0:
-        raise PacketError("a frame rate that is none")
+        raise PacketError(f"frame rate: expected positive numbers, got {numerator}/{denominator}")
     values = None if count == 0 else _values(data, start + _FRAME.size)
     return LiveLinkPacket(device, subject, number, part, numerator / denominator, values)
 
@@ -89,7 +89,7 @@ def _values(data: bytes, start: int) -> Floats:
 
 
 def _name(data: bytes, start: int) -> tuple[str, int]:
-    """A text and where it ends."""
+    """Return a text and where it ends."""
     if len(data) < start + _LENGTH.size:
         raise PacketError("a packet that is cut off")
     (length,) = _LENGTH.unpack_from(data, start)
@@ -102,7 +102,7 @@ def _name(data: bytes, start: int) -> tuple[str, int]:
 
 
 def _other_version(data: bytes) -> str:
-    """Why a packet that does not begin with our version is not read."""
+    """Return why a packet of another version is not read."""
     if any(_is_animator(data, order) for order in "<>"):
         return (
             "the app is in MetaHuman Animator mode, which sends no blendshapes: choose Live Link (ARKit) as its "
@@ -114,7 +114,7 @@ def _other_version(data: bytes) -> str:
 
 
 def _is_animator(data: bytes, order: str) -> bool:
-    """uint16 version, text, frame time, uint16 values, 6 floats of pose; nothing else has exactly this length."""
+    """Return whether it is uint16 version, text, frame time, uint16 values, 6 floats of pose: by its exact length."""
     head = struct.Struct(order + "HH")
     if len(data) < head.size:
         return False
@@ -127,7 +127,7 @@ def _is_animator(data: bytes, order: str) -> bool:
 
 
 def motion_of(values: Floats) -> Floats:
-    """Values (61,) of a packet -> motion (58,); the packet has no position, which stays 0."""
+    """Return motion (58,) of the values (61,) of a packet; it has no position, which stays 0."""
     motion: Floats = values[_COLUMNS] * _FACTORS
     shapes = motion[SHAPES]
     np.minimum(np.maximum(shapes, 0.0, out=shapes), 1.0, out=shapes)
@@ -164,7 +164,7 @@ class LiveLinkDecoder:
         return motion_of(packet.values)
 
     def statistics(self) -> Mapping[str, Any]:
-        """Frames lost on the way, doubled, late, without a face; how often the phone's count began anew; its name."""
+        """Return counts of frames lost, doubled, late, without a face, of new counts of the phone; and its name."""
         return {**self._counts, "subject": self._subject}
 
     def _is_next(self, packet: LiveLinkPacket, data: bytes, time_s: float) -> bool:
@@ -189,7 +189,7 @@ class LiveLinkDecoder:
 def open_live_link(argument: str) -> UdpSight:
     """Open `--face live-link[:PORT|HOST[:PORT]][,flip=...]`; without HOST only this machine can send.
 
-    A phone is another one, so the log says what to type for it, and the address for its app. Raises as
+    The log says what to type for a phone, which is another machine, and the address for its app. Raises as
     `open_udp_sight`.
     """
     return open_udp_sight("live-link", argument, PORT, LiveLinkDecoder(), _hint)

@@ -1,12 +1,12 @@
 """A live voice on the grid of the loop: pieces of a sound card, or of a sender, in; frames of 640 samples out.
 
-Sound cards drift: 100 ppm are 0.36 s an hour. So each piece comes with the time of its newest sample, `drift` tells
-from them where every sample lies, and a resampler of variable rate (soxr) follows: its ratio is the card's true rate,
-and a little more or less where its output is ahead or behind, 1 % at most. Nothing is cut out or put in but for three
-cases:
+Sound cards drift: 100 ppm are 0.36 s an hour. So each piece comes with the time of its newest sample, `SampleClock`
+computes from them where every sample lies, and a resampler of variable rate (soxr) follows: its ratio is the card's
+true rate, and a little more or less where its output is ahead or behind, 1 % at most. Nothing is cut out or put in but
+for three cases:
 
 1. The device was away: `GAP_S` and more are missing. The frames of that time are missing too, and the stretch after it
-   is placed anew.
+   is placed again.
 2. A stretch of less than `SETTLE_S`, of which little is known yet, is placed again where it is `UNSETTLED_S` off.
 3. The place is off by more than `GAP_S`: pieces that were held up came all at once.
 
@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +29,6 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
-from sfms_robot.sources.drift import SampleClock
 
 GAP_S: Final = 0.15
 SETTLE_S: Final = 1.0
@@ -38,16 +39,143 @@ KEPT_FRAMES: Final = 50  # at most, ahead of the one that is asked for
 _LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
 _NONE: Final = np.zeros(0, dtype=np.float32)
 
+BIN_S: Final = 1.0  # the least late callback of every second is kept
+BINS: Final = 64  # so the line follows a card that warms up within a minute
+LEAST_SPAN_S: Final = 8.0  # of fewer seconds jitter would say more of the rate than the card does
+LOST_S: Final = 0.02  # when the least late of a whole second is this late, samples were lost
+LARGEST_SKEW: Final = 5e-3  # more is another rate than the one that was said
 
-class LiveVoice:
+
+class SourcePart:
+    """Common parts of voices and sights (`ports.Voice`, `ports.Sight`), with defaults.
+
+    now: `time.monotonic`, or a test's clock.
+    """
+
+    lost: bool = False
+    duration_s: float | None = None
+    latency_s: float = 0.0
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+
+    def start(self, origin_s: float) -> None:
+        """Set loop time 0 to `origin_s` of `time.monotonic`."""
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {}
+
+    def close(self) -> None:
+        """Give back what is open. Idempotent."""
+
+
+def window(first: int, samples: Floats, begin: int, count: int) -> Floats:
+    """Return `count` samples from place `begin` on, of `samples` that begin at place `first`; silence elsewhere."""
+    out = np.zeros(count, np.float32)
+    start, end = max(first, begin), min(first + len(samples), begin + count)
+    if start < end:
+        out[start - begin : end - begin] = samples[start - first : end - first]
+    return out
+
+
+# --- the clock of a sound card, measured by the computer's -----------------------------------------------------------
+#
+# The card counts samples; each callback comes with the time of its newest sample, by the computer's clock. A callback
+# may come late, never early. So in the plane of (samples, seconds) the truth is a line under all callbacks, as high as
+# possible: the edge of their lower convex hull below the middle of them, which leaves the least lateness in all (Moon,
+# Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999). One late callback,
+# or many, lie above it and change nothing.
+
+_Point = tuple[float, float]
+
+
+class SampleClock:
+    """Samples of one unbroken stream <-> seconds of `time.monotonic`. Counts begin at 0; not thread-safe.
+
+    Args:
+        rate_hz: nominal.
+        skew: where it is known: seconds of the computer for one of the card, less one.
+    """
+
+    def __init__(self, rate_hz: float, skew: float = 0.0) -> None:
+        self._nominal_hz = rate_hz
+        self.skew = skew
+        self._offset_s: float | None = None  # the line: offset + (1 + skew) x, with x = samples / nominal rate
+        self._least: deque[_Point] = deque(maxlen=BINS)  # (x, seconds - x)
+        self._bin: _Point | None = None
+        self._bin_ends_s = BIN_S
+
+    @property
+    def rate_hz(self) -> float:
+        """The card's true rate, by the computer's clock."""
+        return self._nominal_hz / (1.0 + self.skew)
+
+    @property
+    def drift_ppm(self) -> float:
+        """Excess of the card's rate over its nominal one [ppm]."""
+        return (1.0 / (1.0 + self.skew) - 1.0) * 1e6
+
+    def observe(self, count: int, captured_s: float) -> None:
+        """Take in a callback: `count` samples so far, the newest of them at `captured_s` or before."""
+        x_s = count / self._nominal_hz
+        point = (x_s, float(captured_s) - x_s)
+        below_s = point[1] - self.skew * x_s
+        self._offset_s = below_s if self._offset_s is None else min(self._offset_s, below_s)
+        if self._bin is None or below_s < self._bin[1] - self.skew * self._bin[0]:
+            self._bin = point
+        if x_s >= self._bin_ends_s:
+            self._least_of_bin(self._bin)
+            self._bin, self._bin_ends_s = None, x_s + BIN_S
+
+    def lateness_s(self, count: int, captured_s: float) -> float:
+        """Return how late such a callback would be; below 0: earlier than the line allows. 0 for the first."""
+        return 0.0 if self._offset_s is None else captured_s - self.time_s(count)
+
+    def time_s(self, count: float) -> float:
+        """Return when so many samples had been captured. Raises ValueError before the first callback."""
+        if self._offset_s is None:
+            raise ValueError("no callback was observed")
+        return self._offset_s + (1.0 + self.skew) * count / self._nominal_hz
+
+    def count_at(self, time_s: float) -> float:
+        """Return how many samples had been captured then."""
+        return (time_s - self.time_s(0)) * self.rate_hz
+
+    def _least_of_bin(self, point: _Point) -> None:
+        if self.lateness_s(round(point[0] * self._nominal_hz), sum(point)) > LOST_S:
+            self._least.clear()
+        self._least.append(point)
+        if len(self._least) == 1 or self._least[-1][0] - self._least[0][0] < LEAST_SPAN_S:
+            self._offset_s = min(r - self.skew * x for x, r in self._least)
+            return
+        (x0, r0), (x1, r1) = _edge_below_middle(list(self._least))
+        self.skew = min(max((r1 - r0) / (x1 - x0), -LARGEST_SKEW), LARGEST_SKEW)
+        self._offset_s = min(r - self.skew * x for x, r in self._least)
+
+
+def _edge_below_middle(points: list[_Point]) -> tuple[_Point, _Point]:
+    """Return that edge of the lower convex hull of two or more points, which go from left to right."""
+    hull: list[_Point] = []
+    for point in points:
+        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    middle = sum(x for x, _ in points) / len(points)
+    right = next((index for index in range(1, len(hull)) if hull[index][0] >= middle), len(hull) - 1)
+    return hull[right - 1], hull[right]
+
+
+def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
+
+
+class LiveVoice(SourcePart):
     """`ports.Voice` of a live stream. All methods may be called from any thread; none blocks for longer than a piece
     takes to be resampled.
     """
 
-    duration_s: float | None = None
-    lost: bool = False
-
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s: float | None = None
         self._rate_hz = 0.0
@@ -62,16 +190,10 @@ class LiveVoice:
         self._next = 0  # sample of the loop, at 16 kHz, that the stream gives next
         self._frames: dict[int, Floats] = {}
         self._wanted = 0  # frame
-        self._latency_s = 0.0
         self._counts = {"gaps": 0, "late_samples": 0, "not_finite": 0}
 
-    @property
-    def latency_s(self) -> float:
-        """The longest from the end of a frame to the piece that made it whole, lately."""
-        return self._latency_s
-
     def start(self, origin_s: float) -> None:
-        """Loop time 0 is `origin_s` of `time.monotonic`. Pieces that came before taught the clock, and are dropped."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped, but taught the clock."""
         with self._lock:
             self._origin_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
             self._frames.clear()
@@ -79,7 +201,7 @@ class LiveVoice:
     def push(
         self, samples: NDArray[np.float32], rate_hz: float, captured_s: float, arrived_s: float | None = None
     ) -> None:
-        """The next piece, (n,) or (n, channels), full scale 1.
+        """Take the next piece, (n,) or (n, channels), full scale 1.
 
         Args:
             captured_s: `time.monotonic` of its newest sample; may be late by some tens of milliseconds, never early.
@@ -98,7 +220,7 @@ class LiveVoice:
                 self._resample(mono, captured_s, captured_s if arrived_s is None else arrived_s)
 
     def take(self, index: int) -> Floats | None:
-        """See `ports.Voice`. A frame of which only a part was heard is filled up with silence."""
+        """Return a frame as `ports.Voice`. A frame of which only a part was heard is filled up with silence."""
         with self._lock:
             self._wanted = index
             for old in [each for each in self._frames if each < index]:
@@ -107,19 +229,16 @@ class LiveVoice:
             return self._frames.pop(index, None) if whole else None
 
     def statistics(self) -> Mapping[str, Any]:
-        """Drift of the card, gaps, samples that came too late or were not finite, and the latency."""
+        """Return drift of the card, gaps, samples that came too late or were not finite, and the latency."""
         with self._lock:
             drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
             return {
-                "rate_hz": self._rate_hz, "drift_ppm": drift_ppm, "latency_ms": round(self._latency_s * 1e3, 1),
+                "rate_hz": self._rate_hz, "drift_ppm": drift_ppm, "latency_ms": round(self.latency_s * 1e3, 1),
                 **self._counts,
             }  # fmt: skip
 
-    def close(self) -> None:
-        """Nothing is held open."""
-
     def interrupt(self) -> None:
-        """The next piece does not follow the last one."""
+        """Let the next piece not follow the last one."""
         with self._lock:
             self._end_stretch()
 
@@ -157,12 +276,12 @@ class LiveVoice:
         self._write(out, arrived_s)
 
     def _behind(self) -> float:
-        """By how many samples of the card the stream is behind its place."""
+        """Return by how many samples of the card the stream is behind its place."""
         assert self._clock is not None and self._origin_s is not None
         return self._clock.count_at(self._origin_s + self._next / AUDIO_HZ) - self._position
 
     def _place(self, samples: Floats, first: int) -> Floats:
-        """Begin a stream at the first of these samples that is not in the past; returns what is left of them."""
+        """Begin a stream at the first of these samples that is not in the past; return the rest of them."""
         import soxr
 
         assert self._clock is not None and self._origin_s is not None
@@ -189,7 +308,7 @@ class LiveVoice:
             self._stream = None
 
     def _write(self, samples: Floats, arrived_s: float | None) -> None:
-        """Lay samples into their frames. `arrived_s`: None for what a resampler still held."""
+        """Put samples into their frames. `arrived_s`: None for what a resampler still held."""
         while len(samples):
             index, within = divmod(self._next, FRAME_SAMPLES)
             part, samples = samples[: FRAME_SAMPLES - within], samples[FRAME_SAMPLES - within :]
@@ -205,17 +324,17 @@ class LiveVoice:
     def _measure(self, end_s: float, arrived_s: float) -> None:
         assert self._origin_s is not None
         late_s = float(arrived_s) - self._origin_s - end_s
-        self._latency_s = max(late_s, self._latency_s - _LATENCY_FALLS_S, 0.0)
+        self.latency_s = max(late_s, self.latency_s - _LATENCY_FALLS_S, 0.0)
 
 
 def check_rate(rate_hz: float) -> None:
-    """Raises ConfigError for what is no rate of speech."""
+    """Raise ConfigError for a rate that speech does not have."""
     if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
-        raise ConfigError(f"rate_hz = {rate_hz!r} is no rate for speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
+        raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
 def _mono(samples: NDArray[np.float32]) -> tuple[Floats, int]:
-    """Channels averaged, and how many of the samples are not finite."""
+    """Return the mean of the channels, and how many of the samples are not finite."""
     finite = np.isfinite(samples)
     not_finite = samples.size - int(np.count_nonzero(finite))
     if not_finite:

@@ -1,43 +1,254 @@
 """The microphone: `--audio mic[:DEVICE]`, and what the robot says into it: `--agent-audio device:DEVICE`.
 
-PortAudio, resampling and echo cancellation are in a process of their own (`microphone_worker`), which sends frames of
-the loop; here they are only handed on. The process is started again when the device goes away, until it is back.
+PortAudio, resampling and echo cancellation are in a process of their own (`listen`), which sends frames of the loop. A
+device that gives nothing for `LOST_S` went away: the process ends, and the next one begins with a PortAudio that sees
+the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import time
-from collections.abc import Mapping
-from typing import Any, Final, Literal
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.ports import Voice
-from sfms_robot.sources.microphone_worker import Heard, Opened, Recording, Told, listen
-from sfms_robot.sources.sound_devices import SoundDevice, choose_device, tell_devices
+from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
+from sfms_robot.signals.own_voice_gate import OwnVoiceGate
+from sfms_robot.sources.live_voice import LiveVoice, window
+from sfms_robot.sources.sound_devices import BLOCK_S, device_name, open_capture
 from sfms_robot.sources.worker import SourceWorker
 
 logger = logging.getLogger(__name__)
 
 MIC_FLAG: Final = "--audio mic"
 DEVICE_FLAG: Final = "--agent-audio device"
-TOLD_FRAMES: Final = 12  # of the robot's voice at once: the worker may miss half a second of tellings
+STATISTICS_S: Final = 1.0
+LONGEST_WAIT_S: Final = 0.15  # for the microphone, from the end of a frame: later it is of no use to the loop
+REFERENCE_WAIT_S: Final = 0.1
+SAID_FRAMES: Final = 12  # of the robot's voice in a message: the worker may miss half a second of messages
 KEPT_FRAMES: Final = 50
-_TOLD_RAD_S: Final = 0.1  # a change of speed that is worth telling
-_SILENCE: Final = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+_ALIVE_S: Final = 0.1
+_NEW_SPEED_RAD_S: Final = 0.1  # a change of speed that is worth a message
 _LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
+_SILENCE: Final = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+_SILENCE.flags.writeable = False
+
+
+# --- the worker's side -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A device to record: by number, name or part of its name, "" for the default one.
+
+    Attributes:
+        flag: the option in errors, "--audio mic".
+        reference: device that records what the loudspeaker is given; None: none.
+        spoken: the parent sends what the robot says (`ToWorker.said`).
+    """
+
+    device: str
+    flag: str
+    reference: str | None = None
+    reference_flag: str = ""
+    spoken: bool = False
+
+
+@dataclass(frozen=True)
+class ToWorker:
+    """From the parent.
+
+    Attributes:
+        origin_s: loop time 0 in seconds of `time.monotonic`.
+        first, said: (n x 640,) what the robot says from frame `first` on: the newest frames, as it may miss some.
+        speed_rad_s: how fast its joints move, all together.
+    """
+
+    origin_s: float
+    first: int = 0
+    said: Floats | None = None
+    speed_rad_s: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeardFrame:
+    """A frame of the loop.
+
+    Attributes:
+        index: of the frame.
+        known_s: when it was known, `time.monotonic`.
+        audio: (640,) what the person said.
+        voice: a person speaks in it.
+        said: (640,) what the robot said meanwhile, where a device records it; as late as `audio`.
+    """
+
+    index: int
+    known_s: float
+    audio: Floats
+    voice: bool
+    said: Floats | None = None
+
+
+MicrophoneMessage = str | HeardFrame | dict[str, Any]  # the first is the name of the device
+
+
+def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker | None, None]:
+    """Yield frames of a microphone, once a second its statistics; see `sources.worker`.
+
+    Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing records, for a
+    device that cannot be opened, and when one goes away.
+    """
+    with ExitStack() as stack:
+        mic = stack.enter_context(open_capture(recording.device, recording.flag))
+        said = None
+        if recording.reference is not None:
+            said = stack.enter_context(open_capture(recording.reference, recording.reference_flag))
+        reference = SpeechFrames() if recording.spoken else None if said is None else LiveVoice()
+        front_end = FrontEnd(reference)
+        given = yield mic.device.name
+        before: ToWorker | None = None
+        said_s = next_statistics_s = 0.0
+        while True:
+            mic.pass_on(front_end.mic, 2 * BLOCK_S)
+            if said is not None and isinstance(reference, LiveVoice):
+                said.pass_on(reference, 0.0)
+            if given is not None and given is not before:
+                if before is None or given.origin_s != before.origin_s:
+                    front_end.start(given.origin_s, time.monotonic())
+                if isinstance(reference, SpeechFrames) and given.said is not None:
+                    reference.set(given.first, given.said)
+                front_end.speed_rad_s = given.speed_rad_s
+                before = given
+            messages: list[MicrophoneMessage | None] = [*front_end.frames(time.monotonic())]
+            if (now_s := time.monotonic()) >= next_statistics_s:
+                next_statistics_s = now_s + STATISTICS_S
+                messages.append({**front_end.statistics(), "overflows": mic.overflows})
+            elif not messages and (before is None or recording.spoken or now_s > said_s + _ALIVE_S):
+                messages.append(None)  # and receive what the parent sends
+            for message in messages:
+                given, said_s = (yield message), now_s
+
+
+# --- from what is recorded to what a person said, on the grid of the loop -----------------------------------------
+#
+#     pieces by their time stamps -> frames of 40 ms -> what the robot itself says taken out -> `HeardFrame`
+#
+# Microphone and reference each drift by their own clock; both are resampled to the computer's (`LiveVoice`), so that
+# they stay together. The echo canceller is a few milliseconds late: its frames begin that much later, so that its
+# output is the frames of the loop, and nothing waits for the next one.
+
+
+class SpeechFrames:
+    """Speech of the robot, in frames of the loop, known one frame before they are played."""
+
+    def __init__(self) -> None:
+        self._first = 0  # sample of the loop
+        self._samples: Floats = _SILENCE[:0]
+
+    def start(self, origin_s: float) -> None:
+        """Do nothing: they are counted from the origin already."""
+
+    def set(self, first: int, samples: Floats) -> None:
+        """Set (n x 640,) from frame `first` on, instead of those before."""
+        self._first, self._samples = first * FRAME_SAMPLES, samples
+
+    def take(self, index: int) -> Floats | None:
+        """Return (640,) of a frame of the echo canceller, which is that much later; None: not known yet."""
+        begin = index * FRAME_SAMPLES + ECHO_LATENCY_SAMPLES - self._first
+        if begin + FRAME_SAMPLES > len(self._samples):
+            return None
+        return window(0, self._samples, begin, FRAME_SAMPLES)
+
+
+class FrontEnd:
+    """One microphone and, where the robot speaks, its voice. Belongs to one thread.
+
+    Args:
+        reference: what the robot says: a `LiveVoice` of what its loudspeaker is given, or frames from the parent.
+
+    Attributes:
+        mic: push its pieces here.
+        speed_rad_s: how fast the head's joints move, all together, by which the noise of their motors is judged.
+    """
+
+    def __init__(self, reference: LiveVoice | SpeechFrames | None = None) -> None:
+        self.mic = LiveVoice()
+        self.speed_rad_s = 0.0
+        self._reference = reference
+        self._gate = OwnVoiceGate(speaks=reference is not None)
+        self._origin_s: float | None = None
+        self._next = 0
+        self._waiting: Floats | None = None  # of the microphone, for its reference
+        self._counts = {"voice_frames": 0, "own_voice_frames": 0, "without_reference": 0}
+
+    def start(self, origin_s: float, now_s: float) -> None:
+        """Set loop time 0 to `origin_s` of `time.monotonic`; frames that ended before `now_s` are not given."""
+        begins_s = origin_s + self._gate.latency_s
+        self.mic.start(begins_s)
+        if self._reference is not None:
+            self._reference.start(begins_s)
+        self._origin_s, self._waiting = origin_s, None
+        self._next = max(0, math.floor((now_s - origin_s) * FRAME_HZ))
+
+    def frames(self, now_s: float) -> list[HeardFrame]:
+        """Return frames that are whole, oldest first; one whose microphone is missing for too long is left out."""
+        frames: list[HeardFrame] = []
+        while self._origin_s is not None:
+            late_s = now_s - self._origin_s - (self._next + 1) * FRAME_S
+            if self._waiting is None:
+                self._waiting = self.mic.take(self._next)
+            if self._waiting is None and late_s < LONGEST_WAIT_S:
+                break
+            said = None if self._reference is None else self._reference.take(self._next)
+            if self._reference is not None and said is None and late_s < REFERENCE_WAIT_S:
+                break
+            heard = self._judge(now_s, self._waiting, said)
+            if self._waiting is not None:
+                frames.append(heard)
+            self._next, self._waiting = self._next + 1, None
+        return frames
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return those of the microphone (`LiveVoice`), and frames with a voice; with a reference, its own, frames in
+        which the robot spoke, and frames whose reference was not there in time.
+        """
+        figures: dict[str, Any] = {**self.mic.statistics(), "voice_frames": self._counts["voice_frames"]}
+        if self._reference is not None:
+            figures |= self._counts
+        if isinstance(self._reference, LiveVoice):
+            figures["reference"] = dict(self._reference.statistics())
+        return figures
+
+    def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> HeardFrame:
+        """Return a frame without the robot's own voice: one in, one out, since the gate counts samples."""
+        own = None if self._reference is None else (_SILENCE if said is None else said)
+        (frame,) = self._gate.push(_SILENCE if mic is None else mic, own, self.speed_rad_s)
+        self._counts["voice_frames"] += frame.voice
+        self._counts["own_voice_frames"] += own is not None and bool(own.any())
+        self._counts["without_reference"] += own is not None and said is None
+        own_said = said if isinstance(self._reference, LiveVoice) else None
+        return HeardFrame(index=self._next, known_s=now_s, audio=frame.audio, voice=frame.voice, said=own_said)
+
+
+# --- the run's side --------------------------------------------------------------------------------------------------
 
 
 class Microphone:
     """`ports.Voice` of the worker `listen`. Only `close` blocks.
 
     Args:
-        agent: what the robot says, where a program or a file tells it: it is taken out of what is heard.
+        agent: what the robot says, of a program or a file: it is taken out of what is heard.
 
     Attributes:
         device: its name.
+        latency_s: the longest time from the end of a frame to the moment that its worker sent it, lately.
     """
 
     duration_s: float | None = None
@@ -45,36 +256,31 @@ class Microphone:
     def __init__(self, worker: SourceWorker, agent: OwnVoice | None = None) -> None:
         self._worker, self._agent = worker, agent
         self._origin_s: float | None = None
-        self._frames: dict[int, Heard] = {}
+        self._frames: dict[int, HeardFrame] = {}
         self.device = ""
-        self._latency_s = 0.0
+        self.latency_s = 0.0
         self._late_frames = 0
-        self._told: Mapping[str, Any] = {}
+        self._figures: Mapping[str, Any] = {}
         self._said: dict[int, Floats | None] = {}
-        self._speed_rad_s = self._told_speed_rad_s = 0.0
+        self._speed_rad_s = self._sent_speed_rad_s = 0.0
         self._collect(0.0, 0)
 
     @property
     def lost(self) -> bool:
-        """It gave sound, and gives none any more."""
+        """It gave sound, and has stopped."""
         return bool(self.device) and self._worker.statistics()["state"] in ("lost", "starting")
-
-    @property
-    def latency_s(self) -> float:
-        """The longest from the end of a frame to the moment that its worker sent it, lately."""
-        return self._latency_s
 
     def start(self, origin_s: float) -> None:
         self._origin_s = origin_s
-        self._worker.tell(Told(origin_s))
+        self._worker.tell(ToWorker(origin_s))
 
     def take(self, index: int) -> Floats | None:
-        """See `ports.Voice`."""
+        """Return as `ports.Voice`."""
         if self._origin_s is None:
             return None
         if self._agent is not None and self._agent.ask(index + 1):
             self._tell(self._origin_s, *self._agent.newest())
-        elif self._agent is None and abs(self._speed_rad_s - self._told_speed_rad_s) > _TOLD_RAD_S:
+        elif self._agent is None and abs(self._speed_rad_s - self._sent_speed_rad_s) > _NEW_SPEED_RAD_S:
             self._tell(self._origin_s)
         self._collect(self._origin_s + (index + 1) * FRAME_S, index)
         heard = self._frames.pop(index, None)
@@ -83,24 +289,24 @@ class Microphone:
         return None if heard is None else heard.audio
 
     def moves(self, speed_rad_s: float) -> None:
-        """How fast the joints of the head beside it move, all together: the noise that they make is known by that."""
+        """Set how fast the joints of the head near it move, all together: their noise is judged by that."""
         self._speed_rad_s = speed_rad_s
 
     def _tell(self, origin_s: float, first: int = 0, said: Floats | None = None) -> None:
-        self._told_speed_rad_s = self._speed_rad_s
-        self._worker.tell(Told(origin_s, first, said, self._speed_rad_s))
+        self._sent_speed_rad_s = self._speed_rad_s
+        self._worker.tell(ToWorker(origin_s, first, said, self._speed_rad_s))
 
     def said(self, index: int) -> Floats | None:
-        """What the loudspeaker beside it was given in a frame that was taken just now."""
+        """Return what the loudspeaker near it was given in a frame that was taken just now."""
         return self._said.get(index)
 
     def statistics(self) -> Mapping[str, Any]:
-        """Device, latency, frames that came too late, what the worker tells of its process and of the sound."""
+        """Return device, latency, frames that came too late, state of the worker, and figures of the sound."""
         return {
             "device": self.device,
             **self._worker.statistics(),
-            **self._told,
-            "latency_ms": round(self._latency_s * 1e3, 1),
+            **self._figures,
+            "latency_ms": round(self.latency_s * 1e3, 1),
             "late_frames": self._late_frames,
         }
 
@@ -111,17 +317,17 @@ class Microphone:
         for old in [index for index in self._frames if index < wanted]:
             del self._frames[old]
         for message in self._worker.messages(now_s):
-            if isinstance(message, Heard):
+            if isinstance(message, HeardFrame):
                 self._take_in(message, wanted)
-            elif isinstance(message, Opened):
-                self.device = message.device
+            elif isinstance(message, str):
+                self.device = message
             else:
-                self._told = message
+                self._figures = message
 
-    def _take_in(self, heard: Heard, wanted: int) -> None:
+    def _take_in(self, heard: HeardFrame, wanted: int) -> None:
         assert self._origin_s is not None
         late_s = heard.known_s - self._origin_s - (heard.index + 1) * FRAME_S
-        self._latency_s = max(late_s, self._latency_s - _LATENCY_FALLS_S, 0.0)
+        self.latency_s = max(late_s, self.latency_s - _LATENCY_FALLS_S, 0.0)
         if wanted <= heard.index < wanted + KEPT_FRAMES:
             self._frames[heard.index] = heard
         else:
@@ -129,7 +335,7 @@ class Microphone:
 
 
 class OwnVoice:
-    """`ports.Voice` around what the robot says: the microphone is told of it as soon as the grid is.
+    """`ports.Voice` around what the robot says: the microphone gets it as soon as the grid does.
 
     Attributes:
         outlet: the programs behind it.
@@ -151,18 +357,19 @@ class OwnVoice:
         self._inner.start(origin_s)
 
     def ask(self, index: int) -> bool:
-        """Fetch frame `index` and those before it that were not asked for yet; whether there were any."""
+        """Fetch frame `index` and those before it that were not fetched yet; return whether there were any."""
         before, self._asked = self._asked, max(index, self._asked)
         for each in range(before + 1, self._asked + 1):
             self._frames[each] = self._inner.take(each)
-            self._frames.pop(each - TOLD_FRAMES, None)
+            self._frames.pop(each - SAID_FRAMES, None)
         return self._asked > before
 
     def newest(self) -> tuple[int, Floats]:
-        """The first of the newest frames, and their samples; silence where nothing was said. Of a voice that is to be
-        told early they come so much sooner, and the last of them are still to be known: silence.
+        """Return the first of the newest frames, and their samples; silence where nothing was said.
+
+        A voice that is to be known early (`early_s`) is so much sooner here, with silence at its end.
         """
-        indices = range(max(0, self._asked + 1 - TOLD_FRAMES), self._asked + 1)
+        indices = range(max(0, self._asked + 1 - SAID_FRAMES), self._asked + 1)
         frames = [self._frames.get(index) for index in indices]
         samples = np.concatenate([_SILENCE if frame is None else frame for frame in frames])
         return indices[0], np.concatenate([samples[self._early :], _SILENCE[: self._early]])
@@ -179,10 +386,10 @@ class OwnVoice:
 
 
 class Loudspeaker:
-    """`ports.Voice` of what the robot says, where a device records it: late, for nobody can record what is to come.
+    """`ports.Voice` of what the robot says, where a device records it: late, as any recording.
 
     Args:
-        recorder: the microphone beside which it is recorded, or a recorder of its own.
+        recorder: the microphone with which it is recorded, or one for it alone.
     """
 
     duration_s: float | None = None
@@ -199,52 +406,46 @@ class Loudspeaker:
         self._recorder.start(origin_s)
 
     def take(self, index: int) -> Floats | None:
-        """What was recorded one frame before, which came with the microphone's; two before, without a microphone."""
+        """Return what was recorded one frame before, with the microphone's; two before, without a microphone."""
         return self._recorder.said(index - 1) if self._beside else self._recorder.take(index - 2)
 
     def statistics(self) -> Mapping[str, Any]:
-        told = self._recorder.statistics()
-        return told.get("reference", {}) if self._beside else told
+        figures = self._recorder.statistics()
+        return figures.get("reference", {}) if self._beside else figures
 
     def close(self) -> None:
         self._recorder.close()
 
 
 def open_microphone(argument: str) -> Microphone:
-    """What stands behind the colon of `--audio mic[:DEVICE]`: a number, a name or a part of one; "" is the default.
+    """Open `--audio mic[:DEVICE]`: a number, a name or a part of one; "" is the default.
 
     Blocks until it records, a second. Raises ConfigError for a device that is not there and without PortAudio,
     PortError where there is no microphone or it cannot be opened.
     """
-    return _opened(Recording(_by_name(argument, MIC_FLAG), MIC_FLAG))
+    return _opened(_recording(argument))
 
 
 def open_microphone_beside(argument: str, agent: Voice) -> tuple[Microphone, OwnVoice]:
-    """As `open_microphone`, without what `agent` says; and the agent's voice to use instead of `agent`."""
+    """Open as `open_microphone`, without what `agent` says; return also the voice to use instead of `agent`."""
     own = OwnVoice(agent)
-    return _opened(Recording(_by_name(argument, MIC_FLAG), MIC_FLAG, told=True), own), own
+    return _opened(_recording(argument, spoken=True), own), own
 
 
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
-    """As `open_microphone`, without what `device` records of the robot's voice; and that voice."""
-    names = (_by_name(argument, MIC_FLAG), MIC_FLAG, _by_name(device, DEVICE_FLAG), DEVICE_FLAG)
-    microphone = _opened(Recording(*names))
+    """Open as `open_microphone`, without what `device` records of the robot's voice; return also that voice."""
+    reference = device_name(device, DEVICE_FLAG)
+    microphone = _opened(_recording(argument, reference=reference, reference_flag=DEVICE_FLAG))
     return microphone, Loudspeaker(microphone, beside=True)
 
 
 def open_loudspeaker(argument: str) -> Loudspeaker:
-    """`--agent-audio device:DEVICE` without a microphone. Raises and blocks as `open_microphone`."""
-    return Loudspeaker(_opened(Recording(_by_name(argument, DEVICE_FLAG), DEVICE_FLAG)), beside=False)
+    """Open `--agent-audio device:DEVICE` without a microphone. Raises and blocks as `open_microphone`."""
+    return Loudspeaker(_opened(_recording(argument, DEVICE_FLAG)), beside=False)
 
 
-def sound_devices(what: Literal["recording", "playing"] = "recording") -> list[SoundDevice]:
-    """Devices that record, or those that play. Blocks for a second. Raises ConfigError without PortAudio."""
-    worker = SourceWorker("sound devices", tell_devices, what)
-    try:
-        worker.wait()
-        return list(worker.messages(time.monotonic())[0])
-    finally:
-        worker.close()
+def _recording(argument: str, flag: str = MIC_FLAG, **more: Any) -> Recording:
+    return Recording(device=device_name(argument, flag), flag=flag, **more)
 
 
 def _opened(recording: Recording, agent: OwnVoice | None = None) -> Microphone:
@@ -254,8 +455,3 @@ def _opened(recording: Recording, agent: OwnVoice | None = None) -> Microphone:
     microphone = Microphone(worker, agent)
     logger.warning("%s: %s", name, microphone.device)
     return microphone
-
-
-def _by_name(argument: str, flag: str) -> str:
-    """Numbers change when something is plugged in, and the worker may be started again then."""
-    return choose_device(sound_devices(), argument, flag).name if argument.isdigit() else argument

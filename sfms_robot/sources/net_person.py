@@ -1,43 +1,48 @@
-"""Other programs in place of microphone, camera and loudspeaker: `--audio push`, `--face push`, `--agent-audio tcp`.
+"""Programs and visitors of the page in place of microphone, camera and loudspeaker.
 
-One server for all flags that name the same address. What programs hand over goes through the sources of calls
-(`push`), with the sender's times in our clock; what the run hears and does is told to those who ask for it.
+`--audio push`, `--face push`, `--agent-audio tcp` (`NetPerson`): one server for all flags that name the same address.
+`--audio browser`, `--face browser` (`PageVisitor`): the visitor with the controls of the page. What they hand over goes
+through the sources of calls (`push`), with the sender's times in our clock; a program also receives what the run hears
+and does where it asks for that.
 
 1. One program feeds each of voice, face and speech. Another is refused by name until the first has gone; one that has
-   sent no voice, or no face, for `SILENT_S` loses its place to whoever asks for it.
-2. Beyond loopback whoever says hello needs the token, which is made anew and printed at every start.
+   sent no voice, or no face, for `SILENT_S` loses its place to a program that asks for it.
+2. Beyond loopback a hello needs the token, which is new and printed at every start.
+3. One visitor is the person at a time: the next one has another clock, and another face at rest.
+4. While a program or visitor that brought a voice, or a face, is away, it counts as lost.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 
-from sfms_robot.endpoint import LOOPBACK, host_and_port
+from sfms_robot.endpoint import LOOPBACK, host_and_port, is_loopback, shown, token_admits
 from sfms_robot.errors import ConfigError, PacketError, PortError
-from sfms_robot.frames import AUDIO_HZ, Floats
-from sfms_robot.origin import token_admits
-from sfms_robot.sources.net_intake import Intake, SenderClock
+from sfms_robot.frames import AUDIO_HZ, POSE_CHANNELS, Floats, Sighting
+from sfms_robot.sources.live_face import LiveFace
+from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.net_messages import (
     FEEDS,
     MICROPHONE,
     VERSION,
+    VOICE,
     Hello,
     Hush,
     Message,
-    Seen,
-    Sound,
+    SeenMessage,
+    SoundMessage,
     json_message,
+    parse_message,
     sound_message,
 )
-from sfms_robot.sources.net_server import Connection, NetServer
+from sfms_robot.sources.net_server import NetProgram, NetServer
 from sfms_robot.sources.push import PushedSight, PushedSpeech, PushedVoice
 
 logger = logging.getLogger(__name__)
@@ -46,32 +51,117 @@ PORT: Final = 8765
 SILENT_S: Final = 2.0
 FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
 
+OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
+_WINDOW_S: Final = 10.0  # that a clock is remembered, once or twice
+_SET_S: Final = 1.0  # a message that took so much longer than the quickest: the clock was set
+_SPARE_S: Final = 2.0  # of sound, that may arrive faster than time passes
+
 _open: dict[tuple[str, int], NetPerson] = {}
 _opening: Final = threading.Lock()
 
 
+class SenderClock:
+    """The clock of a program that sends, in ours.
+
+    Every message says when it was sent, by a clock of any origin. The message of the last seconds that took least time
+    on its way tells where that clock stands: its delay is taken as none. So a time is late by the shortest delay of the
+    way, and never early; a clock that drifts is followed. Holds the least `arrived - sent` of two windows.
+    """
+
+    def __init__(self) -> None:
+        self._began_s = 0.0
+        self._now_least: float | None = None
+        self._last_least: float | None = None
+
+    def observe(self, sent_s: float, arrived_s: float) -> None:
+        """Take in a message that arrived at `arrived_s` of `time.monotonic`."""
+        took = arrived_s - sent_s
+        if self._now_least is None or took > self.offset_s + _SET_S:
+            self._began_s, self._now_least, self._last_least = arrived_s, took, None
+        elif arrived_s - self._began_s > _WINDOW_S:
+            self._began_s, self._last_least, self._now_least = arrived_s, self._now_least, took
+        else:
+            self._now_least = min(self._now_least, took)
+
+    @property
+    def offset_s(self) -> float:
+        """Seconds to add to a time of the sender. 0 before the first message."""
+        known = [each for each in (self._now_least, self._last_least) if each is not None]
+        return min(known, default=0.0)
+
+
+class Intake:
+    """Voice and face of one person, judged by their age and pace.
+
+    Attributes:
+        counts: messages that came too late, and sound that came faster than time passes.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self.counts = dict.fromkeys(("old", "too_fast"), 0)
+        self._now = now
+        self._spare_s = _SPARE_S
+        self._spared_s = now()
+
+    def hear(self, voice: PushedVoice, message: SoundMessage, clock: SenderClock) -> None:
+        """Hand on the next piece of their voice. Never blocks."""
+        now_s, at_s, old = self._times(message, clock)
+        piece_s = len(message.samples) / message.rate_hz
+        if not old and self._in_time(piece_s, now_s):
+            voice.hear(message.samples, message.rate_hz, at_s)
+
+    def see(self, sight: PushedSight | BrowserSight, message: SeenMessage, clock: SenderClock) -> None:
+        """Hand on their face now, or that it is lost. Never blocks."""
+        _, at_s, old = self._times(message, clock)
+        if not old:
+            sight.see(message.motion, at_s, message.attention)
+
+    def at_s(self, message: SoundMessage | SeenMessage, clock: SenderClock) -> float | None:
+        """Return the time of a message in our clock; None: as it arrives."""
+        if not message.at_s:
+            return None
+        clock.observe(message.sent_s, self._now())
+        return message.at_s + clock.offset_s
+
+    def _times(self, message: SoundMessage | SeenMessage, clock: SenderClock) -> tuple[float, float | None, bool]:
+        """Return now, the time of a message, at most now, and whether it is too old."""
+        now_s, at_s = self._now(), self.at_s(message, clock)
+        old = at_s is not None and at_s < now_s - OLDEST_S
+        self.counts["old"] += old
+        return now_s, None if at_s is None else min(at_s, now_s), old
+
+    def _in_time(self, piece_s: float, now_s: float) -> bool:
+        """Return whether no more sound came than time has passed, and a little."""
+        self._spare_s = min(_SPARE_S, self._spare_s + (now_s - self._spared_s))
+        self._spared_s = now_s
+        if piece_s > self._spare_s:
+            self.counts["too_fast"] += 1
+            return False
+        self._spare_s -= piece_s
+        return True
+
+
 class NetPerson:
-    """The server's handler: who feeds what, and who wants to be told what.
+    """The server's handler: which program feeds what, and which are sent what.
 
     Attributes:
         now: `time.monotonic`, or a test's.
-        token: what a hello has to hold; None: nothing.
+        token: needed in a hello; None: not needed.
     """
 
     def __init__(self, flag: str, host: str, port: int, now: Callable[[], float] = time.monotonic) -> None:
         self.now = now
         self._place = (host, port)
         self._feeds: dict[str, NetVoice | NetSight | NetSpeech] = {}
-        self._feeders: dict[str, Connection] = {}
-        self._clocks: dict[Connection, SenderClock] = {}
+        self._feeders: dict[str, NetProgram] = {}
+        self._clocks: dict[NetProgram, SenderClock] = {}
         self._heard_s: dict[str, float] = {}
         self._origin_s = 0.0
         self._state: Mapping[str, Any] | None = None
         self._intake = Intake(now)
         self._server = NetServer(flag, host, port, self)
-        bound = self._server.address
-        self.token = None if ipaddress.ip_address(bound[0]).is_loopback else secrets.token_urlsafe(12)
-        at = f"[{bound[0]}]:{bound[1]}" if ":" in bound[0] else f"{bound[0]}:{bound[1]}"
+        self.token = None if is_loopback(self.address[0]) else secrets.token_urlsafe(12)
+        at = shown(*self.address)
         logger.warning(
             "%s: tcp://%s and ws://%s%s", flag, at, at, "" if self.token is None else f", token {self.token}"
         )
@@ -81,16 +171,16 @@ class NetPerson:
         """Host and port that are bound."""
         return self._server.address
 
-    # --- what a run opens and tells; from its threads ---
+    # --- from the run, in its threads ---
 
     def join(self, name: str, part: NetVoice | NetSight | NetSpeech) -> None:
-        """`part` takes what programs feed as `name`. Raises PortError when another one does already."""
+        """Give `part` what programs feed as `name`. Raises PortError when another one takes it already."""
         if name in self._feeds:
             raise PortError(f"{FLAGS[name]}: port {self.address[1]} is used by another run of this program")
         self._feeds[name] = part
 
     def leave(self, name: str) -> None:
-        """The last one closes the server. Blocks until it is."""
+        """Take a part away; the last one closes the server. Blocks until it is closed."""
         with _opening:
             self._feeds.pop(name, None)
             if not self._feeds:
@@ -98,34 +188,34 @@ class NetPerson:
                 self._server.close()
 
     def start(self, origin_s: float) -> None:
-        """Loop time 0 is `origin_s` of `time.monotonic`. From now on programs are answered."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`. From now on programs are answered."""
         self._origin_s = origin_s
         self._server.start()
 
     def hears(self, audio: Floats, time_s: float) -> None:
-        """What the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
+        """Send what the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
         at_s = self._origin_s + time_s
         self._server.post(lambda: self._send_sound(audio, at_s))
 
     def tells(self, kind: str, time_s: float, **values: Any) -> None:
-        """An event, or a state, that begins at loop time `time_s`. Never blocks."""
-        told = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
-        self._server.post(lambda: self._send_event(told))
+        """Send an event, or a state, that begins at loop time `time_s`. Never blocks."""
+        event = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
+        self._server.post(lambda: self._send_event(event))
 
     def statistics(self) -> Mapping[str, Any]:
-        """What the server counts; sound and faces that came too late, or faster than time passes; who feeds what."""
+        """Return the server's counts, sound and faces that were too late or too fast, and which program feeds what."""
         feeders = {name: connection.name for name, connection in self._feeders.copy().items()}
         return {**self._server.counts, **self._intake.counts, "feeders": feeders}
 
-    # --- what programs send; in the server's thread ---
+    # --- from programs, in the server's thread ---
 
-    def received(self, connection: Connection, message: Message) -> None:
+    def received(self, connection: NetProgram, message: Message) -> None:
         """Hand a message to the part that it feeds. Raises PacketError for one that was not announced."""
         if isinstance(message, Hello):
             self._greet(connection, message)
             return
         if not connection.greeted:
-            raise PacketError("the first message is no hello")
+            raise PacketError("the first message must be a hello")
         name = next(name for name, kind in FEEDS.items() if kind == message.kind)
         if self._feeders.get(name) is not connection:
             raise PacketError(f"{name} was not announced in its hello")
@@ -134,25 +224,26 @@ class NetPerson:
         match self._feeds[name], message:
             case NetSpeech() as speech, Hush():
                 speech.hush()
-            case NetSpeech() as speech, Sound() as sound:
-                speech.say(sound.samples, sound.rate_hz, self._intake.times(sound, clock)[1])
-            case NetSight() as sight, Seen() as seen:
+            case NetSpeech() as speech, SoundMessage() as sound:
+                speech.say(sound.samples, sound.rate_hz, self._intake.at_s(sound, clock))
+            case NetSight() as sight, SeenMessage() as seen:
                 self._intake.see(sight, seen, clock)
-            case NetVoice() as voice, Sound() as sound:
+            case NetVoice() as voice, SoundMessage() as sound:
                 self._intake.hear(voice, sound, clock)
 
-    def gone(self, connection: Connection) -> None:
+    def gone(self, connection: NetProgram) -> None:
+        """Free the places of a program that has gone."""
         self._clocks.pop(connection, None)
         for name in [each for each, feeder in self._feeders.items() if feeder is connection]:
             del self._feeders[name]
             logger.info("%s: %s has gone", FLAGS[name], connection.name)
             part = self._feeds.get(name)
-            if part is not None and name != "speech":  # who has nothing to say is no loss
+            if part is not None and name != "speech":  # a program with nothing to say is no loss
                 part.lost = True
             if isinstance(part, NetSight):
                 part.see(None)
 
-    def _greet(self, connection: Connection, hello: Hello) -> None:
+    def _greet(self, connection: NetProgram, hello: Hello) -> None:
         if connection.greeted:
             raise PacketError("a second hello")
         if not token_admits(hello.token, self.token):
@@ -171,7 +262,7 @@ class NetPerson:
         if self._state is not None and "events" in hello.wants:
             connection.send(json_message(**self._state, sent_s=self.now()))
 
-    def _claim(self, connection: Connection, name: str) -> None:
+    def _claim(self, connection: NetProgram, name: str) -> None:
         if name not in self._feeds:
             raise PacketError(f"this run takes no {name} from programs ({FLAGS[name]})")
         feeder = self._feeders.get(name)
@@ -182,38 +273,39 @@ class NetPerson:
         del self._feeders[name]
         feeder.end(f"{name} now comes from {connection.name}: none came for {SILENT_S:g} s")
 
+    def _wanting(self, what: str) -> list[NetProgram]:
+        return [each for each in self._server.connections if what in each.wants]
+
     def _send_sound(self, audio: Floats, at_s: float) -> None:
-        wanting = [each for each in self._server.connections() if "microphone" in each.wants]
-        if wanting:
+        if wanting := self._wanting("microphone"):
             samples = np.rint(np.clip(audio, -1.0, 1.0) * 32767).astype(np.int16)
             message = sound_message(MICROPHONE, AUDIO_HZ, self.now(), at_s, samples)
             for connection in wanting:
                 connection.send(message)
 
-    def _send_event(self, told: Mapping[str, Any]) -> None:
-        if told["type"] == "state":
-            self._state = told
-        for connection in self._server.connections():
-            if "events" in connection.wants:
-                connection.send(json_message(**told, sent_s=round(self.now(), 4)))
+    def _send_event(self, event: Mapping[str, Any]) -> None:
+        if event["type"] == "state":
+            self._state = event
+        for connection in self._wanting("events"):
+            connection.send(json_message(**event, sent_s=round(self.now(), 4)))
 
 
-class _NetPart:
-    """Of what another program feeds: it joins the server, which runs from its start to its close."""
+class _NetPart(SourcePart):
+    """A part of a person that another program feeds: it joins the server, which runs from its start to its close."""
 
     feed: ClassVar[str]
 
     def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)  # type: ignore[call-arg]
+        super().__init__(outlet.now)
         self.outlet = outlet
         outlet.join(self.feed, cast(Any, self))
 
     def start(self, origin_s: float) -> None:
         self.outlet.start(origin_s)
-        super().start(origin_s)  # type: ignore[misc]
+        super().start(origin_s)
 
     def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "net": self.outlet.statistics()}  # type: ignore[misc]
+        return {**super().statistics(), "net": self.outlet.statistics()}
 
     def close(self) -> None:
         self.outlet.leave(self.feed)
@@ -226,7 +318,7 @@ class NetVoice(_NetPart, PushedVoice):
 
 
 class NetSight(_NetPart, PushedSight):
-    """`ports.Sight` of a person whom another program sees."""
+    """`ports.Sight` of a person that another program sees."""
 
     feed = "face"
 
@@ -238,35 +330,155 @@ class NetSpeech(_NetPart, PushedSpeech):
 
 
 def open_net_voice(argument: str) -> NetVoice:
-    """`--audio push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    """Open `--audio push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
     return NetVoice(_person("--audio push", argument))
 
 
 def open_net_sight(argument: str) -> NetSight:
-    """`--face push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    """Open `--face push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
     return NetSight(_person("--face push", argument))
 
 
 def open_net_speech(argument: str) -> NetSpeech:
-    """`--agent-audio tcp[:[HOST:]PORT]`. Raises ConfigError, PortError."""
+    """Open `--agent-audio tcp[:[HOST:]PORT]`. Raises ConfigError, PortError."""
     return NetSpeech(_person("--agent-audio tcp", argument))
 
 
 def _person(flag: str, argument: str) -> NetPerson:
-    """The one of that address; its server runs from then on."""
-    place = _parsed(flag, argument)
+    """Return the person of an address, whose server runs from then on."""
+    place = host_and_port(argument) if argument else (LOOPBACK, PORT)
+    if place is None:
+        choices = f"{flag}, {flag}:PORT, {flag}:HOST:PORT; 0 for a free one"
+        raise ConfigError(f"{flag}:{argument}: {argument!r}: expected a TCP port (valid: {choices})")
     with _opening:
         if place not in _open:
             _open[place] = NetPerson(flag, *place)
         return _open[place]
 
 
-def _parsed(flag: str, argument: str) -> tuple[str, int]:
-    if not argument:
-        return LOOPBACK, PORT
-    place = host_and_port(argument)
-    if place is None:
-        raise ConfigError(
-            f"{flag}:{argument}: {argument!r} is no TCP port ({flag}, {flag}:PORT, {flag}:HOST:PORT; 0 for a free one)"
-        )
-    return place
+# --- visitors of the page -------------------------------------------------------------------------------------------
+
+
+class PageVisitor:
+    """The person in front of the page. All methods from any thread; none blocks.
+
+    Attributes:
+        voice, sight: the person, as sources.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self.voice = BrowserVoice(self, now)
+        self.sight = BrowserSight(self, now)
+        self._lock = threading.Lock()
+        self._number: int | None = None
+        self._feeds: frozenset[str] = frozenset()
+        self._clock, self._intake = SenderClock(), Intake(now)
+
+    def came(self, number: int, feeds: Sequence[str]) -> None:
+        """Make visitor `number` the person, who brings `feeds` of voice and face, or none."""
+        with self._lock:
+            if number != self._number:
+                self._clock = SenderClock()
+                self.sight.forget()
+            self._number, before, self._feeds = number, self._feeds, frozenset(feeds)
+            self._lose(before - self._feeds)
+            self.voice.lost = self.voice.lost and "voice" not in feeds
+            self.sight.lost = self.sight.lost and "face" not in feeds
+
+    def gone(self, number: int) -> None:
+        """Note that visitor `number` has gone, or has lost the controls."""
+        with self._lock:
+            if number == self._number:
+                before, self._number, self._feeds = self._feeds, None, frozenset()
+                self._lose(before)
+
+    def received(self, number: int, data: bytes) -> None:
+        """Take a message of `net_messages`. Raises PacketError for any other, and for one that was not announced."""
+        with self._lock:
+            message = parse_message(data)
+            if not isinstance(message, (SoundMessage, SeenMessage)) or (
+                isinstance(message, SoundMessage) and message.kind != VOICE
+            ):
+                raise PacketError("only voice and face are taken from a visitor")
+            name = "voice" if isinstance(message, SoundMessage) else "face"
+            if number != self._number or name not in self._feeds:
+                raise PacketError(f"{name} was not announced by `source`")
+            if isinstance(message, SoundMessage):
+                self._intake.hear(self.voice, message, self._clock)
+            else:
+                self._intake.see(self.sight, message, self._clock)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return counts of messages that came too late, and of sound that came faster than time passes."""
+        return dict(self._intake.counts)
+
+    def _lose(self, feeds: frozenset[str]) -> None:
+        if "voice" in feeds:
+            self.voice.lost = True
+            self.voice.interrupt()
+        if "face" in feeds:
+            self.sight.lost = True
+
+
+class BrowserVoice(PushedVoice):
+    """`ports.Voice` of a visitor."""
+
+    def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
+        super().__init__(now)
+        self._visitor = visitor
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), **self._visitor.statistics()}
+
+
+class BrowserSight(SourcePart):
+    """`ports.Sight` of a visitor. Their rest is learned while they are seen, as that of a person at a webcam."""
+
+    def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
+        super().__init__(now)
+        self._visitor = visitor
+        self._lock = threading.Lock()
+        self._face = LiveFace(np.ones(len(POSE_CHANNELS), np.float32))
+
+    def see(self, face: Floats | None, seen_s: float | None = None, attention: float | None = None) -> None:
+        """Take their face (58,) at `seen_s` of `time.monotonic`, None: now; without one the last grows old and is lost.
+
+        Their attention is judged here, by head and eyes.
+        """
+        if face is not None:
+            with self._lock:
+                self._face.put(self._now() if seen_s is None else seen_s, face)
+
+    def forget(self) -> None:
+        """Expect another person."""
+        with self._lock:
+            self._face.forget()
+
+    def start(self, origin_s: float) -> None:
+        with self._lock:
+            self._face.start(origin_s)
+
+    def at(self, time_s: float) -> Sighting | None:
+        with self._lock:
+            return self._face.at(time_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return self._visitor.statistics()
+
+
+def open_browser_voice(argument: str, visitor: PageVisitor | None = None) -> BrowserVoice:
+    """Open `--audio browser`. Raises ConfigError where no page is served, and for an argument: it takes none."""
+    return _of_page("--audio", argument, visitor).voice
+
+
+def open_browser_sight(argument: str, visitor: PageVisitor | None = None) -> BrowserSight:
+    """Open `--face browser`, as `open_browser_voice`."""
+    return _of_page("--face", argument, visitor).sight
+
+
+def _of_page(flag: str, argument: str, visitor: PageVisitor | None) -> PageVisitor:
+    if argument:
+        raise ConfigError(f"{flag} browser:{argument}: takes nothing behind the colon ({flag} browser)")
+    if visitor is None:
+        raise ConfigError(f"{flag} browser: there is no page (sfms-robot run --view serves one)")
+    return visitor

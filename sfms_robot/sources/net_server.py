@@ -1,72 +1,88 @@
-"""The side of the network: a thread that takes connections, hands messages to who asked for them, and sends.
+"""Server of the programs beside a run: takes connections, hands on messages, and sends.
 
-What a stranger can do costs the servo loop no tick:
+A message travels behind its length (uint32) over TCP, or as one of a WebSocket; both share a port. A connection that
+begins with "GET " is HTTP and wants a WebSocket: as a length that would be more than any message has. Pages of the web
+may not connect: a browser says whose page it is, and only pages of this machine, or from the very address that they
+call, are admitted (`endpoint.origin_problem`).
 
-1. All of it happens in one thread of its own. The loop hands over what is to be sent through a bounded queue.
-2. A connection is read in small turns with pauses between them: who sends faster is held up by TCP itself.
-3. Who reads too slowly gets the newest `OUTBOX` messages; older ones are left out and counted.
-4. Who says nothing after connecting, and who has gone without saying so, is closed.
+A client costs the servo loop no tick:
+
+1. All of it happens in one thread. The loop hands over what is to be sent through a bounded queue.
+2. A connection is read in small turns with pauses between them: TCP itself holds up one that sends faster.
+3. A slow reader gets the newest `OUTBOX` messages; older ones are left out and counted.
+4. A client that sends no hello, or has gone without closing, is disconnected.
 """
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import re
 import socket
+import struct
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Final, Protocol
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing, suppress
+from typing import Any, Final, Protocol
 
-from sfms_robot.errors import PacketError, PortError
-from sfms_robot.sources.net_messages import Message, json_message, parse_message
-from sfms_robot.sources.net_wire import HTTP, TcpWire, WebSocketWire, Wire
+from websockets.exceptions import InvalidHandshake, WebSocketException
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request
+from websockets.server import ServerProtocol
+
+from sfms_robot.endpoint import listen, origin_problem, shown
+from sfms_robot.errors import PacketError
+from sfms_robot.sources.net_messages import LONGEST, Message, json_message, parse_message
 
 logger = logging.getLogger(__name__)
 
 MOST_CONNECTIONS: Final = 8
 HELLO_S: Final = 5.0  # until the first message
 OUTBOX: Final = 50  # messages: two seconds of microphone
-TURN_MESSAGES: Final = 16  # of one connection, then the others, and a pause
+TURN_MESSAGES: Final = 16  # of one connection, then a pause, in which the others are read
 TURN_BYTES: Final = 65_536
 TURN_S: Final = 0.01
 MOST_MALFORMED: Final = 100  # then the connection is closed
-_SLICE: Final = 1024  # bytes that are looked at at once
 LAST_WORDS_S: Final = 0.2  # that a program gets to read why it is closed
+_SLICE: Final = TURN_BYTES // TURN_MESSAGES  # bytes of a WebSocket that are read at once
 _STOP_S: Final = 2.0
 _MOST_SAID: Final = 20
+_HTTP: Final = b"GET "
+_LENGTH: Final = struct.Struct("<I")
+_REASON: Final = 120  # bytes of a closing frame's text
 
 
 class Handler(Protocol):
-    """Who decides what messages mean. Called in the server's thread."""
+    """Decides what messages mean. Called in the server's thread."""
 
-    def received(self, connection: Connection, message: Message) -> None:
-        """Raises PacketError for what this connection may not send: it is closed with that line."""
+    def received(self, connection: NetProgram, message: Message) -> None:
+        """Raise PacketError for a message that this connection may not send: it is closed with that line."""
 
-    def gone(self, connection: Connection) -> None: ...
+    def gone(self, connection: NetProgram) -> None:
+        """Note that a connection is closed, or about to be. Idempotent."""
 
 
 class NetServer:
-    """Holds one address from construction until `close`; whoever connects waits until `start`.
+    """Holds one address from construction until `close`; clients wait until `start`. Raises PortError.
 
-    Raises PortError when the address cannot be had.
+    Args:
+        flag: the option that names the address, for errors.
+        port: 0: any that is free.
 
     Attributes:
         address: host and port that are bound.
         counts: connections, refused ones, messages, malformed ones, and messages that slow readers missed.
+        connections: those that are open; for the server's thread.
     """
 
     def __init__(self, flag: str, host: str, port: int, handler: Handler) -> None:
-        """`flag`: what the command line calls it, for the error's text. Port 0: any that is free."""
         self.counts = dict.fromkeys(("connections", "refused", "messages", "malformed", "missed"), 0)
-        self._handler = handler
+        self.handler = handler
+        self.connections: set[NetProgram] = set()
         self._said: set[str] = set()
-        self._connections: set[Connection] = set()
-        self._socket = _bound(flag, host, port)
+        self._socket = listen(flag, host, port)
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
@@ -86,12 +102,8 @@ class NetServer:
             with suppress(RuntimeError):  # closed
                 self._loop.call_soon_threadsafe(self._work)
 
-    def connections(self) -> list[Connection]:
-        """Those that are open. In the server's thread."""
-        return list(self._connections)
-
     def say_once(self, key: str, text: str) -> None:
-        """One line in the log for `key`, whatever its numbers, the first time."""
+        """Log one line for `key`, whatever its numbers, the first time."""
         key = re.sub(r"\d+", "", key)
         if key not in self._said and len(self._said) < _MOST_SAID:
             self._said.add(key)
@@ -106,43 +118,6 @@ class NetServer:
             self._loop.call_soon_threadsafe(self._closing.set)
             self._thread.join(_STOP_S)
 
-    def opened(self, connection: Connection) -> bool:
-        """Whether it may stay."""
-        self.counts["connections"] += 1
-        if len(self._connections) >= MOST_CONNECTIONS:
-            self.counts["refused"] += 1
-            self.say_once("full", f"{connection.name}: refused, {MOST_CONNECTIONS} programs are connected already")
-            return False
-        self._connections.add(connection)
-        return True
-
-    def closed(self, connection: Connection) -> None:
-        self._connections.discard(connection)
-        self._handler.gone(connection)
-
-    def message(self, connection: Connection, data: bytes) -> None:
-        """One message of a connection, whatever it is."""
-        self.counts["messages"] += 1
-        try:
-            message = parse_message(data)
-        except PacketError as error:
-            self.counts["malformed"] += 1
-            connection.malformed += 1
-            self.say_once(f"malformed {error}", f"{connection.name}: left out: {error}")
-            if not connection.greeted or connection.malformed > MOST_MALFORMED:
-                connection.end(str(error))
-            return
-        try:
-            self._handler.received(connection, message)
-        except PacketError as error:
-            self.counts["refused"] += 1
-            self.say_once(f"refused {error}", f"{connection.name}: refused: {error}")
-            connection.end(str(error))
-
-    def pause_s(self) -> float:
-        """Between two turns of one connection."""
-        return TURN_S * max(1, len(self._connections))
-
     def _work(self) -> None:
         while self._posted:
             self._posted.popleft()()
@@ -155,178 +130,242 @@ class NetServer:
             self._socket.close()
 
     async def _serve(self) -> None:
-        server = await self._loop.create_server(lambda: Connection(self, self._loop), sock=self._socket)
+        server = await asyncio.start_server(lambda *ends: NetProgram(self, *ends).run(), sock=self._socket)
         await self._closing.wait()
         server.close()
-        open_still = self.connections()
+        open_still = list(self.connections)
         for connection in open_still:
             connection.end("the robot stops", refused=False)
-        if open_still:
-            await asyncio.wait([connection.lost for connection in open_still], timeout=LAST_WORDS_S)
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        if tasks:
+            await asyncio.wait(tasks, timeout=LAST_WORDS_S)
         for connection in open_still:
             connection.abort()
-        await asyncio.sleep(0)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
-class Connection(asyncio.Protocol):
+class NetProgram:
     """One program that is connected, over TCP or a WebSocket.
 
     Attributes:
-        name: who it is, for people: what it calls itself, and its address.
+        name: what it calls itself, and its address.
         greeted: its hello was accepted.
-        malformed: messages of it that could not be read.
+        malformed: count of its messages that could not be read.
         wants: what it is sent.
-        lost: done when it is closed.
     """
 
-    def __init__(self, server: NetServer, loop: asyncio.AbstractEventLoop) -> None:
-        self.name = "somebody"
-        self.greeted = False
-        self.malformed = 0
+    def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.name = shown(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
+        self.greeted, self.malformed = False, 0
         self.wants: frozenset[str] = frozenset()
-        self.lost = loop.create_future()
-        self._server = server
-        self._loop = loop
-        self._transport: asyncio.Transport | None = None  # None: closed, or about to be
-        self._socket_transport: asyncio.Transport | None = None
-        self._wire: Wire | None = None
-        self._unread = bytearray()
-        self._turning = False
-        self._full = False
+        self._server, self._reader, self._writer = server, reader, writer
+        self._loop = asyncio.get_running_loop()
+        self._wire: TcpWire | WebSocketWire | None = None
+        self._over = False
         self._outbox: deque[bytes] = deque(maxlen=OUTBOX)
-        self._deadline: asyncio.TimerHandle | None = None
+        self._waiting = asyncio.Event()  # something to send
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        peer = transport.get_extra_info("peername")
-        self.name = f"{peer[0]}:{peer[1]}"
-        self._transport = self._socket_transport = transport
-        _tell_of_the_dead(transport.get_extra_info("socket"))
-        transport.set_write_buffer_limits(high=65_536)
-        if not self._server.opened(self):
+    async def run(self) -> None:
+        """Serve it until either side closes."""
+        server = self._server
+        server.counts["connections"] += 1
+        if len(server.connections) >= MOST_CONNECTIONS:
+            server.counts["refused"] += 1
+            server.say_once("full", f"{self.name}: refused, {MOST_CONNECTIONS} programs are connected already")
             self.abort()
             return
-        self._deadline = self._loop.call_later(HELLO_S, self._silent)
-
-    def data_received(self, data: bytes) -> None:
-        self._unread += data
-        if self._wire is None:
-            if len(self._unread) < len(HTTP):
-                return
-            self._wire = WebSocketWire() if self._unread.startswith(HTTP) else TcpWire()
-        if not self._turning:
-            self._turn()
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._transport = None
-        if self._deadline is not None:
-            self._deadline.cancel()
-        self._server.closed(self)
-        if not self.lost.done():
-            self.lost.set_result(None)
-
-    def pause_writing(self) -> None:
-        self._full = True
-
-    def resume_writing(self) -> None:
-        self._full = False
-        while self._outbox and not self._full:
-            self._write(self._outbox.popleft())
+        server.connections.add(self)
+        _find_the_dead(self._writer.get_extra_info("socket"))
+        self._writer.transport.set_write_buffer_limits(high=65_536)
+        deadline = self._loop.call_later(HELLO_S, self._silent)
+        sending = self._loop.create_task(self._send())
+        try:
+            await self._receive()
+        except (OSError, asyncio.IncompleteReadError):
+            pass  # it has gone
+        except PacketError as error:
+            server.counts["malformed"] += 1
+            server.say_once(f"wire {error}", f"{self.name}: closed: {error}")
+            self.end(str(error))
+        finally:
+            deadline.cancel()
+            sending.cancel()
+            server.connections.discard(self)
+            server.handler.gone(self)  # once more where it was ended here
+            self._writer.close()
 
     def send(self, message: bytes) -> None:
-        """Now, or when it reads again: then the newest. In the server's thread."""
-        if not self._full:
-            self._write(message)
-            return
+        """Send a message when the client reads: the newest ones. In the server's thread."""
         self._server.counts["missed"] += len(self._outbox) == self._outbox.maxlen
         self._outbox.append(message)
+        self._waiting.set()
 
     def end(self, reason: str, refused: bool = True) -> None:
-        """Tell why, as a message of type "error", and close. `refused`: it was the program's own doing."""
-        transport = self._transport
-        if transport is None:
+        """Send the reason, as a message of type "error", and close. `refused`: the client is to blame."""
+        if self._over:
             return
+        self._over = True
+        self._server.handler.gone(self)
         if self._wire is not None:
-            self._write(json_message(type="error", error=reason))
-            transport.write(self._wire.closing(reason, refused))
-        self._transport = None
-        transport.close()
-        self._loop.call_later(HELLO_S, transport.abort)  # who does not read does not keep it open
+            for message in (*self._outbox, json_message(type="error", error=reason)):
+                self._writer.write(self._wire.packed(message))
+            self._writer.write(self._wire.closing(reason, refused))
+        self._writer.close()
+        self._loop.call_later(HELLO_S, self.abort)  # a client that does not read does not keep it open
 
     def abort(self) -> None:
         """Close without a word."""
-        self._transport = None
-        if self._socket_transport is not None:
-            self._socket_transport.abort()
+        self._over = True
+        self._writer.transport.abort()
 
-    def _write(self, message: bytes) -> None:
-        if self._transport is not None and self._wire is not None:
-            self._transport.write(self._wire.packed(message))
+    async def _send(self) -> None:
+        with suppress(OSError):
+            while True:
+                await self._waiting.wait()
+                assert self._wire is not None  # nothing is sent before the hello
+                while self._outbox:
+                    self._writer.write(self._wire.packed(self._outbox.popleft()))
+                    await self._writer.drain()
+                self._waiting.clear()
 
-    def _turn(self) -> None:
-        """Look at some of what came in; at the rest after a pause, in which nothing is read."""
-        self._turning, messages, looked = False, 0, 0
-        while self._unread and self._transport is not None:
-            if messages >= TURN_MESSAGES or looked >= TURN_BYTES:
-                self._turning = True
-                self._transport.pause_reading()
-                self._loop.call_later(self._server.pause_s(), self._next_turn)
-                return
-            piece = bytes(self._unread[:_SLICE])
-            del self._unread[:_SLICE]
-            looked += len(piece)
-            messages += self._look(piece)
+    async def _receive(self) -> None:
+        head = await self._reader.readexactly(len(_HTTP))
+        self._wire = wire = WebSocketWire(self._writer) if head == _HTTP else TcpWire()
+        looked = size = 0
+        async with aclosing(wire.messages(self._reader, head)) as messages:
+            async for data in messages:
+                if self._over:
+                    return
+                looked, size = looked + 1, size + len(data or b"")
+                if data is not None:
+                    self._take(data)
+                if looked >= TURN_MESSAGES or size >= TURN_BYTES:
+                    looked = size = 0
+                    await asyncio.sleep(TURN_S * len(self._server.connections))
 
-    def _next_turn(self) -> None:
-        if self._transport is not None:
-            self._transport.resume_reading()
-            self._turn()
-
-    def _look(self, piece: bytes) -> int:
-        """How many messages it completed, and what else was to be looked at."""
-        wire, count = self._wire, 0
-        assert wire is not None
+    def _take(self, data: bytes) -> None:
+        server = self._server
+        server.counts["messages"] += 1
         try:
-            for data in wire.push(piece):
-                count += 1
-                if data is not None and self._transport is not None:
-                    self._server.message(self, data)
+            message = parse_message(data)
         except PacketError as error:
-            self._server.counts["malformed"] += 1
-            self._server.say_once(f"wire {error}", f"{self.name}: closed: {error}")
-            self._answer(wire)
+            server.counts["malformed"] += 1
+            self.malformed += 1
+            server.say_once(f"malformed {error}", f"{self.name}: left out: {error}")
+            if not self.greeted or self.malformed > MOST_MALFORMED:
+                self.end(str(error))
+            return
+        try:
+            server.handler.received(self, message)
+        except PacketError as error:
+            server.counts["refused"] += 1
+            server.say_once(f"refused {error}", f"{self.name}: refused: {error}")
             self.end(str(error))
-            return count
-        self._answer(wire)
-        if wire.over and self._transport is not None:
-            self._transport.close()
-        if self.greeted and self._deadline is not None:
-            self._deadline.cancel()
-            self._deadline = None
-        return count
-
-    def _answer(self, wire: Wire) -> None:
-        if self._transport is not None and (answer := wire.answer()):
-            self._transport.write(answer)
 
     def _silent(self) -> None:
-        self._server.counts["refused"] += 1
-        self._server.say_once("silent", f"{self.name}: closed: no hello within {HELLO_S:g} s")
-        self.end(f"no hello within {HELLO_S:g} s")
+        if not self.greeted:
+            self._server.counts["refused"] += 1
+            self._server.say_once("silent", f"{self.name}: closed: no hello within {HELLO_S:g} s")
+            self.end(f"no hello within {HELLO_S:g} s")
 
 
-def _bound(flag: str, host: str, port: int) -> socket.socket:
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        return socket.create_server(address[:2], family=family)
-    except (OSError, UnicodeError) as error:
-        used = getattr(error, "errno", None) == errno.EADDRINUSE
-        problem = "is used by another program" if used else getattr(error, "strerror", None) or error
-        raise PortError(f"{flag}: TCP port {port} on {host}: {problem}") from error
+class TcpWire:
+    """Each message behind its length."""
+
+    async def messages(self, reader: asyncio.StreamReader, head: bytes) -> AsyncGenerator[bytes | None, None]:
+        """Yield messages, and None for anything else that cost time. `head`: the first four bytes.
+
+        Raises PacketError for bytes after which nothing can be read.
+        """
+        while True:
+            (length,) = _LENGTH.unpack(head)
+            if not 0 < length <= LONGEST:
+                raise PacketError(f"a message of {length} bytes (1 to {LONGEST})")
+            yield await reader.readexactly(length)
+            head = await reader.readexactly(_LENGTH.size)
+
+    def packed(self, message: bytes) -> bytes:
+        """Return a message in the form that is sent; empty while the other side is not ready for any."""
+        return _LENGTH.pack(len(message)) + message
+
+    def closing(self, reason: str, refused: bool) -> bytes:
+        """Return what is sent before the connection is closed."""
+        return b""
 
 
-def _tell_of_the_dead(of: socket.socket) -> None:
-    """A peer that has gone without a word is found out: within 11 s, where the system can."""
+class WebSocketWire:
+    """A WebSocket (RFC 6455), server's side; methods as of `TcpWire`."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._protocol = ServerProtocol(max_size=LONGEST)
+        self._writer = writer
+
+    async def messages(self, reader: asyncio.StreamReader, head: bytes) -> AsyncGenerator[bytes | None, None]:
+        protocol, data, parts = self._protocol, head, list[Frame]()
+        while data:
+            protocol.receive_data(data)
+            problem, events = None, protocol.events_received()
+            for event in events:
+                if isinstance(event, Request):
+                    problem = self._shake(event)
+                elif isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                    parts.append(event)
+                    if event.fin:
+                        message, text = b"".join(part.data for part in parts), parts[0].opcode is Opcode.TEXT
+                        parts.clear()
+                        if text and message.decode(errors="ignore").encode() != message:
+                            protocol.fail(CloseCode.INVALID_DATA)  # RFC 6455, 8.1
+                            problem = "no WebSocket: a text that is not UTF-8"
+                            break
+                        yield message
+                yield None
+            if not events:
+                yield None
+            if failed := protocol.handshake_exc or protocol.parser_exc:
+                problem = problem or f"no WebSocket: {_line(failed)}"
+            if problem is not None:
+                raise PacketError(problem)
+            self._writer.write(self._answer())
+            if protocol.close_expected():
+                return
+            data = await reader.read(_SLICE)
+
+    def packed(self, message: bytes) -> bytes:
+        try:
+            (self._protocol.send_text if message[:1] == b"{" else self._protocol.send_binary)(message)
+        except WebSocketException:  # the handshake is not over, or the other side closes
+            return b""
+        return self._answer()
+
+    def closing(self, reason: str, refused: bool) -> bytes:
+        code = CloseCode.POLICY_VIOLATION if refused else CloseCode.GOING_AWAY
+        with suppress(WebSocketException):  # it closes already
+            self._protocol.send_close(code, reason.encode()[:_REASON].decode(errors="ignore"))
+        return self._answer()
+
+    def _answer(self) -> bytes:
+        """Return what the protocol itself has to send: a handshake, a pong."""
+        return b"".join(self._protocol.data_to_send())
+
+    def _shake(self, request: Request) -> str | None:
+        """Answer a request for a WebSocket; return why it is refused."""
+        problem = origin_problem(request.headers.get("Origin"), request.headers.get("Host", ""))
+        answer = self._protocol.accept(request) if problem is None else self._protocol.reject(403, f"{problem}\n")
+        self._protocol.send_response(answer)
+        return problem
+
+
+def _line(error: BaseException) -> str:
+    """Return the innermost cause, on one line."""
+    while error.__cause__ is not None and isinstance(error, InvalidHandshake):
+        error = error.__cause__
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def _find_the_dead(of: Any) -> None:
+    """Have the system find out within 11 s that a peer has gone without closing, where it can."""
     of.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     of.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if sys.platform == "linux":

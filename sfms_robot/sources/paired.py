@@ -1,4 +1,4 @@
-"""The grid of 40 ms: a voice, a sight and the robot's own voice, whatever each of them is, as one source.
+"""The grid of 40 ms: a voice, a sight and the robot's own voice, each of any kind, as one source.
 
 1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index yields exactly one frame, in order: a listener counts.
 2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
@@ -7,11 +7,11 @@
 3. The face is the newest one, and none when that is older than `FACE_S` at the end of the frame. Of a recording it is
    no newer than that; of something live up to one frame newer, when the frame is given later: a face does not wait for
    the voice beside it, which comes some tens of milliseconds late.
-4. What the robot says is told one frame early, as a program that speaks knows it: frame i carries the samples of frame
+4. What the robot says is given one frame early, as a program that speaks knows it: frame i carries the samples of frame
    i + 1, for which a listener plans its lips while it hears frame i.
-5. Where a sighting does not tell the person's attention, their face does (`signals.attention`).
-6. What is not finite or not of the right shape is left out here, for everybody after: one NaN would stay with a
-   listener for good.
+5. A sighting without the person's attention gets it from their face (`signals.attention`).
+6. What is not finite or not of the right shape is left out here, once for all: one NaN would stay in a listener for
+   good.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _NONE: Final = np.zeros(0, dtype=np.float32)
 
 
 class PairedSource:
-    """`ports.Source` of a voice and a sight; None for what there is not.
+    """`ports.Source` of a voice and a sight; None for a part that is missing.
 
     Args:
         agent: what the robot itself says.
@@ -50,8 +50,8 @@ class PairedSource:
     Attributes:
         duration_s: None for one without end.
         latency_s: see `ports.Voice`.
-        missing: voice, face, agent_audio: those that are lost.
-        outlets: those behind its parts, each once.
+        missing: of voice, face and agent_audio those that are lost.
+        outlets: those of its parts, each once.
     """
 
     def __init__(
@@ -67,7 +67,9 @@ class PairedSource:
         self.latency_s = 0.0
         self.missing: tuple[str, ...] = ()
         self._voice, self._sight, self._agent = voice, sight, agent
-        behind = [getattr(part, "outlet", None) for part in self._parts().values()]
+        parts: dict[str, Voice | Sight | None] = {"voice": voice, "face": sight, "agent_audio": agent}
+        self._parts = {name: part for name, part in parts.items() if part is not None}
+        behind = [getattr(part, "outlet", None) for part in self._parts.values()]
         self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
@@ -76,12 +78,12 @@ class PairedSource:
         self._face_age_ms = Quantiles()
 
     def start(self, origin_s: float) -> None:
-        """Loop time 0 is `origin_s` of `time.monotonic`."""
-        for part in self._parts().values():
+        """Set loop time 0 to `origin_s` of `time.monotonic`."""
+        for part in self._parts.values():
             part.start(origin_s)
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Frames that are due by `now_s` and whole, or waited for long enough; oldest first. Never blocks."""
+        """Return frames that are due by `now_s` and whole, or waited for long enough; oldest first. Never blocks."""
         until_s = now_s if self.duration_s is None else min(now_s, self.duration_s)
         due = math.floor(until_s * FRAME_HZ + _EPS_FRAMES)
         frames: list[SpeakerFrame] = []
@@ -91,43 +93,39 @@ class PairedSource:
                 break
             frames.append(self._frame(self._given, heard, now_s))
             self._given += 1
-        self.missing = tuple(name for name, part in self._parts().items() if part.lost)
+        self.missing = tuple(name for name, part in self._parts.items() if part.lost)
         return frames
 
     def moves(self, speed_rad_s: float) -> None:
-        """See `ports.Source`; a microphone wants to know."""
-        if (tell := getattr(self._voice, "moves", None)) is not None:
-            tell(speed_rad_s)
+        """Pass on to a microphone; see `ports.Source`."""
+        if (moves := getattr(self._voice, "moves", None)) is not None:
+            moves(speed_rad_s)
 
     def statistics(self) -> Mapping[str, Any]:
-        """Of the grid, and under `voice`, `face` and `agent_audio` what these tell of themselves.
+        """Return those of the grid, and under `voice`, `face` and `agent_audio` their own.
 
         frames, overruns (frames without the voice that should be in them), faces_lost (frames whose face was too old),
         left_out (by what it was), wait_ms from the end of a frame until it was given, face_age_ms at the end of its
         frame.
         """
-        told: dict[str, Any] = {
+        figures: dict[str, Any] = {
             "frames": self._given,
             "overruns": self._overruns,
             "left_out": dict(self._judge.left_out),
+            "wait_ms": self._wait_ms.report(p50=50, p99=99),
         }
-        told["wait_ms"] = self._wait_ms.report(p50=50, p99=99)
         if self._sight is not None:
-            told["faces_lost"] = self._given - len(self._face_age_ms)
-            told["face_age_ms"] = self._face_age_ms.report(p50=50, p99=99)
-        return told | {name: dict(part.statistics()) for name, part in self._parts().items()}
+            figures["faces_lost"] = self._given - len(self._face_age_ms)
+            figures["face_age_ms"] = self._face_age_ms.report(p50=50, p99=99)
+        return figures | {name: dict(part.statistics()) for name, part in self._parts.items()}
 
     def close(self) -> None:
         """Close all parts. Idempotent."""
-        for part in self._parts().values():
+        for part in self._parts.values():
             part.close()
 
-    def _parts(self) -> dict[str, Voice | Sight]:
-        parts = {"voice": self._voice, "face": self._sight, "agent_audio": self._agent}
-        return {name: part for name, part in parts.items() if part is not None}
-
     def _heard(self, index: int, now_s: float) -> Floats | None:
-        """The voice of a frame, empty where it is given up; None: wait."""
+        """Return the voice of a frame, empty where it is given up; None: wait."""
         waited_s = max(0.0, now_s - (index + 1) / FRAME_HZ)
         heard: Floats | None = _NONE
         if self._voice is not None:
@@ -156,10 +154,10 @@ class PairedSource:
 
 
 class JudgedSource:
-    """`ports.Source` around one that somebody else wrote: what it gives is judged, and put on the grid, as it comes."""
+    """`ports.Source` around one of another package: its frames are judged, and put on the grid, as they come."""
 
     def __init__(self, inner: Source) -> None:
-        """Raises ConfigError for an object that is no source."""
+        """Raise ConfigError for an object that is not a source."""
         if missing := [name for name in _SOURCE if not hasattr(inner, name)]:
             raise ConfigError(f"{type(inner).__name__} lacks {', '.join(missing)}: derive it from sfms_robot.Source")
         self.duration_s = inner.duration_s
@@ -174,7 +172,7 @@ class JudgedSource:
         self._inner.start(origin_s)
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Raises what the inner source raises."""
+        """Return the frames of the inner source; raises what it raises."""
         frames: list[SpeakerFrame] = []
         for given in self._inner.read(now_s):
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
@@ -184,7 +182,7 @@ class JudgedSource:
         return frames
 
     def statistics(self) -> Mapping[str, Any]:
-        """Frames so far, what was left out of them, and what the source tells of itself."""
+        """Return frames so far, what was left out of them, and the inner source's own statistics."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
 
     def moves(self, speed_rad_s: float) -> None:
@@ -198,11 +196,11 @@ _SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "moves"
 
 
 class FrameJudge:
-    """Makes frames of what may be anything: 640 finite samples or none, a finite face or none, on the grid.
+    """Makes frames on the grid of unchecked values: 640 finite samples or none, a finite face or none.
 
     Attributes:
         left_out: of how many frames the voice, the face, the attention, the place or the robot's voice was left out;
-            each is named once in the log.
+            each is logged once.
     """
 
     def __init__(self) -> None:
@@ -210,7 +208,7 @@ class FrameJudge:
         self._attending = AttentionState()
 
     def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
-        """Frame `index`, whatever times its parts tell; its face keeps the time that it was seen, where that can be."""
+        """Return frame `index`, at its own time; its face keeps the time that it was seen, where that can be."""
         time_s = (index + 1) / FRAME_HZ
         audio = self._samples(index, "voice", heard)
         own_audio = None if says is None else self._samples(index, "robot's voice", says)
@@ -261,7 +259,7 @@ class FrameJudge:
         place = np.asarray(place_m, dtype=np.float32)
         if place.shape == (3,) and np.isfinite(place).all():
             return place
-        self._leave_out(index, "place", f"{place.tolist()} is no point")
+        self._leave_out(index, "place", f"{place.tolist()} is not a point")
         return None
 
     def _leave_out(self, index: int, what: str, why: str) -> None:

@@ -1,8 +1,11 @@
-"""The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in a process of its own (`playback_worker`).
+"""The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in another process (`play`).
 
-Who plays it knows when it sounds. What is said at a time leaves the loudspeaker `delay_s` later, by the device's own
-time stamps (`Playout`), and that is what everybody beside it is told: the listener's lips, the state of the run and
-the echo canceller go by what leaves, not by when it was handed over. What did not leave is silence for them too.
+What is said at a time leaves the loudspeaker `delay_s` later, by the device's own time stamps (`Playout`), and so it is
+reported to everything beside it: the listener's lips, the state of the run and the echo canceller follow what leaves,
+not when it was handed over. What did not leave is silence for them too.
+
+A device that takes nothing for `LOST_S` went away: the process ends, and the next one begins with a PortAudio that sees
+the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
@@ -11,28 +14,274 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+from statistics import median
 from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.errors import PortError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
-from sfms_robot.sources.microphone import sound_devices
-from sfms_robot.sources.playback_worker import FLAG, PlaybackOpened, Silence, Speech, play
-from sfms_robot.sources.sound_devices import choose_device
-from sfms_robot.sources.spoken import Spoken
+from sfms_robot.signals.audio import at_positions
+from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, SampleClock, window
+from sfms_robot.sources.push import Spoken
+from sfms_robot.sources.sound_devices import (
+    DeviceStream,
+    SoundDevice,
+    choose_device,
+    device_name,
+    listed_devices,
+    portaudio,
+    started_stream,
+)
 from sfms_robot.sources.worker import SourceWorker
 
 logger = logging.getLogger(__name__)
 
+FLAG: Final = "--play"
+LOST_S: Final = 0.5  # more than a busy computer takes
+STATISTICS_S: Final = 1.0
+TURN_S: Final = 0.02  # between two looks at messages of the parent
+_LATENCY_S: Final = 0.05  # requested from the device: what is on its way out cannot be hushed any more
+_START_LIMIT_S: Final = 1.0
+_MEASURED_BLOCKS: Final = 20  # from which the latency of the device is measured
+_LATEST_S: Final = 2.0  # a time stamp that is further away is of another clock
+_PLAYED: Final = 2  # channels that get the voice; those behind them are of a room
+JUMP_S: Final = 0.02
+_EXACT_S: Final = 0.0005  # where a stretch begins, and in silence
+_UNREPORTED: Final = 64  # silences that wait to be reported
 DEFAULT: Final = "default"  # `--play` without a device
 MARGIN_S: Final = 0.08  # before the device wants what is said: a frame, two processes, a tick that is late
-HUSH_S: Final = 0.04  # until the worker has heard of it
-EARLY_S: Final = 0.02  # of the echo canceller: time stamps are a device's own word, and no echo comes before its sound
+HUSH_S: Final = 0.04  # until the worker knows of it
+EARLY_S: Final = 0.02  # of the echo canceller: a device's time stamps may be off, and no echo comes before its sound
 AHEAD_FRAMES: Final = 10  # that the worker knows beforehand, where they are known: the loop may be held up
 _KEPT: Final = AUDIO_HZ  # samples of what left
 _FADE: Final = np.linspace(1.0, 0.0, AUDIO_HZ // 200, dtype=np.float32)  # 5 ms: a voice that is cut off clicks
 _NONE: Final = np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True)
+class PlaybackOpened:
+    """The first message. `latency_s`: from handing a sample over to its leaving, by the device's own word."""
+
+    device: str
+    rate_hz: float
+    latency_s: float
+
+
+@dataclass(frozen=True)
+class Speech:
+    """From the parent: what leaves from frame `first` of the loop on, (n x 640,); the newest replaces what was sent.
+
+    origin_s: loop time 0 in seconds of `time.monotonic`.
+    """
+
+    origin_s: float
+    first: int
+    samples: Floats
+
+
+@dataclass(frozen=True)
+class Silence:
+    """Samples `first` to `last` - 1 of the loop did not leave."""
+
+    first: int
+    last: int
+
+
+PlaybackMessage = PlaybackOpened | Silence | dict[str, Any]
+
+
+def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
+    """Play what the parent sends; see `sources.worker`. `wanted`: a number, a name, a part of one; "": the default.
+
+    Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing plays, for a device
+    that cannot be opened, and when it goes away.
+    """
+    with open_loudspeaker(wanted) as loudspeaker:
+        playout = loudspeaker.playout
+        told = yield PlaybackOpened(loudspeaker.device.name, loudspeaker.rate_hz, loudspeaker.latency_s())
+        before: Speech | None = None
+        next_statistics_s = 0.0
+        while True:
+            if told is not None and told is not before:
+                if before is None or told.origin_s != before.origin_s:
+                    playout.start(told.origin_s)
+                playout.tell(told.first, told.samples)
+                before = told
+            loudspeaker.check()
+            messages: list[PlaybackMessage | None] = [None]  # and receive what the parent sends
+            while playout.silences:
+                messages.append(playout.silences.popleft())
+            if (now_s := time.monotonic()) >= next_statistics_s:
+                next_statistics_s = now_s + STATISTICS_S
+                messages.append({**playout.statistics(), "latency_ms": round(loudspeaker.latency_s() * 1e3, 1)})
+            for message in messages:
+                told = yield message
+            if told is before:
+                time.sleep(TURN_S)
+
+
+class PlaybackStream(DeviceStream):
+    """A device that plays what a `Playout` gives, by callbacks in a thread of PortAudio's."""
+
+    def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
+        super().__init__(device, rate_hz, channels)
+        self.playout = Playout(rate_hz)
+        self._latencies_s: list[float] = []
+        self._measured = threading.Event()
+        self._called_s = time.monotonic()
+
+    def start(self) -> bool:
+        """Open the stream; return whether it plays. Raises PortAudio's errors."""
+        import sounddevice
+
+        self._open(sounddevice.OutputStream, _LATENCY_S, self._called)
+        if not self._measured.wait(_START_LIMIT_S):
+            self.close()
+            return False
+        return True
+
+    def latency_s(self) -> float:
+        """Return the median of the newest blocks."""
+        return median(self._latencies_s[-_MEASURED_BLOCKS:])
+
+    def check(self) -> None:
+        """Raise PortError when it went away."""
+        if time.monotonic() - self._called_s > LOST_S:
+            raise PortError(f"{self.device.name} takes no more sound")
+
+    def _called(self, out: Floats, n: int, stamp: Any, status: Any) -> None:
+        now_s = self._called_s = time.monotonic()
+        ahead_s = stamp.outputBufferDacTime - stamp.currentTime if stamp.outputBufferDacTime else None
+        latency_s = leaves_after_s(ahead_s, float(self._stream.latency) if self._stream is not None else _LATENCY_S)
+        self._latencies_s = [*self._latencies_s[1 - _MEASURED_BLOCKS :], latency_s]
+        if len(self._latencies_s) == _MEASURED_BLOCKS:
+            self._measured.set()
+        block = self.playout.block(n, now_s + latency_s, bool(status.output_underflow))
+        out[:, :_PLAYED] = np.clip(block, -1.0, 1.0)[:, None]
+        out[:, _PLAYED:] = 0.0
+
+
+def leaves_after_s(ahead_s: float | None, usual_s: float) -> float:
+    """Return how long after the request a block leaves: what the device says, `ahead_s`, where that can be."""
+    return ahead_s if ahead_s is not None and 0.0 <= ahead_s <= _LATEST_S else usual_s
+
+
+def open_loudspeaker(wanted: str) -> PlaybackStream:
+    """Open the device that is wanted, playing silence: at 16 kHz and mono where it takes that, else at its own rate.
+
+    Blocks until its latency is known, some tenths of a second. Raises ConfigError, PortError; see `play`.
+    """
+    sounddevice = portaudio(FLAG)
+    device = choose_device(listed_devices(FLAG, "sink"), wanted, FLAG, plays=True)
+    counts = (1, min(_PLAYED, device.channels), device.channels)
+    stream = started_stream(PlaybackStream, device, counts, sounddevice.check_output_settings, FLAG)
+    if stream is None:
+        raise PortError(f"{FLAG}: {device.name} is open, but takes no sound")
+    return stream
+
+
+# --- from what is said, in frames of the loop, to what the device is handed ---------------------------------------
+#
+# Every sample leaves the device at its time. The grid of the loop is the only clock: sample s, 16 kHz, leaves the
+# loudspeaker s / 16000 after loop time 0, whatever the device's rate and drift. The device says of every block when it
+# leaves; `SampleClock` computes from that the time of every sample, and the next block is the signal at the instants at
+# which it leaves: its rate is the card's true one, and a little more or less where it is ahead or behind, 1 % at most.
+# Nothing is cut out or put in but for these cases:
+#
+# 1. The device had nothing to play for a while. What was due then is not said any more; what follows is on time again.
+# 2. What is handed over is off by more than `JUMP_S`, or at all while nothing sounds: it jumps to its place.
+# 3. A sample arrives too late: the device has had zeros for it.
+#
+# What did not leave is reported (`Silence`), so that the rest of the program does not take it for said.
+
+
+class Playout:
+    """One device. `block` is called in one thread, the rest in another.
+
+    Args:
+        rate_hz: of the device, by its own word.
+
+    Attributes:
+        silences: not reported yet; the oldest is taken from the left.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._origin_s: float | None = None
+        self._said: tuple[int, Floats] = (0, np.zeros(1, np.float32))  # from which sample of the loop on, and what
+        self._clock: SampleClock | None = None  # None: the next block begins a stretch
+        self._skew = 0.0  # of the card, kept over its silences
+        self._count = 0  # samples of the stretch that were handed over
+        self._next = 0.0  # sample of the loop that is handed over next
+        self._settled = False  # it continues where the last block ended
+        self.silences: deque[Silence] = deque(maxlen=_UNREPORTED)
+        self._counts = {"underruns": 0, "jumps": 0}
+        at_positions(np.zeros(1, np.float32), np.zeros(1))  # makes its table now, not in the callback of the device
+
+    def start(self, origin_s: float) -> None:
+        """Set loop time 0 to `origin_s` of `time.monotonic`."""
+        self._origin_s, self._next, self._settled = origin_s, 0.0, False
+
+    def tell(self, first: int, samples: Floats) -> None:
+        """Set what is to leave from frame `first` on, (n x 640,), n > 0, instead of what was set before."""
+        self._said = (first * FRAME_SAMPLES, samples)
+
+    def block(self, n: int, leaves_s: float, dry: bool = False) -> Floats:
+        """Return the next (n,) samples for the device, the first of which leaves at `leaves_s` of `time.monotonic`.
+
+        `leaves_s` may be late by some milliseconds, seldom early. `dry`: the device had nothing to play before it.
+        """
+        clock = self._followed(leaves_s, dry)
+        count, self._count = self._count, self._count + n
+        if self._origin_s is None:
+            return np.zeros(n, np.float32)
+        due = (clock.time_s(count) - self._origin_s) * AUDIO_HZ
+        self._place(due, math.ceil(n * AUDIO_HZ / self._rate_hz))
+        pull = (due - self._next) / (PULL_S * AUDIO_HZ)
+        ratio = AUDIO_HZ / clock.rate_hz * (1.0 + min(max(pull, -LARGEST_PULL), LARGEST_PULL))
+        begins, self._next = self._next, self._next + ratio * n
+        first, said = self._said
+        self._lacks(max(begins, first + len(said)), self._next)
+        return at_positions(said, begins - first + ratio * np.arange(n, dtype=np.float64))
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return how often the device ran dry, jumps, and the drift of the card."""
+        drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
+        return {**self._counts, "drift_ppm": drift_ppm}
+
+    def _followed(self, leaves_s: float, dry: bool) -> SampleClock:
+        """Return the clock, which has seen this block; a new one where the block does not follow the last one."""
+        if self._clock is not None and (dry or self._clock.lateness_s(self._count, leaves_s) > GAP_S):
+            self._counts["underruns"] += self._origin_s is not None
+            self._clock, self._settled = None, False
+        if self._clock is None:
+            self._clock, self._count = SampleClock(self._rate_hz, self._skew), 0
+        self._clock.observe(self._count, leaves_s)
+        self._skew = self._clock.skew
+        return self._clock
+
+    def _place(self, due: float, n: int) -> None:
+        """Move to what is due, where the next sample is not nearly that; `n`: samples of the loop that come."""
+        first, said = self._said
+        begins, ends = (max(0, math.floor(at(self._next, due)) - first) for at in (min, max))
+        sounds = bool(said[begins : ends + n].any())
+        if abs(due - self._next) / AUDIO_HZ > (JUMP_S if self._settled and sounds else _EXACT_S):
+            if sounds:
+                self._counts["jumps"] += self._settled
+                self._lacks(self._next, due)
+            self._next = due
+        self._settled = True
+
+    def _lacks(self, begins: float, ends: float) -> None:
+        if ends > begins and ends > 0.0:
+            self.silences.append(Silence(max(0, math.floor(begins)), math.ceil(ends)))
+
+
+# --- the run's side --------------------------------------------------------------------------------------------------
 
 
 class PlayedVoice:
@@ -47,7 +296,7 @@ class PlayedVoice:
         delay_s: from when something is said until it leaves.
         duration_s: until all that is said has left; None for one without end.
         outlet: the programs behind what is said.
-        early_s: by how much an echo canceller is to be told too early.
+        early_s: by how much an echo canceller gets it too early.
     """
 
     latency_s = 0.0
@@ -58,7 +307,7 @@ class PlayedVoice:
         self.device = ""
         self.delay_s = self._device_s = 0.0
         self._origin_s: float | None = None
-        self._turn = threading.Lock()  # of who tells the loudspeaker what to play
+        self._turn = threading.Lock()  # of sending to the loudspeaker
         self._next = 0  # frame of `spoken` that is taken next
         self._leaves: tuple[int, Floats] = (0, _NONE)  # from which sample of the loop on, and what
         self._speaks = False
@@ -70,7 +319,7 @@ class PlayedVoice:
 
     @property
     def lost(self) -> bool:
-        """It is away, or being looked for: nobody hears the robot."""
+        """The device is away: the robot is not heard."""
         return self._loudspeaker.lost
 
     def start(self, origin_s: float) -> None:
@@ -81,10 +330,11 @@ class PlayedVoice:
             self._tell()
 
     def take(self, index: int) -> Floats | None:
-        """The (640,) that leave in frame `index`, silence where there is none; None until something was said. A frame
-        that is still to come is what will leave, as far as that is known.
+        """Return the (640,) that leave in frame `index`, silence where there is none; None until something was said.
+
+        A frame that is still to come is what will leave, as far as that is known.
         """
-        if self._origin_s is not None and self._turn.acquire(blocking=False):  # else somebody is at it at this moment
+        if self._origin_s is not None and self._turn.acquire(blocking=False):  # else another thread is at it
             try:
                 self._collect()
                 self._tell()
@@ -93,21 +343,16 @@ class PlayedVoice:
         if not self._speaks:
             return None
         begin, leaves = self._leaves
-        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        if not self.lost:
-            first = index * FRAME_SAMPLES - begin
-            part = leaves[max(first, 0) : max(first + FRAME_SAMPLES, 0)]
-            frame[max(-first, 0) : max(-first, 0) + len(part)] = part
-        return frame
+        return window(begin, _NONE if self.lost else leaves, index * FRAME_SAMPLES, FRAME_SAMPLES)
 
     def said(self) -> None:
-        """See `Player`."""
+        """Send what is new; see `Player`."""
         with self._turn:
             if self._origin_s is not None:
                 self._tell()
 
     def hushed(self) -> None:
-        """See `Player`: what is on its way out of the device is the last that is heard."""
+        """Play nothing more than what is on its way out of the device; see `Player`."""
         with self._turn:
             if self._origin_s is None:
                 return
@@ -120,7 +365,7 @@ class PlayedVoice:
             self._tell()
 
     def statistics(self) -> Mapping[str, Any]:
-        """Device, process, delay, times it ran dry, milliseconds of sound that were not heard; and of what is said."""
+        """Return device, process, delay, how often it ran dry, sound not heard [ms]; and those of what is said."""
         return {
             "device": self.device, **self._loudspeaker.statistics(), **self._told,
             "delay_ms": round(self.delay_s * 1e3, 1), "unsaid_ms": round(self._unsaid / AUDIO_HZ * 1e3, 1),
@@ -132,7 +377,7 @@ class PlayedVoice:
         self._spoken.close()
 
     def _tell(self) -> None:
-        """The loudspeaker hears what leaves from now on, with what is known of what comes after it."""
+        """Send the loudspeaker what leaves from now on, with what is known of what comes after it."""
         self._take_in()
         assert self._origin_s is not None
         begin, leaves = self._leaves
@@ -144,7 +389,7 @@ class PlayedVoice:
         self._loudspeaker.tell(Speech(self._origin_s, first, samples[:whole]))
 
     def _take_in(self) -> None:
-        """What was said up to the frame that is in progress will leave as it is; what left long ago is forgotten."""
+        """Fix what was said up to the frame that is in progress: it will leave; forget what left long ago."""
         begin, leaves = self._leaves
         now = self._sample(self._now())
         pieces = []
@@ -157,7 +402,7 @@ class PlayedVoice:
         self._leaves = (begin + old, np.concatenate([leaves[old:], *pieces]))
 
     def _sample(self, time_s: float) -> int:
-        """Of the loop, at `time_s` of `time.monotonic`."""
+        """Return the sample of the loop at `time_s` of `time.monotonic`."""
         assert self._origin_s is not None
         return math.floor((time_s - self._origin_s) * AUDIO_HZ)
 
@@ -188,15 +433,13 @@ def _sounding(piece: Floats | None) -> Floats:
 
 
 def open_playback(argument: str, spoken: Spoken) -> PlayedVoice:
-    """What `spoken` says, played: on a device by number, name or a part of one; "default" is the default.
+    """Play what `spoken` says on a device by number, name or a part of one; "default" is the default.
 
     Blocks until it plays, a second. Raises ConfigError for a device that is not there and without PortAudio, PortError
     where there is no loudspeaker or it cannot be opened.
     """
     wanted = "" if argument == DEFAULT else argument
-    if wanted.isdigit():  # numbers change when something is plugged in, and the worker may be started again then
-        wanted = choose_device(sound_devices("playing"), wanted, FLAG, plays=True).name
-    worker = SourceWorker("loudspeaker", play, wanted)
+    worker = SourceWorker("loudspeaker", play, device_name(wanted, FLAG, plays=True))
     worker.wait()
     played = PlayedVoice(worker, spoken)
     spoken.played_by(played)

@@ -1,7 +1,7 @@
-"""A person who is handed over by calls, from any thread: sound, faces, and what the robot itself says.
+"""A person handed over by calls, from any thread: sound, faces, and what the robot itself says.
 
-A call brings no time of its own, so sound counts from the moment it comes: a piece is played out from then on, and the
-next ones follow it. Where pieces are long, or come unevenly, that leaves room for the longest of them.
+A call brings no time of its own, so sound counts from the moment it arrives: a piece is played out from then on, and
+the next ones follow it. Where pieces are long, or arrive unevenly, that leaves room for the longest of them.
 """
 
 from __future__ import annotations
@@ -11,39 +11,64 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
+from sfms_robot.ports import Voice
 from sfms_robot.signals.audio import Resampler
-from sfms_robot.sources.live_voice import LiveVoice, check_rate
-from sfms_robot.sources.spoken import Player
+from sfms_robot.sources.live_voice import LiveVoice, SourcePart, check_rate, window
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
 HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a listener
 SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
-SIGHTINGS: Final = 64  # kept: more than a camera sees until they are asked for
+SIGHTINGS: Final = 64  # kept: more than a camera sees between two ticks
 _JOIN: Final = round(0.02 * AUDIO_HZ)
 _NONE: Final = np.zeros(0, dtype=np.float32)
+
+
+class Player(Protocol):
+    """Plays what is said. All methods from any thread; none waits for a device.
+
+    Attributes:
+        delay_s: from the time of a sample of what is said until it leaves the loudspeaker.
+    """
+
+    delay_s: float
+
+    def said(self) -> None:
+        """There is something new to say."""
+
+    def hushed(self) -> None:
+        """Nothing more is said from now on."""
+
+
+class Spoken(Voice, Protocol):
+    """A voice that can be played."""
+
+    def upcoming(self, index: int) -> Floats | None:
+        """Return what is known by now of frame `index`, (640,), which was not taken yet: it may change until it is."""
+
+    def played_by(self, player: Player) -> None:
+        """Report every change to `player` at once, from now on."""
 
 
 class PushedVoice(LiveVoice):
     """`ports.Voice` of what a program hears."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        super().__init__()
-        self._now = now
+        super().__init__(now)
         self._pushing = threading.Lock()
         self._longest_s = 0.0  # piece
         self._last_s = 0.0
         self._dropped = 0
 
     def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
-        """The next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
+        """Take the next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
 
         Of one that is longer than a second the newest is kept. `captured_s`: `time.monotonic` of its newest sample;
         None: it counts from this call on. Never blocks. Raises ConfigError for another rate, type or shape.
@@ -53,31 +78,26 @@ class PushedVoice(LiveVoice):
         kept = samples[-int(HEARD_S * rate_hz) :]
         with self._pushing:
             self._dropped += len(samples) - len(kept)
-            if captured_s is not None:
-                self.push(kept, rate_hz, captured_s, self._now())
-                return
             now_s, piece_s = self._now(), len(kept) / rate_hz
-            if now_s - self._last_s > self._longest_s + HEARD_S:
-                self._longest_s = 0.0
-            if piece_s > self._longest_s:
-                self._longest_s = piece_s
-                self.interrupt()
-            self._last_s = now_s
-            self.push(kept, rate_hz, now_s + self._longest_s, now_s)
+            if captured_s is None:
+                if now_s - self._last_s > self._longest_s + HEARD_S:
+                    self._longest_s = 0.0
+                if piece_s > self._longest_s:
+                    self._longest_s = piece_s
+                    self.interrupt()
+                self._last_s = now_s
+                captured_s = now_s + self._longest_s
+            self.push(kept, rate_hz, captured_s, now_s)
 
     def statistics(self) -> Mapping[str, Any]:
         return {**super().statistics(), "dropped": self._dropped, "delay_ms": round(self._longest_s * 1e3, 1)}
 
 
-class PushedSight:
+class PushedSight(SourcePart):
     """`ports.Sight` of what a program sees."""
 
-    lost = False  # what is not pushed is not there
-    duration_s: float | None = None
-    latency_s = 0.0
-
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self._now = now
+        super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s = 0.0
         self._seen: deque[tuple[float, Sighting | None]] = deque(maxlen=SIGHTINGS)  # seconds of `now`
@@ -88,7 +108,7 @@ class PushedSight:
         seen_s: float | None = None,
         attention: float | None = None,
     ) -> None:
-        """The person's face, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
+        """Take the person's face, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
 
         Args:
             seen_s: `time.monotonic` when it was seen, no earlier than the last one; None: now.
@@ -109,35 +129,25 @@ class PushedSight:
             self._origin_s = origin_s
 
     def at(self, time_s: float) -> Sighting | None:
-        """See `ports.Sight`; None also from the moment on in which the face was lost."""
+        """Return as `ports.Sight`; None also from the moment on in which the face was lost."""
         with self._lock:
             for seen_s, sighting in reversed(self._seen):
                 if seen_s - self._origin_s <= time_s:
                     return sighting and replace(sighting, face=replace(sighting.face, time_s=seen_s - self._origin_s))
         return None
 
-    def statistics(self) -> Mapping[str, Any]:
-        return {}
 
-    def close(self) -> None:
-        """Nothing is held open."""
-
-
-class PushedSpeech:
+class PushedSpeech(SourcePart):
     """`ports.Voice` of what the robot says, each sample at the time at which it is played.
 
-    Speech is synthesized faster than it is spoken: two minutes may wait. Nothing until it has said something, silence
-    after that. All methods may be called from any thread; `take` waits for none of them.
+    Speech is synthesized faster than it is spoken: two minutes may wait. `take` returns None until something was said,
+    silence after that. All methods may be called from any thread; `take` waits for none of them.
     """
 
-    lost = False  # what is not pushed is not there
-    duration_s: float | None = None
-    latency_s = 0.0
-
     def __init__(self, now: Callable[[], float] = time.monotonic, longest_s: float = SAID_S) -> None:
-        self._now = now
+        super().__init__(now)
         self._longest = int(longest_s * AUDIO_HZ)
-        self._saying = threading.Lock()  # of who says: the stretch that is resampled
+        self._saying = threading.Lock()  # of `say` and `hush`: the stretch that is resampled
         self._rate_hz = float(AUDIO_HZ)
         self._resampler: Resampler | None = None  # None: the next piece begins a stretch
         self._given = 0  # samples of the stretch, at its rate
@@ -152,7 +162,7 @@ class PushedSpeech:
         self._player: Player | None = None
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
-        """What it says, as `PushedVoice.hear`.
+        """Take what it says, as `PushedVoice.hear`.
 
         Args:
             at_s: `time.monotonic` when its first sample is played; what was to be played from then on is replaced.
@@ -163,7 +173,7 @@ class PushedSpeech:
         """
         check_rate(rate_hz)
         if at_s is not None and not np.isfinite(at_s):
-            raise ConfigError(f"at_s = {at_s!r} is no time")
+            raise ConfigError(f"at_s = {at_s!r}: expected a finite time")
         samples = as_floats(pcm)
         finite = np.isfinite(samples)
         if at_s is not None and self._player is not None:
@@ -183,7 +193,7 @@ class PushedSpeech:
             self._player.said()
 
     def hush(self) -> None:
-        """What is still to be played from now on will not be."""
+        """Drop what is still to be played from now on."""
         with self._saying:
             self._resampler, self._began, self._given = None, _place(self._now()), 0
             self._cut(self._began)
@@ -191,21 +201,20 @@ class PushedSpeech:
             self._player.hushed()
 
     def played_by(self, player: Player) -> None:
-        """What is said without a time leaves as soon as `player` can; `at_s` is when it leaves the loudspeaker."""
+        """Let `player` play it: without a time as soon as it can; `at_s` is when it leaves the loudspeaker."""
         self._player = player
 
     def start(self, origin_s: float) -> None:
-        """Loop time 0 is `origin_s` of `time.monotonic`."""
         with self._lock:
             self._origin = _place(origin_s)
 
     def take(self, index: int) -> Floats | None:
-        """The (640,) that are played in frame `index`, silence where there are none."""
+        """Return the (640,) that are played in frame `index`, silence where there are none."""
         begin = self._origin + index * FRAME_SAMPLES
         if self._saying.acquire(blocking=False):  # else more is being said at this very moment
             try:
                 if self._resampler is not None and self._place < min(begin + FRAME_SAMPLES, self._end):
-                    self._finish()  # who plays it has no more either
+                    self._finish()  # nothing more will come in time
             finally:
                 self._saying.release()
         with self._lock:
@@ -217,17 +226,14 @@ class PushedSpeech:
             return self._frame(begin)
 
     def upcoming(self, index: int) -> Floats | None:
-        """See `Spoken`."""
+        """Return as `Spoken`."""
         with self._lock:
             return self._frame(self._origin + index * FRAME_SAMPLES) if self._speaks else None
 
     def statistics(self) -> Mapping[str, Any]:
-        """Samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
+        """Return samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
         with self._lock:
             return dict(self._counts)
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     @property
     def _end(self) -> int:
@@ -235,14 +241,12 @@ class PushedSpeech:
         return self._began + round(self._given * AUDIO_HZ / self._rate_hz)
 
     def _frame(self, begin: int) -> Floats:
-        """The (640,) from place `begin` on."""
-        frame = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+        """Return the (640,) from place `begin` on."""
+        frame = window(0, _NONE, begin, FRAME_SAMPLES)
         for place, piece in self._pieces:
             if place >= begin + FRAME_SAMPLES:
                 break
-            first, last = max(place, begin), min(place + len(piece), begin + FRAME_SAMPLES)
-            if first < last:
-                frame[first - begin : last - begin] = piece[first - place : last - place]
+            frame += window(place, piece, begin, FRAME_SAMPLES)
         return frame
 
     def _begin(self, at: int, rate_hz: float) -> None:
@@ -252,14 +256,14 @@ class PushedSpeech:
         self._began = self._place = at
 
     def _finish(self) -> None:
-        """What was said so far is a whole: let out what the resampler still holds."""
+        """End the stretch: let out what the resampler still holds."""
         if self._resampler is not None:
             end = self._end
             self._append(self._resampler.push(_NONE, last=True))
             self._resampler, self._began, self._given = None, end, 0
 
     def _cut(self, at: int) -> None:
-        """Nothing of what was said before is played from `at` on."""
+        """Drop what was to be played from `at` on."""
         with self._lock:
             while self._pieces and self._pieces[-1][0] + len(self._pieces[-1][1]) > at:
                 place, piece = self._pieces.pop()
@@ -282,7 +286,7 @@ def _place(time_s: float) -> int:
 
 
 def as_floats(pcm: Pcm) -> NDArray[np.float32]:
-    """(n,) or (n, channels), full scale 1. Raises ConfigError for another type or shape."""
+    """Return sound as (n,) or (n, channels) of full scale 1. Raises ConfigError for another type or shape."""
     if isinstance(pcm, bytes | bytearray | memoryview):
         if len(pcm) % 2:
             raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples")

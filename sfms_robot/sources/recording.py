@@ -1,28 +1,28 @@
 """A recorded person: a sound file as a voice, a face track as a sight.
 
-A run lasts as long as what is recorded; of one that is asked to last longer the recording starts again after one
-second of silence, the face with its voice.
+A run lasts as long as its recording; in a longer one the recording starts again after one second of silence, the face
+with its voice.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, resample
-from sfms_robot.sources.spoken import Player
+from sfms_robot.sources.live_voice import SourcePart, window
+from sfms_robot.sources.push import Player
 
 _PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
 _EPS_FRAMES = 1e-6
+_NONE = np.zeros(0, dtype=np.float32)
 
 
-class RecordedVoice:
-    """`ports.Voice` of (n,) mono 16 kHz, or of a file that is read as the run goes. Silence follows its end.
+class RecordedVoice(SourcePart):
+    """`ports.Voice` of (n,) mono 16 kHz, or of a file that is read during the run. Silence follows its end.
 
     loop: start again instead, after a pause.
 
@@ -30,11 +30,8 @@ class RecordedVoice:
         frames: how many there are; the last is filled up with silence.
     """
 
-    latency_s = 0.0
-
-    lost = False
-
     def __init__(self, audio: Floats | AudioFile, loop: bool = False) -> None:
+        super().__init__()
         self._audio = audio
         self._loop = loop
         self._next = 0
@@ -42,38 +39,29 @@ class RecordedVoice:
         self.frames = math.ceil((audio.length if isinstance(audio, AudioFile) else len(audio)) / FRAME_SAMPLES)
         self.duration_s: float | None = self.frames * FRAME_S
 
-    def start(self, origin_s: float) -> None:
-        """A recording begins with the run."""
-
     def take(self, index: int) -> Floats:
-        """The samples (640,) of any frame; in order is fastest."""
+        """Return the samples (640,) of any frame; in order is fastest."""
         known = self._ahead.pop(index, None)
         return self._frame(index) if known is None else known
 
     def upcoming(self, index: int) -> Floats:
-        """See `Spoken`; kept until it is taken."""
+        """Return as `Spoken`; kept until it is taken."""
         if index not in self._ahead:
             self._ahead[index] = self._frame(index)
         return self._ahead[index]
 
     def played_by(self, player: Player) -> None:
-        """What is recorded does not change."""
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {}
+        """Do nothing: a recording does not change."""
 
     def close(self) -> None:
-        """Give the file back. Idempotent."""
+        """Close the file. Idempotent."""
         if isinstance(self._audio, AudioFile):
             self._audio.close()
 
     def _frame(self, index: int) -> Floats:
         frame = index % (self.frames + _PAUSE_FRAMES) if self._loop else index
-        out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-        if frame < self.frames:
-            part = self._part(frame)
-            out[: len(part)] = part
-        return out
+        part = self._part(frame) if frame < self.frames else _NONE
+        return window(0, part, 0, FRAME_SAMPLES)
 
     def _part(self, frame: int) -> Floats:
         if not isinstance(self._audio, AudioFile):
@@ -86,37 +74,25 @@ class RecordedVoice:
         return self._audio.read(FRAME_SAMPLES)
 
 
-class RecordedSight:
-    """`ports.Sight` of a face track, resampled to the ends of the frames. Nobody is seen where the track says so, and
-    after its end.
+class RecordedSight(SourcePart):
+    """`ports.Sight` of a face track, resampled to the ends of the frames. No face where the track has
+    none, and after its end.
 
     Args:
         frames: of the voice it belongs to, with which it starts again; None: it is on its own.
     """
 
-    latency_s = 0.0
-
-    lost = False
-
     def __init__(self, track: Track, loop: bool = False, frames: int | None = None) -> None:
+        super().__init__()
         self._faces = resample(track, FRAME_HZ, start_s=FRAME_S).motion
         self._loop = loop
         self._frames = len(self._faces) if frames is None else frames
         self.duration_s: float | None = len(self._faces) * FRAME_S
 
-    def start(self, origin_s: float) -> None:
-        """A recording begins with the run."""
-
     def at(self, time_s: float) -> Sighting | None:
-        """The face of the frame that ends at `time_s`, or ended last before it."""
+        """Return the face of the frame that ends at `time_s`, or ended last before it."""
         index = math.floor(time_s * FRAME_HZ + _EPS_FRAMES) - 1
         place = index % (self._frames + _PAUSE_FRAMES) if self._loop else index
         if not 0 <= place < len(self._faces) or not np.isfinite(self._faces[place]).all():
             return None
         return Sighting(FaceFrame.of((index + 1) / FRAME_HZ, self._faces[place]))
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {}
-
-    def close(self) -> None:
-        """Nothing is held open."""

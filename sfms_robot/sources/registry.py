@@ -1,8 +1,8 @@
-"""What `--audio`, `--face` and `--agent-audio` may say: a kind by name with its argument, a file, a shipped speaker.
+"""Values of `--audio`, `--face` and `--agent-audio`: a kind by name with its argument, a file, a shipped speaker.
 
-A kind of somebody else's is an entry point of the group `sfms_robot.sources`: a callable that takes what stands behind
-the colon (NAME:ARGUMENT) and returns a `ports.Voice`, a `ports.Sight`, or, for `--audio`, a whole `ports.Source`. Kinds
-are imported when they are opened, so that a name that is wrong is found at once. Any voice goes with any face.
+A kind of another package is an entry point of the group `sfms_robot.sources`: a callable that takes the text behind the
+colon (NAME:ARGUMENT) and returns a `ports.Voice`, a `ports.Sight`, or, for `--audio`, a whole `ports.Source`. Kinds are
+imported when they are opened, so that a wrong name is found at once. Any voice goes with any face.
 """
 
 from __future__ import annotations
@@ -14,42 +14,41 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.data import speaker_names
+from sfms_robot.data import SPEAKER_VOICE, data_dir, speaker_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.plugins import plug_in, plugins
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER, own_face, voice_file
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Source, Voice
-    from sfms_robot.sources.browser import Visitor
-    from sfms_robot.sources.spoken import Spoken
+    from sfms_robot.sources.net_person import PageVisitor
+    from sfms_robot.sources.push import Spoken
 
 GROUP: Final = "sfms_robot.sources"
+DEFAULT_SPEAKER: Final = "facegood_1114_3_16"
 BROWSER: Final = "browser"  # the kind of a person in front of the page
-_HERE: Final = "sfms_robot.sources"
-_METHODS: Final = {"voice": "take", "face": "at", "source": "read"}  # by which each is told from the others
+_METHODS: Final = {"voice": "take", "face": "at", "source": "read"}  # the method that only this one has
 
 Kinds = Mapping[str, EntryPoint]
 
 
 def _ours(**kinds: str) -> Kinds:
     named = {name.replace("_", "-"): place for name, place in kinds.items()}
-    return {name: EntryPoint(name, f"{_HERE}.{place}", GROUP) for name, place in named.items()}
+    return {name: EntryPoint(name, f"sfms_robot.sources.{place}", GROUP) for name, place in named.items()}
 
 
 VOICES: Final = _ours(
-    mic="microphone:open_microphone", push="net_person:open_net_voice", browser="browser:open_browser_voice"
+    mic="microphone:open_microphone", push="net_person:open_net_voice", browser="net_person:open_browser_voice"
 )
 SIGHTS: Final = _ours(
     live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
-    push="net_person:open_net_sight", browser="browser:open_browser_sight",
+    push="net_person:open_net_sight", browser="net_person:open_browser_sight",
 )  # fmt: skip
 AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="net_person:open_net_speech")
 
 
 @dataclass(frozen=True)
 class SourceKinds:
-    """Every kind of each flag by name, not yet imported; ours go before those of other packages."""
+    """Every kind of each flag by name, not yet imported; shipped kinds go before those of other packages."""
 
     voices: Kinds
     sights: Kinds
@@ -57,15 +56,44 @@ class SourceKinds:
 
 
 def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
-    """Return every kind of source; `others`: those of other packages, None for what is installed."""
+    """Return every kind of source; `others`: those of other packages, None for the installed ones."""
     found = plugins(GROUP) if others is None else {each.name: each for each in others}
     return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
 
 
 def split_kind(value: str) -> tuple[str, str]:
-    """What a flag says -> the kind's name and its argument: `live-link,flip=yaw` has one without a colon."""
+    """Return the kind's name and its argument of the value of a flag: `live-link,flip=yaw` has one without a colon."""
     end = min((value.index(mark) for mark in ":," if mark in value), default=len(value))
     return value[:end], value[end:].removeprefix(":")
+
+
+@dataclass(frozen=True)
+class ShippedSpeaker:
+    """A recorded person that ships with the package: `sim/speakers/NAME/`."""
+
+    name: str
+    audio: Path
+    face: Path | None
+
+
+def shipped_speaker(name: str) -> ShippedSpeaker:
+    """Return a shipped speaker by name. Raises ConfigError with the choices."""
+    if name not in speaker_names():
+        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speaker_names())})")
+    folder = data_dir("sim") / "speakers" / name
+    face = folder / "face.csv.gz"
+    return ShippedSpeaker(name, folder / SPEAKER_VOICE, face if face.is_file() else None)
+
+
+def voice_file(name: str) -> Path | None:
+    """Return a sound file by path, or a speaker's by name; None when there is neither."""
+    speaker = _speaker(name)
+    return _existing(name) if speaker is None else speaker.audio
+
+
+def _speaker(name: str) -> ShippedSpeaker | None:
+    """Return a shipped speaker, unless a file has that name."""
+    return shipped_speaker(name) if name in speaker_names() and not Path(name).is_file() else None
 
 
 def check_source(
@@ -75,8 +103,9 @@ def check_source(
     kinds: SourceKinds | None = None,
     play: str | None = None,
 ) -> None:
-    """Are there such kinds, or such files, and something to play? Imports and opens nothing. Raises ConfigError with
-    the choices.
+    """Check that there are such kinds, or such files, and something to play. Imports and opens nothing.
+
+    Raises ConfigError with the choices.
     """
     known = source_kinds() if kinds is None else kinds
     speakers = speaker_names()
@@ -97,14 +126,18 @@ def open_source(
     kinds: SourceKinds | None = None,
     agent: Spoken | None = None,
     play: str | None = None,
-    visitor: Visitor | None = None,
+    visitor: PageVisitor | None = None,
 ) -> Source:
-    """A person by what a run is told of them.
+    """Open a person by the flags of a run.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none. `loop`: recordings start again when they end before `duration_s` does. `agent` is what the robot
-    says, instead of `agent_audio`. `play`: the device that plays it; None: somebody else does. `visitor`: who is in
-    front of the page, where one is served.
+    own, else none.
+
+    Args:
+        loop: recordings start again when they end before `duration_s` does.
+        agent: what the robot says, instead of `agent_audio`.
+        play: the device that plays it; None: it is played elsewhere.
+        visitor: the person in front of the page, where one is served.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
@@ -118,7 +151,10 @@ def open_source(
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
         own: Any = agent
         if play is not None:
-            own = _played(play, agent or _agent(agent_audio, known, failed), failed)
+            from sfms_robot.sources.playback import open_playback
+
+            own = open_playback(play, agent or _agent(agent_audio, known, failed))
+            failed.callback(own.close)
         if split_kind(audio)[0] == "mic" and (own is not None or agent_audio != "none"):
             voice, own = _conversation(audio, own or agent_audio, known, failed)
         else:
@@ -132,8 +168,7 @@ def open_source(
         else:
             sight = _opened("--face", face, known.sights, ("face",), failed, visitor)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
-            own = own or _agent(agent_audio, known, failed)
-            source = PairedSource(voice, sight, own, duration_s)
+            source = PairedSource(voice, sight, own or _agent(agent_audio, known, failed), duration_s)
         failed.pop_all()
     return source
 
@@ -149,9 +184,9 @@ def _existing(name: str) -> Path | None:
 
 
 def _opened(
-    flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack, visitor: Visitor | None = None
+    flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack, visitor: PageVisitor | None = None
 ) -> Any:
-    """What a kind opens; None where `value` names none."""
+    """Open a kind; None where `value` names none."""
     name, argument = split_kind(value)
     if name not in kinds:
         return None
@@ -164,7 +199,7 @@ def _opened(
 
 
 def _conversation(audio: str, agent: Voice | str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
-    """A microphone, and what the robot says: the one has to know of the other, whose echo it hears."""
+    """Open a microphone, and what the robot says: its echo is taken out of what the microphone hears."""
     from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
 
     device = split_kind(audio)[1]
@@ -182,14 +217,6 @@ def _agent(value: str, known: SourceKinds, failed: ExitStack) -> Any:
     return agent or _recorded_voice(value, False)
 
 
-def _played(device: str, spoken: Spoken, failed: ExitStack) -> Voice:
-    from sfms_robot.sources.playback import open_playback
-
-    played = open_playback(device, spoken)
-    failed.callback(played.close)
-    return played
-
-
 def _recorded_voice(name: str, loop: bool) -> Any:
     from sfms_robot.signals.audio import AudioFile
     from sfms_robot.sources.recording import RecordedVoice
@@ -202,5 +229,6 @@ def _recorded_sight(face: str, audio: str, loop: bool, frames: int | None) -> An
     from sfms_robot.signals.tracks import read_track
     from sfms_robot.sources.recording import RecordedSight
 
-    file = own_face(audio) if face == "auto" else _existing(face)
+    speaker = _speaker(audio)
+    file = (None if speaker is None else speaker.face) if face == "auto" else _existing(face)
     return None if face == "none" or file is None else RecordedSight(read_track(file), loop, frames)

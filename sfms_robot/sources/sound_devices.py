@@ -7,27 +7,39 @@ environment variables PULSE_SOURCE and PULSE_SINK at that moment; monitors, what
 from __future__ import annotations
 
 import os
+import queue
 import re
 import subprocess
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Final, Literal, Self, TypeVar
 
+import numpy as np
+
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.frames import AUDIO_HZ
+from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.worker import SourceWorker
 
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
 _PACTL_LIMIT_S: Final = 5.0
 BLOCK_S: Final = 0.01
+LOST_S: Final = 0.2  # a microphone that gives nothing for so long went away
+_LATENCY_S: Final = 0.06  # requested from a microphone; with less, a sound server's stream seldom starts
+_START_LIMIT_S: Final = 0.3
+_OLDEST_S: Final = 1.0  # a time stamp that is further away is of another clock
+_DENORMAL: Final = np.finfo(np.float32).tiny  # what is smaller costs four times the processor
+_MIXED: Final = 2  # channels; of more the first is taken, where arrays put what they made of the others
 _STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
 _VARIABLES: Final = {"source": "PULSE_SOURCE", "sink": "PULSE_SINK"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SoundDevice:
     """A device that records, or one that plays.
 
@@ -49,7 +61,7 @@ class SoundDevice:
 
     @property
     def label(self) -> str:
-        """What a person may type for it, number first where it has one of its own."""
+        """Text by which a person names it, number first where it has one."""
         return self.name if self.server else f"{self.number} {self.name}"
 
     @property
@@ -59,7 +71,7 @@ class SoundDevice:
 
     @contextmanager
     def selected(self) -> Iterator[None]:
-        """What is opened in here by `number` is this device. Not for several threads."""
+        """Let what is opened inside by `number` be this device. Not for several threads."""
         if self.server is None:
             yield
             return
@@ -113,6 +125,64 @@ class DeviceStream:
             self._stream.start()
 
 
+class Capture(DeviceStream):
+    """A device that records into a queue, by callbacks in a thread of PortAudio's.
+
+    Attributes:
+        overflows: times that PortAudio lost samples.
+    """
+
+    def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
+        super().__init__(device, rate_hz, channels)
+        self.overflows = 0
+        self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
+        self._heard_s = time.monotonic()
+
+    def start(self) -> bool:
+        """Open the stream; return whether it records. Raises PortAudio's errors."""
+        import sounddevice
+
+        self._open(sounddevice.InputStream, _LATENCY_S, self._called)
+        try:
+            self._pieces.get(timeout=_START_LIMIT_S)
+        except queue.Empty:
+            self.close()
+            return False
+        return True
+
+    def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
+        """Push all that was recorded to `voice`; wait so long for something. Raises PortError when it went away."""
+        try:
+            piece = self._pieces.get(timeout=wait_s) if wait_s else self._pieces.get_nowait()
+            while True:
+                samples, captured_s, overflow = piece
+                if overflow:
+                    self.overflows += 1
+                    voice.interrupt()
+                voice.push(samples, self.rate_hz, captured_s)
+                piece = self._pieces.get_nowait()
+        except queue.Empty:
+            if time.monotonic() - self._heard_s > LOST_S:
+                raise PortError(f"{self.device.name} gives no more sound") from None
+
+    def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
+        now_s = self._heard_s = time.monotonic()
+        adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
+        used = samples[:, :1] if self.channels > _MIXED else samples
+        piece = np.where(np.abs(used) < _DENORMAL, np.float32(0), used)  # a copy: PortAudio writes there again
+        self._pieces.put((piece, captured_s(now_s, adc_age_s, n / self.rate_hz), bool(status.input_overflow)))
+
+
+def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> float:
+    """Return when the newest sample of a piece came, `time.monotonic`, never after `now_s`.
+
+    `first_age_s`: how old the device says that its first one is; None, or what cannot be: it came just now.
+    """
+    if first_age_s is None or not -length_s <= first_age_s <= _OLDEST_S:
+        return now_s
+    return min(now_s, now_s - first_age_s + length_s)
+
+
 Stream = TypeVar("Stream", bound=DeviceStream)
 
 
@@ -137,7 +207,7 @@ def started_stream(
 
 
 def portaudio(flag: str) -> ModuleType:
-    """The module sounddevice, its library loaded. Raises ConfigError where there is none; `flag` is who needs it."""
+    """Return the module sounddevice, its library loaded. Raises ConfigError without it, for the option `flag`."""
     try:
         import sounddevice
     except OSError as error:
@@ -147,7 +217,7 @@ def portaudio(flag: str) -> ModuleType:
 
 
 def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays: bool = False) -> SoundDevice:
-    """The device with this number, this name, or the only one with this in its name; "" is the default one.
+    """Return the device with this number, this name, or the only one with this in its name; "" is the default one.
 
     Raises PortError where there are none, ConfigError for a name that is not there or fits several, with the choices.
     """
@@ -164,7 +234,7 @@ def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays:
 
 
 def accepted_format(device: SoundDevice, channels: Sequence[int], check: Callable[..., None]) -> tuple[float, int]:
-    """Rate and channels that it takes: 16 kHz first, `channels` in their order; the last of all is taken unasked.
+    """Return rate and channels that it takes: 16 kHz first, `channels` in their order; the last of all unchecked.
 
     `check`: sounddevice's, of what is recorded or of what is played.
     """
@@ -182,16 +252,33 @@ def accepted_format(device: SoundDevice, channels: Sequence[int], check: Callabl
 
 
 def why_not_opened(error: Exception) -> str:
-    """PortAudio's own word, and what it mostly means."""
+    """Return PortAudio's message, or what it mostly means."""
     text = str(error.args[0] if error.args else error).rpartition(": ")[2].partition(" [")[0]
     busy = "unavailable" in text.casefold() or "busy" in text.casefold()
     return "another program holds it, or it was unplugged" if busy else text
 
 
 def tell_devices(what: Literal["recording", "playing"]) -> Generator[list[SoundDevice], Any, None]:
-    """For a `SourceWorker`: PortAudio, which prints what it likes, sees the devices of this moment."""
+    """Yield the devices of this moment; for a `SourceWorker`, since PortAudio prints what it likes."""
     records = what == "recording"
     yield listed_devices("a microphone" if records else "a loudspeaker", "source" if records else "sink")
+
+
+def sound_devices(what: Literal["recording", "playing"] = "recording") -> list[SoundDevice]:
+    """Return devices that record, or those that play. Blocks for a second. Raises ConfigError without PortAudio."""
+    worker = SourceWorker("sound devices", tell_devices, what)
+    try:
+        worker.wait()
+        return list(worker.messages(time.monotonic())[0])
+    finally:
+        worker.close()
+
+
+def device_name(wanted: str, flag: str, plays: bool = False) -> str:
+    """Return the name of a device that is given by number: numbers change when something is plugged in."""
+    if not wanted.isdigit():
+        return wanted
+    return choose_device(sound_devices("playing" if plays else "recording"), wanted, flag, plays).name
 
 
 def listed_devices(flag: str, of_server: Literal["source", "sink"]) -> list[SoundDevice]:
@@ -203,8 +290,10 @@ def listed_devices(flag: str, of_server: Literal["source", "sink"]) -> list[Soun
     records = of_server == "source"
     channels, default = "max_input_channels" if records else "max_output_channels", sounddevice.default.device
     found = [
-        SoundDevice(each["name"], each["index"], each[channels], each["default_samplerate"],
-                    each["index"] == default[0 if records else 1])
+        SoundDevice(
+            name=each["name"], number=each["index"], channels=each[channels], rate_hz=each["default_samplerate"],
+            default=each["index"] == default[0 if records else 1],
+        )
         for each in sounddevice.query_devices()
         if each[channels] > 0
     ]  # fmt: skip
@@ -212,6 +301,21 @@ def listed_devices(flag: str, of_server: Literal["source", "sink"]) -> list[Soun
     if server is not None:
         found += [replace(server, name=name, default=False, server=of_server) for name in _names(f"{of_server}s")]
     return found
+
+
+def open_capture(wanted: str, flag: str) -> Capture:
+    """Open the device that is wanted, recording: at 16 kHz and mono where it takes that, else at its own rate.
+
+    Blocks until sound comes, some tenths of a second. Raises ConfigError, PortError.
+    """
+    sounddevice = portaudio(flag)
+    devices = listed_devices(flag, "source")
+    device = choose_device(devices, wanted, flag)
+    capture = started_stream(Capture, device, (1, device.channels), sounddevice.check_input_settings, flag)
+    if capture is None:
+        others = ", ".join(each.label for each in devices if each is not device) or "there is no other"
+        raise PortError(f"{flag}: {device.name} is open, but gives no sound ({others})")
+    return capture
 
 
 def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
@@ -231,7 +335,7 @@ def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
 
 
 def _names(of_server: str) -> list[str]:
-    """Of its sources, or its sinks; none where the server's own tool is not installed, or does not answer."""
+    """Return names of its sources, or its sinks; none where its own tool is not installed, or does not answer."""
     words = ["pactl", "list", "short", of_server]
     try:
         told = subprocess.run(words, capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True)

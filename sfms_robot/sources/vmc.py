@@ -28,7 +28,7 @@ from pythonosc.parsing import osc_types
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Floats
-from sfms_robot.sources.udp_sight import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
+from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
 
 PORT: Final = 39539  # what the protocol gives those who receive
 
@@ -84,7 +84,7 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
 
 def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
-    """The messages of a packet, one or a bundle of them, in order. Raises PacketError where it is no OSC."""
+    """Yield the messages of a packet, one or a bundle of them, in order. Raises PacketError for other bytes."""
     if not data.startswith(_BUNDLE):
         if not data.startswith(b"/"):
             raise PacketError("no OSC packet")
@@ -109,7 +109,7 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
 
 
 def parse_message(element: bytes) -> tuple[str, list[Any]]:
-    """Address and arguments of one message of numbers and texts. Raises PacketError for other types."""
+    """Return address and arguments of one message of numbers and texts. Raises PacketError for other types."""
     if len(element) > _LONGEST_ODD:
         raise PacketError("an OSC message that is too long")
     values: list[Any] = []
@@ -143,7 +143,7 @@ _READ: Final[Mapping[str, Any]] = {
 
 
 def angles_of_unity(quaternion: Quaternion) -> tuple[float, float, float]:
-    """A rotation in Unity's axes -> roll, pitch, yaw in ours [rad], R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return roll, pitch, yaw in our axes [rad], R = Rz(yaw) Ry(pitch) Rx(roll), of a rotation in Unity's axes."""
     x, y, z, w = quaternion
     x, y, z = -z, x, -y
     sine = max(-1.0, min(1.0, 2.0 * (w * y - z * x)))
@@ -197,7 +197,7 @@ class VmcDecoder:
         return self._motion() if changed and self._tracking else None
 
     def statistics(self) -> Mapping[str, Any]:
-        """Messages; those of other types than the protocol has; times tracking was lost; names that say nothing."""
+        """Return counts of messages, those of unexpected types, losses of tracking, and unknown names."""
         return {**self._counts, "unknown_names": len(self._unknown)}
 
     def _take(self, element: bytes) -> None:
@@ -214,7 +214,7 @@ class VmcDecoder:
             self._take_unusual(element)
 
     def _take_unusual(self, element: bytes) -> None:
-        """A message of other types than most senders write, or one that is not there in every frame."""
+        """Take a message of other types than most senders write, or one that is not in every frame."""
         try:
             address, values = parse_message(element)
         except PacketError:
@@ -285,4 +285,4 @@ def _hint(host: str, port: int, wider: str) -> str:
     """Return what to do so that packets of avatar software arrive."""
     own = addresses_of_this_machine() if host in ANY else [host]
     target = f"let the avatar software send VMC to {' or '.join(own) or 'this machine'}, port {port}"
-    return f"{target}; {wider} also hears other machines" if wider else target
+    return f"{target}; {wider} also takes packets of other machines" if wider else target

@@ -1,23 +1,319 @@
 """A person's face from a webcam: `--face webcam[:N|FILE][,flip=...]`.
 
-Camera and MediaPipe are in a process of their own (`webcam_worker`), which is started again when the camera goes away.
-Without a face in the picture nothing new is told: the last one ages, and whoever asks judges how old is too old.
+Camera and MediaPipe are in a process of their own (`watch`), which is started again when the camera goes away. No
+picture is kept, none leaves that process. MediaPipe (extra `webcam`) finds up to three faces in each picture; the
+person among them is chosen here (`choose`). A picture's time is when the driver says that it was taken, where it does
+so on this computer's clock, else when it arrived. A recorded video is played at its own pace from loop time 0 on; what
+cannot be kept up with is left out. Without a face in the picture nothing new is reported: the last one ages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib.util
+import math
+import os
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Sighting
+import numpy as np
+from numpy.typing import NDArray
+
+from sfms_robot.data import data_dir
+from sfms_robot.endpoint import whole_number
+from sfms_robot.errors import ConfigError, PortError, optional
+from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
 from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
-from sfms_robot.sources.webcam_worker import Opened, Seen, watch
 from sfms_robot.sources.worker import SourceWorker
 
 _NICE: Final = 5  # below the servo loop
+MOST_FACES: Final = 3
+_PICTURE_PX: Final = (640, 480)  # asked of a camera; more shows nothing new of a face at arm's length
+_DARK: Final = 16  # mean of 0..255: a lens that is covered, a room without light
+_OLDEST_S: Final = 0.5  # a driver's time stamp that is further away is of another clock
+_ALIVE_S: Final = 0.02
+# Between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133, 362 and
+# 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
+_EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
+
+NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
+TAKE_OVER_S: Final = 1.0  # for so long, without a break
+GONE_S: Final = 0.5  # one that has not been seen for so long is gone
+STEP: Final = 0.25  # of its distance: no further away from where it was can a face be the same one
+
+Picture = NDArray[np.uint8]  # (H, W, 3) red, green, blue
+
+
+@dataclass(frozen=True)
+class SeenFace:
+    """One face in one picture.
+
+    Attributes:
+        motion: (58,) pose in the person's axes (x forward, from the lens on, so negative), blendshapes.
+        place_m: (3,) between the eyes, from the camera: x out of its lens, y to its left, z up.
+    """
+
+    motion: Floats
+    place_m: Floats
+
+
+@dataclass(frozen=True)
+class WebcamOpened:
+    """The first message. `duration_s`: of a recorded video; None for a camera."""
+
+    duration_s: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenPicture:
+    """One picture.
+
+    Attributes:
+        taken_s, known_s: when it was taken, and when its face was known; `time.monotonic`.
+        face: of the person, or None.
+        others: faces besides.
+        dark: the picture was black.
+    """
+
+    taken_s: float
+    known_s: float
+    face: SeenFace | None
+    others: int
+    dark: bool
+
+
+class Landmarker:
+    """MediaPipe's Face Landmarker over a stream of pictures. Creating one takes a second. Raises MissingExtra."""
+
+    def __init__(self, most_faces: int = MOST_FACES) -> None:
+        need_extra()
+        import mediapipe
+        from mediapipe.tasks.python import BaseOptions, vision
+
+        self._mediapipe = mediapipe
+        model = data_dir("sim") / "face_landmarker" / "face_landmarker.task"
+        self._landmarker = vision.FaceLandmarker.create_from_options(
+            vision.FaceLandmarkerOptions(
+                base_options=BaseOptions(model_asset_path=str(model)),
+                running_mode=vision.RunningMode.VIDEO,
+                num_faces=most_faces,
+                output_face_blendshapes=True,
+                output_facial_transformation_matrixes=True,
+            )
+        )
+        self._last_ms = -1
+
+    def faces(self, picture: Picture, taken_s: float) -> list[SeenFace]:
+        """Return the faces in the next picture of the stream."""
+        self._last_ms = max(self._last_ms + 1, round(taken_s * 1e3))  # it refuses a time that does not grow
+        image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
+        found = self._landmarker.detect_for_video(image, self._last_ms)
+        return [
+            seen_face(matrix, {shape.category_name: shape.score for shape in shapes})
+            for matrix, shapes in zip(found.facial_transformation_matrixes, found.face_blendshapes, strict=True)
+        ]
+
+    def close(self) -> None:
+        self._landmarker.close()
+
+
+def watch(argument: str) -> Generator[WebcamOpened | SeenPicture | None, float | None, None]:
+    """Watch a camera (its number) or a recorded video (its file); see `sources.worker`.
+
+    Faces are found once loop time 0 is known, at which a video begins. Raises MissingExtra,
+    ConfigError for another file, PortError for a camera that cannot be opened or that goes away.
+    """
+    need_extra()
+    video = None if argument.isdigit() else argument
+    capture = open_video(argument) if video else open_camera(whole_number(argument))
+    taken = None if video else live(capture, argument)
+    with closing(Landmarker()) as landmarker:
+        begins_s = yield WebcamOpened(_duration_s(capture) if video else None)
+        while begins_s is None:
+            if taken is None:
+                time.sleep(_ALIVE_S)
+            else:
+                next(taken)
+            begins_s = yield None
+        before: Choice | None = None
+        for taken_s, picture in taken or played(capture, begins_s):
+            if picture is None:
+                yield None
+                continue
+            faces = landmarker.faces(picture, taken_s)
+            index, before = choose([face.place_m for face in faces], taken_s, before)
+            face = None if index is None else faces[index]
+            dark = not faces and float(picture.mean()) < _DARK
+            others = len(faces) - (face is not None)
+            yield SeenPicture(taken_s=taken_s, known_s=time.monotonic(), face=face, others=others, dark=dark)
+
+
+def need_extra() -> None:
+    """Raise MissingExtra without MediaPipe."""
+    with optional("--face webcam"):
+        if importlib.util.find_spec("mediapipe") is None:
+            raise ModuleNotFoundError(name="mediapipe")
+
+
+def open_camera(number: int) -> Any:
+    """Open camera `number` of this computer. Raises PortError with the likely reason."""
+    import cv2
+
+    capture = cv2.VideoCapture(number)
+    if not capture.isOpened():
+        raise PortError(f"--face webcam: no camera {number} ({_why_not(number)})")
+    for key, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), _PICTURE_PX, strict=True):
+        capture.set(key, value)
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old pictures are of no use
+    return capture
+
+
+def open_video(file: str) -> Any:
+    """Open a recorded video. Raises ConfigError for another file."""
+    import cv2
+
+    capture = cv2.VideoCapture(file)
+    if not capture.isOpened() or not capture.get(cv2.CAP_PROP_FPS) > 0:
+        raise ConfigError(f"--face webcam:{file}: not a video that can be played")
+    return capture
+
+
+def live(capture: Any, name: str) -> Iterator[tuple[float, Picture]]:
+    """Yield pictures of a camera and when they were taken. Raises PortError when it goes away."""
+    import cv2
+
+    while True:
+        if not capture.grab():
+            raise PortError(f"camera {name} went away")
+        came_s = time.monotonic()
+        stamped_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+        found, picture = capture.retrieve()
+        if found:
+            yield stamped_s if 0 <= came_s - stamped_s < _OLDEST_S else came_s, _rgb(picture)
+
+
+def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | None]]:
+    """Yield pictures of a video at their own pace, without late ones; None while the next one is to come."""
+    import cv2
+
+    period_s = 1.0 / capture.get(cv2.CAP_PROP_FPS)
+    number = 0
+    while capture.grab():
+        due_s, number = begins_s + number * period_s, number + 1
+        if time.monotonic() - due_s > period_s:
+            continue
+        while (wait_s := due_s - time.monotonic()) > 0:
+            yield due_s, None
+            time.sleep(min(wait_s, _ALIVE_S))
+        found, picture = capture.retrieve()
+        if found:
+            yield due_s, _rgb(picture)
+
+
+def _rgb(picture: Any) -> Picture:
+    import cv2
+
+    out: Picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return out
+
+
+def _duration_s(capture: Any) -> float | None:
+    """Return the length of a video; None where the file does not say."""
+    import cv2
+
+    pictures = float(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    return pictures / float(capture.get(cv2.CAP_PROP_FPS)) if pictures > 0 else None
+
+
+def _why_not(number: int) -> str:
+    """Return why a camera cannot be opened; Linux has device files."""
+    device = Path(f"/dev/video{number}")
+    if device.exists():
+        if not os.access(device, os.R_OK | os.W_OK):
+            return f"no permission for {device}: sudo usermod -aG video $USER, then log in again"
+        return f"{device} is there: another program may hold it, or it gives no pictures"
+    others = sorted(path.name.removeprefix("video") for path in Path("/dev").glob("video[0-9]*"))
+    return f"there are {', '.join(others)}" if others else "none is plugged in"
+
+
+# --- one face in the units of this project ------------------------------------------------------------------------
+#
+# MediaPipe gives 52 blendshapes by name, `_neutral` among them and `tongueOut` not, left and right the person's own in
+# a picture that is not mirrored, and a matrix face -> camera: x to the picture's right, y up, z towards the viewer,
+# centimetres. With x forward = z, y left = x, z up = y its rotation is our Rz(yaw) Ry(pitch) Rx(roll), signs included.
+#
+# The distance is what a lens of 63 degrees across the picture's height would make of the face's size, and the face is
+# taken to be of average size. So it is relative: a lens of 45 degrees makes people come out about a third too near.
+# Sideways and up are not affected, since there the lens cancels out.
+
+
+def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
+    """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
+    roll = math.atan2(matrix[1, 0], matrix[1, 1])
+    pitch = math.asin(min(1.0, max(-1.0, -float(matrix[1, 2]))))
+    yaw = math.atan2(matrix[0, 2], matrix[2, 2])
+    right_m, up_m, near_m = matrix[:3, 3] / 100.0
+    pose = (roll, pitch, yaw, near_m, right_m, up_m)
+    eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
+    return SeenFace(
+        np.array([*pose, *(shapes.get(name, 0.0) for name in BLENDSHAPES)], dtype=np.float32),
+        np.array([-eyes_m[2], -eyes_m[0], eyes_m[1]], dtype=np.float32),
+    )
+
+
+# --- which of several faces is the person -------------------------------------------------------------------------
+#
+# The nearest, and not another one at every breath. A face that was chosen stays chosen while it is seen. Another takes
+# its place only when it has been clearly nearer for a while, or when the chosen one is gone. A face is recognized by
+# its place: it does not jump between two pictures.
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The person chosen so far: where and when they were last seen, and since when another one is clearly nearer."""
+
+    place_m: Floats
+    seen_s: float
+    rival_since_s: float | None = None
+
+
+def choose(places_m: Sequence[Floats], time_s: float, before: Choice | None) -> tuple[int | None, Choice | None]:
+    """Return the index of the person among the faces of a picture, by place (3,) from the camera; None without one.
+
+    `before`: the choice of the last picture, None at first. The order of the faces does not matter.
+    """
+    distances_m = [float(np.linalg.norm(place)) for place in places_m]
+    same = _same(places_m, before)
+    if before is None or same is None:
+        if before is not None and time_s - before.seen_s < GONE_S:
+            return None, replace(before, rival_since_s=None)
+        if not places_m:
+            return None, None
+        nearest = int(np.argmin(distances_m))
+        return nearest, Choice(places_m[nearest], time_s)
+    nearest = int(np.argmin(distances_m))
+    if distances_m[nearest] >= NEARER * distances_m[same]:
+        return same, Choice(places_m[same], time_s)
+    since_s = time_s if before.rival_since_s is None else before.rival_since_s
+    if time_s - since_s < TAKE_OVER_S:
+        return same, Choice(places_m[same], time_s, since_s)
+    return nearest, Choice(places_m[nearest], time_s)
+
+
+def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
+    """Return the face that is where the chosen one was, or None."""
+    if before is None or not places_m:
+        return None
+    steps_m = [float(np.linalg.norm(place - before.place_m)) for place in places_m]
+    same = int(np.argmin(steps_m))
+    return same if steps_m[same] <= STEP * float(np.linalg.norm(before.place_m)) else None
+
+
+# --- the run's side --------------------------------------------------------------------------------------------------
 
 
 class Webcam:
@@ -48,12 +344,12 @@ class Webcam:
         if self._origin_s is None:
             return None
         for message in self._worker.messages(self._origin_s + time_s):
-            if isinstance(message, Seen):
+            if isinstance(message, SeenPicture):
                 self._take(message)
         return self._face.at(time_s)
 
     def statistics(self) -> Mapping[str, Any]:
-        """What the worker tells; pictures, of these without a face, dark, and with other people in them; latency."""
+        """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
         return {
             **self._worker.statistics(),
             **self._counts,
@@ -63,7 +359,7 @@ class Webcam:
     def close(self) -> None:
         self._worker.close()
 
-    def _take(self, seen: Seen) -> None:
+    def _take(self, seen: SeenPicture) -> None:
         if self._origin_s is None or seen.taken_s < self._origin_s:
             return
         self._counts["pictures"] += 1
@@ -76,10 +372,10 @@ class Webcam:
 
 
 def open_webcam(argument: str) -> Webcam:
-    """What stands behind the colon of `--face webcam[:N|FILE]`: a camera's number (default 0) or a recorded video.
+    """Open `--face webcam[:N|FILE]`: a camera's number (default 0) or a recorded video.
 
-    Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for a file
-    that is no video and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
+    Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for another
+    file and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
     """
     given = parse_face_argument("webcam", argument)
     place = given.place
@@ -89,4 +385,4 @@ def open_webcam(argument: str) -> Webcam:
     worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
     opened = worker.messages(0.0)[0]
-    return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, Opened) else None)
+    return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, WebcamOpened) else None)

@@ -11,7 +11,7 @@ their commands.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,7 +65,7 @@ class Address:
 class Asked(Protocol):
     """The receiver of visitors' commands. Called in a thread of the page's; a RobotError is sent to the visitor."""
 
-    def command(self, visitor: int, command: Command) -> None:
+    def command(self, visitor: int, name: str, values: Mapping[str, Any]) -> None:
         """Do what a visitor with the controls wants."""
 
     def person(self, visitor: int, message: bytes) -> None:

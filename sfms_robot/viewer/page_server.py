@@ -1,67 +1,214 @@
-"""The page over HTTP and its WebSocket, in the page's process: what a run tells goes to all visitors, once encoded.
+"""Server of the page, in the page's process: what a run sends goes to all visitors, encoded once.
 
-    /                  the page              /static/...     what it loads
+    /                  the page              /static/...     its files
     /ws                the protocol          /human/head.bin the virtual human (`face.human`)
-    /robot/robot.urdf  the robot, and beside it the meshes that it names
+    /robot/robot.urdf  the robot, and beside it the meshes that it names (`face.robot_scene` says which are served)
     /face_landmarker.task  the model by which a page sees its visitor's face
     /runs/last         the run so far, or the last one: its messages, a line of JSON each
-    /recording         the file of what was recorded; beyond loopback with ?token=
+    /recording         the file of the last recording; beyond loopback with ?token=
 
-Pages of others may not connect (`origin`), and a request that calls this machine by a name that is not its own is not
-answered: else any page of the web could have itself served from here.
+1. Pictures: the newest wins. A visitor that reads slowly receives fewer of them, not older ones.
+2. All other messages wait in order, up to `OUTBOX`; a visitor that is so far behind is disconnected.
+3. Controls: the first visitor to ask has them until it gives them back or disconnects, or another one asks after
+   `IDLE_S` in which they were not used. Halting needs no controls.
+4. Where there is a token (bound beyond loopback), a visitor without it only looks.
 """
 
 from __future__ import annotations
 
 import asyncio
-import gzip
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from sfms_robot.data import data_dir
+from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import PacketError
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
-from sfms_robot.origin import host_problem, origin_problem, token_admits
-from sfms_robot.viewer.compressed_files import CompressedFiles, human_gz
-from sfms_robot.viewer.frame_record import Shown, frame_json, told_json
+from sfms_robot.viewer.page_messages import VERSION, Shown, frame_json, message_json, parse_command
 from sfms_robot.viewer.page_process import Asked
-from sfms_robot.viewer.visitor_commands import Command, parse_command
-from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, PERSON_BYTES_PER_S, PERSON_S, Visitor, Visitors
+from sfms_robot.viewer.web_server import CompressedFiles, application
+
+URDF: Final = "robot/robot.urdf"
+KEPT_FRAMES: Final = 600 * FRAME_HZ  # of the run, for /runs/last: ten minutes
+MOST_VISITORS: Final = 32
+OUTBOX: Final = 200
+IDLE_S: Final = 30.0
+MOST_MALFORMED: Final = 100
+COMMAND_S: Final = 0.004  # time that one command is given, when many arrive
+PERSON_S: Final = 0.001  # and a piece of sound, or a face
+PERSON_BYTES_PER_S: Final = 4e6
+BURST_S: Final = 0.25
+FREE: Final = ("hello", "ping", "take", "give")  # commands that take no controls
+_LINES_AT_ONCE: Final = 10  # of a platform each takes a millisecond and a half
 
 NewScene = Callable[[], RobotScene | None]
-URDF: Final = "robot/robot.urdf"
-STATIC: Final = Path(__file__).with_name("static")
-KEPT_FRAMES: Final = 600 * FRAME_HZ  # of the run, for /runs/last: ten minutes
-_LINES_AT_ONCE: Final = 10  # of a platform each takes a millisecond and a half
-_HEADERS: Final = (
-    (b"content-security-policy", b"default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; "
-     b"worker-src 'self' blob:; connect-src 'self' ws: wss:; img-src 'self' data: blob:; "
-     b"style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"),
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cache-control", b"no-cache"),
-)  # fmt: skip
 
 
 def no_scene() -> RobotScene | None:
-    """Of a head without a picture."""
+    """Return None: a head without a picture."""
     return None
 
 
-class Run(Asked, Protocol):
-    """A run as the page's server sees it: takes what visitors ask for. Never blocks."""
+class Visitor:
+    """One page that is connected, or another program that looks.
+
+    Attributes:
+        number: no other visitor has had it.
+        allowed: it has shown the token, or there is none.
+        malformed: count of its messages that could not be used.
+        used_s: time of its last use of the controls.
+        behind: it reads so slowly that it is to be disconnected.
+    """
+
+    def __init__(self, number: int, allowed: bool, now_s: float) -> None:
+        self.number, self.allowed, self.used_s = number, allowed, now_s
+        self.malformed, self.behind = 0, False
+        self._picture: str | None = None
+        self._outbox: deque[str] = deque()
+        self._something = asyncio.Event()
+        self._due_s = now_s - BURST_S
+
+    def tell(self, message: bytes) -> None:
+        """Send a message, behind those that still wait."""
+        self.behind = self.behind or len(self._outbox) >= OUTBOX
+        self._outbox.append(message.decode())
+        self._something.set()
+
+    def show(self, picture: str) -> None:
+        """Send a picture instead of an older one that was not sent yet."""
+        self._picture = picture
+        self._something.set()
+
+    async def next(self) -> str:
+        """Return what is to be sent now; wait until there is something."""
+        await self._something.wait()
+        if self._outbox:
+            message = self._outbox.popleft()
+        else:
+            message, self._picture = self._picture or "", None
+        if not self._outbox and self._picture is None:
+            self._something.clear()
+        return message
+
+    def pause_s(self, cost_s: float, now_s: float) -> float:
+        """Return how long to read nothing more from it, after a message of this cost."""
+        self._due_s = max(self._due_s, now_s - BURST_S) + cost_s
+        return max(0.0, self._due_s - now_s)
+
+    def check_allowed(self) -> None:
+        """Raise PacketError where the token is still to be shown."""
+        if not self.allowed:
+            raise PacketError("the token is needed for this: it was printed when the robot started")
+
+
+class Visitors:
+    """All visitors that are connected, and the one that holds the controls.
+
+    Args:
+        token: needed for more than looking; None: not needed.
+        left: called with the number of a visitor that has lost the controls.
+        now: a monotonic clock [s].
+    """
+
+    def __init__(self, token: str | None, left: Callable[[int], None], now: Callable[[], float]) -> None:
+        self._token, self._left, self._now = token, left, now
+        self._by_number: dict[int, Visitor] = {}
+        self._came = 0
+        self._holder: Visitor | None = None
+
+    def __len__(self) -> int:
+        return len(self._by_number)
+
+    def __iter__(self) -> Iterator[Visitor]:
+        return iter(tuple(self._by_number.values()))
+
+    def get(self, number: int) -> Visitor | None:
+        """Return a visitor that is still connected."""
+        return self._by_number.get(number)
+
+    def enter(self) -> Visitor:
+        """Admit another visitor. Raises PacketError when there are too many."""
+        if len(self._by_number) >= MOST_VISITORS:
+            raise PacketError(f"{MOST_VISITORS} visitors look at this head already")
+        self._came += 1
+        visitor = Visitor(self._came, self._token is None, self._now())
+        self._by_number[visitor.number] = visitor
+        return visitor
+
+    def leave(self, visitor: Visitor) -> None:
+        """Forget a visitor."""
+        self._by_number.pop(visitor.number, None)
+        if visitor is self._holder:
+            self._pass_on(None)
+
+    def controls(self, visitor: Visitor) -> str:
+        """Return the holder of the controls as `visitor` sees it."""
+        return "nobody" if self._holder is None else "you" if visitor is self._holder else "other"
+
+    def greet(self, visitor: Visitor, version: int, token: str) -> None:
+        """Check the version of a page, and its token. Raises PacketError where either is wrong."""
+        if version != VERSION:
+            raise PacketError(f"version: expected {VERSION}, got {version}: load the page again")
+        if self._token is not None and token:
+            if not token_admits(token, self._token):
+                raise PacketError("the token is not the one that was printed when the robot started")
+            visitor.allowed = True
+        visitor.tell(self._controls_json(visitor))
+
+    def take(self, visitor: Visitor) -> None:
+        """Give a visitor the controls. Raises PacketError where it cannot have them."""
+        visitor.check_allowed()
+        now_s, holder = self._now(), self._holder
+        if holder is not None and holder is not visitor and now_s - holder.used_s < IDLE_S:
+            raise PacketError("another visitor holds the controls")
+        visitor.used_s = now_s
+        if visitor is not holder:
+            self._pass_on(visitor)
+
+    def give(self, visitor: Visitor) -> None:
+        """Take the controls back from a visitor."""
+        if visitor is self._holder:
+            self._pass_on(None)
+        else:
+            visitor.tell(self._controls_json(visitor))
+
+    def admit(self, visitor: Visitor, command: str) -> None:
+        """Check that a command is allowed now; free controls are taken. Raises PacketError."""
+        if command == "halt":
+            visitor.check_allowed()
+        elif command not in FREE:
+            self.take(visitor)
+
+    def holds(self, visitor: Visitor) -> bool:
+        """Return whether a visitor has the controls, which counts as use."""
+        if visitor is not self._holder:
+            return False
+        visitor.used_s = self._now()
+        return True
+
+    def _pass_on(self, visitor: Visitor | None) -> None:
+        before, self._holder = self._holder, visitor
+        if before is not None:
+            self._left(before.number)
+        for each in self:
+            each.tell(self._controls_json(each))
+
+    def _controls_json(self, visitor: Visitor) -> bytes:
+        return message_json(type="controls", held=self.controls(visitor), needs_token=not visitor.allowed)
+
+
+class PageRun(Asked, Protocol):
+    """A run as the page's server sees it: carries out what visitors ask for. Never blocks."""
 
     def watched(self, visitors: int) -> None:
         """Note how many visitors are connected now."""
@@ -71,48 +218,43 @@ class PageServer:
     """One page, whatever runs behind it. All in the thread of one event loop.
 
     Args:
-        run: who does what visitors ask for.
-        token: see `Visitors`.
-        now: a monotonic clock [s].
+        run: carries out what visitors ask for.
+        token, now: see `Visitors`.
 
     Attributes:
         app: for an ASGI server.
     """
 
-    def __init__(self, run: Run, token: str | None, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, run: PageRun, token: str | None, now: Callable[[], float] = time.monotonic) -> None:
         self._run, self._token, self._now = run, token, now
         self._visitors = Visitors(token, run.left, now)
         self._hello: dict[str, Any] = {}
         self._began = asyncio.Event()  # there is a hello
         self._new_scene: NewScene = no_scene
         self._scene: RobotScene | None = None
-        self._human: asyncio.Task[bytes] | None = None
         self._record: Mapping[str, Any] | None = None
         self._recording: Path | None = None
         self._over: Mapping[str, Any] | None = None  # the report
-        self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # packed pictures, and messages
-        self._files = CompressedFiles(STATIC)
-        routes = [
-            Route("/", self._index),
-            Route("/runs/last", self._last_run),
-            Route("/recording", self._download),
-            Route("/human/head.bin", self._human_mesh),
-            Route("/robot/{file:path}", self._robot),
-            Route("/face_landmarker.task", self._face_model),
-            WebSocketRoute("/ws", self._visit),
-            Mount("/static", self._files),
-        ]
-        self.app: ASGIApp = guarded_app(Starlette(routes=routes))
+        self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # (packed picture or not, message)
+        self._files = CompressedFiles()
+        self.prepare = self._files.prepare  # what takes a second, in threads; a page waits for it
+        self.app = application(
+            [
+                Route("/", self._index),
+                Route("/runs/last", self._last_run),
+                Route("/recording", self._download),
+                Route("/human/head.bin", self._files.human_mesh),
+                Route("/robot/{file:path}", self._robot),
+                Route("/face_landmarker.task", self._face_model),
+                WebSocketRoute("/ws", self._visit),
+                Mount("/static", self._files),
+            ]
+        )
 
-    # --- what the run tells ---
-
-    def prepare(self) -> None:
-        """Make what takes a second, in threads; a page waits for it."""
-        self._human = asyncio.create_task(asyncio.to_thread(human_gz))
-        self._files.prepare()
+    # --- from the run ---
 
     def begin(self, hello: Mapping[str, Any], new_scene: NewScene = no_scene) -> None:
-        """A run begins: what a page has to know of it. What is left of the last one is forgotten.
+        """Begin a run: forget the last one, and send its `hello` to all visitors.
 
         `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
         """
@@ -125,7 +267,7 @@ class PageServer:
             visitor.tell(self._hello_json(visitor))
 
     def show(self, record: bytes) -> None:
-        """A packed picture, to everybody."""
+        """Send a packed picture to all visitors."""
         self.keep(record)
         if len(self._visitors):
             picture = frame_json(record, _values(self._scene)).decode()
@@ -133,11 +275,11 @@ class PageServer:
                 visitor.show(picture)
 
     def keep(self, record: bytes) -> None:
-        """A packed picture, for /runs/last alone: a newer one is here already."""
+        """Keep a packed picture for /runs/last alone: a newer one is here already."""
         self._history.append((True, record))
 
     def tell(self, message: bytes, keep: bool = True) -> None:
-        """A message of docs/protocol.md, to everybody; `keep`: it belongs to the run."""
+        """Send a message of docs/protocol.md to all visitors; `keep`: it belongs to the run."""
         if keep:
             self._history.append((False, message))
         for visitor in self._visitors:
@@ -146,19 +288,19 @@ class PageServer:
     def end(self, report: Mapping[str, Any]) -> None:
         """Send visitors the report of the run, which is over."""
         self._over = report
-        self.tell(told_json(type="over", report=report))
+        self.tell(message_json(type="over", report=report))
 
     def answer(self, number: int, message: bytes) -> None:
-        """To one visitor, where it is still there."""
+        """Send a message to one visitor, where it is still connected."""
         visitor = self._visitors.get(number)
         if visitor is not None:
             visitor.tell(message)
 
     def recorded(self, file: Path | None, record: Mapping[str, Any] | None) -> None:
-        """What /recording gives, and `record` of the hello."""
+        """Set the file of /recording, and `record` of the hello."""
         self._recording, self._record = file, record
         if record is not None:
-            self.tell(told_json(type="record", **record), keep=False)
+            self.tell(message_json(type="record", **record), keep=False)
 
     # --- over HTTP ---
 
@@ -171,9 +313,9 @@ class PageServer:
         return StreamingResponse(self._lines(), media_type="application/x-ndjson")
 
     async def _lines(self) -> AsyncIterator[bytes]:
-        """The hello, then what the run told, oldest first; others get their turn in between."""
+        """Yield the hello, then what the run sent, oldest first; others get their turn in between."""
         hello, shown = self._hello, _values(self._new_scene())
-        yield told_json(type="hello", **hello | {"over": True, "replay": True}) + b"\n"
+        yield message_json(type="hello", **hello | {"over": True, "replay": True}) + b"\n"
         kept = list(self._history)
         for first in range(0, len(kept), _LINES_AT_ONCE):
             part = kept[first : first + _LINES_AT_ONCE]
@@ -181,23 +323,11 @@ class PageServer:
             await asyncio.sleep(0)
 
     async def _download(self, request: Request) -> Response:
-        token = request.query_params.get("token", "")
-        if not token_admits(token, self._token):
+        if not token_admits(request.query_params.get("token", ""), self._token):
             return PlainTextResponse("the token is needed for this: /recording?token=\n", 403)
         if self._recording is None:
             return PlainTextResponse("nothing was recorded\n", 404)
         return FileResponse(self._recording, filename=self._recording.name)
-
-    async def _human_mesh(self, request: Request) -> Response:
-        if self._human is None:
-            self.prepare()
-        assert self._human is not None
-        packed, headers = await self._human, {"Vary": "Accept-Encoding"}
-        if "gzip" in request.headers.get("accept-encoding", ""):
-            headers["Content-Encoding"] = "gzip"
-        else:
-            packed = gzip.decompress(packed)
-        return Response(packed, media_type="application/octet-stream", headers=headers)
 
     async def _robot(self, request: Request) -> Response:
         scene, file = self._scene, request.path_params["file"]
@@ -219,68 +349,62 @@ class PageServer:
         try:
             visitor = self._visitors.enter()
         except PacketError as error:
-            await _refused(socket, str(error))
+            await _refuse(socket, str(error))
             return
         visitor.tell(self._hello_json(visitor))
         self._run.watched(len(self._visitors))
-        speaking = asyncio.create_task(self._speak(socket, visitor))
+        sending = asyncio.create_task(self._send(socket, visitor))
         try:
-            await self._listen(socket, visitor)
-        except WebSocketDisconnect:
-            pass  # as they do
+            await self._receive(socket, visitor)
         finally:
-            speaking.cancel()
+            sending.cancel()
             self._visitors.leave(visitor)
             self._run.watched(len(self._visitors))
 
-    async def _speak(self, socket: WebSocket, visitor: Visitor) -> None:
-        with suppress(WebSocketDisconnect, RuntimeError):  # it has gone
+    async def _send(self, socket: WebSocket, visitor: Visitor) -> None:
+        with suppress(WebSocketDisconnect, RuntimeError):  # it has disconnected
             while not visitor.behind:
                 await socket.send_text(await visitor.next())
-            await _refused(socket, "too far behind: messages waited for too long")
+            await _refuse(socket, "too far behind: messages waited for too long")
 
-    async def _listen(self, socket: WebSocket, visitor: Visitor) -> None:
+    async def _receive(self, socket: WebSocket, visitor: Visitor) -> None:
         while socket.application_state is WebSocketState.CONNECTED:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
             text, data = message.get("text"), message.get("bytes") or b""
-            cost_s = COMMAND_S if text is not None else PERSON_S + len(data) / PERSON_BYTES_PER_S
             try:
                 if text is not None:
-                    self._command(visitor, parse_command(text))
+                    self._command(visitor, *parse_command(text))
+                elif self._visitors.holds(visitor):
+                    self._run.person(visitor.number, data)
                 else:
-                    self._person(visitor, data)
+                    raise PacketError("sound and faces are taken from the holder of the controls, after `source`")
             except PacketError as error:
                 visitor.malformed += 1
                 if visitor.malformed > MOST_MALFORMED:
-                    await _refused(socket, str(error))
+                    await _refuse(socket, str(error))
                     return
-                visitor.tell(told_json(type="error", error=str(error)))
-            pause_s = visitor.pause_s(cost_s, self._now())
-            if pause_s:
+                visitor.tell(message_json(type="error", error=str(error)))
+            cost_s = COMMAND_S if text is not None else PERSON_S + len(data) / PERSON_BYTES_PER_S
+            if pause_s := visitor.pause_s(cost_s, self._now()):
                 await asyncio.sleep(pause_s)
 
-    def _command(self, visitor: Visitor, command: Command) -> None:
-        if command.name == "hello":
-            self._visitors.greeted(visitor, command)
-        elif command.name == "ping":
-            visitor.tell(told_json(type="pong", id=command.values["id"]))
-        elif command.name == "take":
+    def _command(self, visitor: Visitor, name: str, values: dict[str, Any]) -> None:
+        if name == "hello":
+            self._visitors.greet(visitor, **values)
+        elif name == "ping":
+            visitor.tell(message_json(type="pong", id=values["id"]))
+        elif name == "take":
             self._visitors.take(visitor)
-        elif command.name == "give":
+        elif name == "give":
             self._visitors.give(visitor)
         else:
-            self._visitors.admit(visitor, command)
-            self._run.command(visitor.number, command)
-
-    def _person(self, visitor: Visitor, message: bytes) -> None:
-        if not self._visitors.holds(visitor):
-            raise PacketError("sound and faces are taken of who holds the controls, after `source`")
-        self._run.person(visitor.number, message)
+            self._visitors.admit(visitor, name)
+            self._run.command(visitor.number, name, values)
 
     def _hello_json(self, visitor: Visitor) -> bytes:
-        return told_json(
+        return message_json(
             type="hello", **self._hello, controls=self._visitors.controls(visitor), needs_token=not visitor.allowed,
             over=self._over is not None, record=self._record,
             torque_unconfirmed=(self._over or {}).get("torque_unconfirmed", []),
@@ -291,34 +415,8 @@ def _values(scene: RobotScene | None) -> Shown | None:
     return None if scene is None else scene.values
 
 
-async def _refused(socket: WebSocket, why: str) -> None:
-    """Say why in one line, and close."""
+async def _refuse(socket: WebSocket, why: str) -> None:
+    """Send the reason in one line, and close."""
     with suppress(WebSocketDisconnect, RuntimeError):
-        await socket.send_text(told_json(type="error", error=why).decode())
+        await socket.send_text(message_json(type="error", error=why).decode())
         await socket.close(1008, why[:120])
-
-
-def guarded_app(app: ASGIApp) -> ASGIApp:
-    """Requests of strangers' pages are refused before anything else looks at them; answers carry `_HEADERS`."""
-
-    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await app(scope, receive, send)
-            return
-        headers = {name: value.decode("latin-1") for name, value in scope["headers"]}
-        host = headers.get(b"host", "")
-        problem = host_problem(host)
-        if problem is None and scope["type"] == "websocket":
-            problem = origin_problem(headers.get(b"origin"), host)
-        if problem is not None:
-            await PlainTextResponse(problem + "\n", 403)(scope, receive, send)
-            return
-
-        async def with_headers(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], *_HEADERS]
-            await send(message)
-
-        await app(scope, receive, with_headers if scope["type"] == "http" else send)
-
-    return guarded

@@ -23,7 +23,7 @@ from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.registry import load_listener
 from sfms_robot.runtime.recorder import RUN_FILE
 from sfms_robot.sources.registry import open_source
-from sfms_robot.viewer.frame_record import frame_json
+from sfms_robot.viewer.page_messages import frame_json
 
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
 RAW = {"kind": "arig", "width": 16, "feedforward": 24, "heads": 2, "context_chunks": 4, "context_layers": 1}

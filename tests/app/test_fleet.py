@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from sfms_robot.app.fleet.fleet_client import GONE_S, FleetBoard, tile
-from sfms_robot.app.fleet.fleet_head import FleetControls, fleet_key, fleet_name, proof
+from sfms_robot.app.fleet import GONE_S, FleetBoard, FleetControls, fleet_key, fleet_name, proof, tile
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
@@ -105,12 +104,12 @@ def test_calm_and_knobs_are_turned(run):
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        ({"command": "dance"}, "halt, resume, end, calm, knobs"),
-        ({}, "no command"),
+        ({"command": "dance"}, "'halt', 'resume', 'end', 'calm', 'knobs'"),
+        ({}, "discriminator 'command'"),
         ({"command": "calm", "rates": {"nod": -1}}, "nod"),
-        ({"command": "calm", "rates": 3}, "rates is no mapping"),
+        ({"command": "calm", "rates": 3}, "rates = 3: "),
         ({"command": "knobs", "intensity": {"tail": 1}}, "'tail' is not a region of this head"),
-        ({"command": "knobs", "intensity": {"neck": "much"}}, "is no number"),
+        ({"command": "knobs", "intensity": {"neck": "1"}}, "neck = '1': Input should be a valid number"),
         ({"command": "knobs", "style": {"neck": 9}}, "not in 0..2"),
     ],
 )
@@ -139,10 +138,10 @@ def test_a_name_that_cannot_be_part_of_a_key_is_refused(name):
 def test_a_board_keeps_the_newest_of_each_and_says_who_went_away():
     now_s = [0.0]
     board = FleetBoard(lambda: now_s[0])
-    board.told({"name": "b", "state": "idle"})
-    board.told({"name": "a", "state": "listening", "head": "face28", "person": {"voice_db": -30.0}})
+    board.put({"name": "b", "state": "idle"})
+    board.put({"name": "a", "state": "listening", "head": "face28", "person": {"voice_db": -30.0}})
     now_s[0] = GONE_S + 1
-    board.told({"name": "a", "state": "halted", "why": ["kitchen"]})
+    board.put({"name": "a", "state": "halted", "why": ["kitchen"]})
     a, b = board.tiles()
     assert (a["name"], a["state"], a["why"], a["here"]) == ("a", "halted", ["kitchen"], True)
     assert (b["name"], b["here"], b["age_s"]) == ("b", False, 4.0)

@@ -12,7 +12,7 @@ from sfms_robot.signals.audio import AudioFile
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import shipped_speaker
 
 TALKS_S = 6.0
 

@@ -4,11 +4,14 @@ import json
 import math
 
 import numpy as np
+import pytest
 
-from sfms_robot.app.listen.page_observer import PageObserver
-from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, Reading, SpeakerFrame
+from sfms_robot.app.listen.page_observer import PageObserver, people_per_minute
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, ListenerEvent, Plan, Reading, SpeakerFrame
+from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.ports import Tick
-from sfms_robot.viewer.frame_record import frame_json
+from sfms_robot.viewer.page_messages import frame_json
 
 JOINTS = ("yaw", "jaw")
 
@@ -102,3 +105,13 @@ def test_the_status_is_told_once_a_second_while_somebody_looks():
         watcher.tick(tick(index / 25))
         page.visitors = int(index >= 49)
     assert page.said == [("status", {"status": {"state": "listening"}})] * 2
+
+
+@pytest.mark.parametrize("listener", ["sfms-small", "arig-small", "zenoh/somewhere"])
+def test_the_usual_rates_are_what_a_listener_that_may_decide_events_has_learned(listener):
+    told = people_per_minute(listener)
+    assert set(told) == set(EVENT_KINDS)
+    assert all(rate == load_tables().hazards[kind].per_minute for kind, rate in told.items())
+    assert people_per_minute("arig-paper") == {}  # decides none
+    with pytest.raises(ConfigError, match="nobody"):
+        people_per_minute("nobody")

@@ -9,12 +9,19 @@ import pytest
 
 import sfms_robot
 from sfms_robot.app.listen.knobs import turned
-from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.viewer.frame_record import Picture, frame_json, pack_picture, rare_json
-from sfms_robot.viewer.visitor_commands import COMMANDS, LONGEST_COMMAND, LONGEST_PERSON, VERSION
-from sfms_robot.viewer.visitors import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
+from sfms_robot.viewer.page_messages import (
+    COMMANDS,
+    LONGEST_COMMAND,
+    LONGEST_PERSON,
+    VERSION,
+    frame_json,
+    pack_picture,
+    rare_json,
+)
+from sfms_robot.viewer.page_server import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
 
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
 PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
@@ -40,7 +47,8 @@ def rows(part: str) -> dict[str, set[str]]:
 def test_every_command_is_described_with_all_its_keys():
     described = rows(ASKED)
     assert set(described) == set(COMMANDS)
-    for name, keys in COMMANDS.items():
+    for name, command in COMMANDS.items():
+        keys = command.model_fields
         assert set(keys) - {"seconds"} <= described[name], name
         assert ("seconds" in described[name]) == ("seconds" in keys), name
 
@@ -61,8 +69,10 @@ def test_every_key_of_a_hello_is_described():
 
 
 def test_every_key_of_a_frame_is_described():
-    picture = Picture(0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), rare_json("idle", (), {}, None))
-    assert set(json.loads(frame_json(pack_picture(picture)))) - {"type"} <= rows(TOLD)["frame"]
+    record = pack_picture(
+        0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), rare_json("idle", (), {}, None)
+    )
+    assert set(json.loads(frame_json(record))) - {"type"} <= rows(TOLD)["frame"]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from sfms_robot.app.session import run
 from sfms_robot.frames import MOTION_DIM, Reading
 from sfms_robot.ports import Tick
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
-from sfms_robot.viewer.frame_record import frame_json
+from sfms_robot.viewer.page_messages import frame_json
 
 HEAD, SECONDS = "interbotix_wxxms", 4.0
 

@@ -12,8 +12,7 @@ from sfms_robot.listeners.thread import LATE_S, Lateness
 from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
-from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER, open_source
 
 HOP = 4
 SLOW_S = (3.0, 7.0)  # from then to then

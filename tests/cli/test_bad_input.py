@@ -38,7 +38,7 @@ def listener(folder: Path, weights: bytes) -> Path:
         (["--port", "/dev/ttyNowhere", "--duration", 1], 3, ["/dev/ttyNowhere", "no such device"]),
         (["--port", "socket://nohost"], 3, ["--port socket://nohost", "socket://HOST:PORT"]),
         (["--port", "main=ftp://host:1"], 3, ["--port ftp://host:1", "/dev/ttyUSB0", "socket://HOST:PORT"]),
-        (["--status", "1" * 5000], 2, ["is no TCP port"]),
+        (["--status", "1" * 5000], 2, ["expected a TCP port"]),
         (["--view", "1" * 5000], 2, ["--view"]),
         (["--face", "webcam:" + "1" * 200, "--duration", 1], 2, ["expected a whole number of up to 20 digits"]),
         (["--addressed", "perhaps"], 2, ["--addressed perhaps", "sense, assume, never"]),
@@ -167,7 +167,11 @@ def test_a_status_port_that_is_in_use(fails):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         code, told = fails("run", "--fast", "--duration", "0.2", "--head", "interbotix_wxxms", "--status", port)
-    assert code == 3 and f"--status {port}: Address already in use" in told and "0 for a free one" in told
+    assert (
+        code == 3
+        and f"--status: TCP port {port} on 127.0.0.1: is used by another" in told
+        and "0: any free one" in told
+    )
 
 
 def test_a_halt_switch_that_cannot_be_one(fails, tmp_path):
@@ -194,4 +198,4 @@ def test_what_is_heard_takes_real_time(fails):
 
 def test_a_status_port_that_is_none(fails):
     code, told = fails("run", "--status", "http")
-    assert code == 2 and "--status http: is no TCP port" in told
+    assert code == 2 and "--status http: expected a TCP port" in told

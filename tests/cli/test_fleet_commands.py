@@ -10,8 +10,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from sfms_robot.app.fleet.fleet_client import Fleet
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key
+from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch

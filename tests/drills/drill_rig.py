@@ -17,7 +17,7 @@ from ended import Ended
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 CHECKOUT = Path(__file__).parents[2]
 START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]

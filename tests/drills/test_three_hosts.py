@@ -15,7 +15,7 @@ from drill_rig import CHECKOUT, HEAD, LOOK_S, LOOKS, START
 
 from sfms_robot.app.replay.run_file import _records, states_of
 from sfms_robot.frames import FRAME_S
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from sfms_robot.app.head.pose import HeldFace, NobodyThere, parse_face
+from sfms_robot.app.head.pose import NobodyThere, held_face, parse_face
 from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
@@ -54,7 +54,7 @@ def test_the_bus_that_works_comes_to_rest(dead, alive):
         log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
         watcher = Unplugger(chains[dead])
         parts = Parts(
-            NobodyThere(), NobodyThere(), HeldFace(parse_face(["pitch=0.2", "browInnerUp=1"]), 60.0),
+            NobodyThere(), NobodyThere(), held_face(parse_face(["pitch=0.2", "browInnerUp=1"]), 60.0),
             motion.retargeter, motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
         )  # fmt: skip
         with pytest.raises(BusError, match=dead):

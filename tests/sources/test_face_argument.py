@@ -4,9 +4,8 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS
-from sfms_robot.sources.live_face import FaceArgument, parse_face_argument
+from sfms_robot.sources.live_face import FaceArgument, parse_endpoint, parse_face_argument
 from sfms_robot.sources.registry import split_kind
-from sfms_robot.sources.udp_sight import parse_endpoint
 
 
 @pytest.mark.parametrize(
@@ -48,8 +47,8 @@ def test_signs_are_those_of_the_flipped_channels(names):
 @pytest.mark.parametrize(
     ("argument", "text"),
     [
-        ("1,flip=jaw", "flip = 'jaw' is no pose channel .*roll, pitch, yaw, x, y, z"),
-        ("1,flip=", "flip = '' is no pose channel"),
+        ("1,flip=jaw", "flip = 'jaw': expected a pose channel .*roll, pitch, yaw, x, y, z"),
+        ("1,flip=", "flip = '': expected a pose channel"),
         ("1,mirror=yes", "option 'mirror' is not known .flip."),
     ],
 )
@@ -69,5 +68,5 @@ def test_a_place_that_does_not_say_where_is_this_machine_alone():
 
 @pytest.mark.parametrize("place", ["x", "0", "65536", "-1", ":1234", "host:", "host", "1.5", "²"])
 def test_a_port_that_is_none_is_one_line(place):
-    with pytest.raises(ConfigError, match="is no UDP port .live-link, live-link:PORT, live-link:HOST:PORT"):
+    with pytest.raises(ConfigError, match="expected a UDP port .valid: live-link, live-link:PORT, live-link:HOST:PORT"):
         parse_endpoint("live-link", place, 11111)

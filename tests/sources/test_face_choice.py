@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.sources.webcam_worker import GONE_S, NEARER, TAKE_OVER_S, choose
+from sfms_robot.sources.webcam import GONE_S, NEARER, TAKE_OVER_S, choose
 
 STEP_S = 1 / 30
 LEFT, RIGHT = np.array([0.6, 0.3, 0.0]), np.array([0.6, -0.3, 0.0])

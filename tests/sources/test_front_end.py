@@ -6,7 +6,7 @@ import pytest
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone_worker import LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, ToldSpeech
+from sfms_robot.sources.microphone import LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, SpeechFrames
 
 ORIGIN_S = 1000.0
 PIECE_S = 0.01
@@ -35,7 +35,7 @@ def record(front_end, seconds, rate_hz=AUDIO_HZ, tell=None, away=(), begins_s=-0
 def silence_until(speech, ahead_s=0.05):
     def tell(now_s):
         known = max(0, int((now_s + ahead_s) / FRAME_S))
-        speech.tell(max(0, known - 12), np.zeros(min(known, 12) * FRAME_SAMPLES, np.float32))
+        speech.set(max(0, known - 12), np.zeros(min(known, 12) * FRAME_SAMPLES, np.float32))
 
     return tell
 
@@ -49,7 +49,7 @@ def deviation(frames):
 @pytest.mark.parametrize("rate_hz", [8_000, 16_000, 44_100, 48_000, 192_000])
 @pytest.mark.parametrize("reference", [False, True])
 def test_frames_are_those_of_the_loop_with_and_without_echo_cancellation(rate_hz, reference):
-    speech = ToldSpeech() if reference else None
+    speech = SpeechFrames() if reference else None
     frames = record(FrontEnd(speech), 1.0, rate_hz, silence_until(speech) if speech else None)
     assert [frame.index for frame in frames] == list(range(len(frames))) and len(frames) >= 23
     assert deviation(frames[1:]) < CLOSE
@@ -76,7 +76,7 @@ def test_a_worker_that_begins_late_begins_with_the_frame_of_that_moment():
 
 
 def test_a_frame_whose_reference_does_not_come_is_given_without_and_counted():
-    front_end = FrontEnd(ToldSpeech())
+    front_end = FrontEnd(SpeechFrames())
     frames = record(front_end, 1.0)
     assert frames and deviation(frames[1:]) < CLOSE
     late_s = [frame.known_s - ORIGIN_S - (frame.index + 1) * FRAME_S for frame in frames]
@@ -101,8 +101,8 @@ def test_a_device_that_records_the_loudspeaker_is_told_beside_the_microphone():
 @pytest.mark.parametrize("first", [0, 3])
 def test_told_speech_is_given_as_late_as_the_echo_canceller_needs_it(first):
     said = np.random.default_rng(0).normal(size=8 * FRAME_SAMPLES).astype(np.float32)
-    speech = ToldSpeech()
-    speech.tell(first, said)
+    speech = SpeechFrames()
+    speech.set(first, said)
     taken = [speech.take(index) for index in range(first, first + 7)]
     np.testing.assert_array_equal(np.concatenate(taken), said[ECHO_LATENCY_SAMPLES:][: 7 * FRAME_SAMPLES])
     assert speech.take(first + 7) is None

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
 from sfms_robot.errors import PacketError, PortError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
+from sfms_robot.sources.live_face import Datagram, addresses_of_this_machine
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
-from sfms_robot.sources.udp_sight import Datagram, addresses_of_this_machine
 
 PACKETS = recorded_packets()
 DECODED = Path(__file__).parents[1] / "assets" / "live_link_llv.csv.gz"

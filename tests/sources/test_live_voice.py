@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES
-from sfms_robot.sources.drift import SampleClock
-from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.live_voice import LiveVoice, SampleClock
 from sfms_robot.sources.paired import LONGEST_WAIT_S
 
 ORIGIN_S = 5000.0
@@ -214,7 +213,7 @@ def test_another_rate_begins_anew():
             voice.push(sound, rate_hz, ORIGIN_S + called_s)
     assert len(frames) > 90 and not any(frame is None for frame in frames)
     assert np.abs(offsets_s(frames, 55)).max() < 0.002
-    with pytest.raises(ConfigError, match="rate_hz = 1 is no rate"):
+    with pytest.raises(ConfigError, match="rate_hz = 1: expected a rate"):
         voice.push(np.zeros(1, dtype=np.float32), 1, 0.0)
 
 

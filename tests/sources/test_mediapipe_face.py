@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS
-from sfms_robot.sources.webcam_worker import seen_face
+from sfms_robot.sources.webcam import seen_face
 
 angles = st.tuples(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5), st.floats(-3.0, 3.0))
 

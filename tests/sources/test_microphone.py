@@ -14,12 +14,11 @@ from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import OwnVoice, open_microphone, sound_devices
-from sfms_robot.sources.microphone_worker import LOST_S, Capture, captured_s
+from sfms_robot.sources.microphone import OwnVoice, open_microphone
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.sound_devices import SoundDevice, why_not_opened
+from sfms_robot.sources.sound_devices import LOST_S, Capture, SoundDevice, captured_s, sound_devices, why_not_opened
 
 pytestmark = pytest.mark.realtime
 
@@ -239,7 +238,7 @@ def test_a_piece_came_when_its_device_says_so_where_that_can_be(first_age_s, exp
 @pytest.mark.parametrize("channels", [1, 2, 16])
 def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
     """Pieces as PortAudio hands them over, at a rate that no voice needs, with what is no sound in one of them."""
-    capture = Capture(SoundDevice("array", 3, channels, 192_000.0), 192_000.0, channels)
+    capture = Capture(SoundDevice(name="array", number=3, channels=channels, rate_hz=192_000.0), 192_000.0, channels)
     voice, origin_s = LiveVoice(), time.monotonic() - 0.5
     voice.start(origin_s)
     piece = np.zeros((9_600, channels), np.float32)
@@ -258,7 +257,7 @@ def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
 
 
 def test_a_device_that_gives_no_more_sound_went_away():
-    capture = Capture(SoundDevice("array", 3, 1, 16_000.0), 16_000.0, 1)
+    capture = Capture(SoundDevice(name="array", number=3, channels=1, rate_hz=16_000.0), 16_000.0, 1)
     capture.pass_on(LiveVoice(), 0.0)
     capture._heard_s -= 1.1 * LOST_S
     with pytest.raises(PortError, match="^array gives no more sound$"):

@@ -9,23 +9,16 @@ from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
+from net_program import LENGTH, face_message, framed
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.origin import origin_problem
+from sfms_robot.endpoint import origin_problem
+from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.frames import FRAME_S
 from sfms_robot.sources import net_server
-from sfms_robot.sources.net_messages import (
-    MICROPHONE,
-    SPEECH,
-    VOICE,
-    MessageBuffer,
-    face_message,
-    framed,
-    json_message,
-    sound_message,
-)
-from sfms_robot.sources.net_person import SILENT_S, NetPerson, NetSight, NetSpeech, NetVoice
+from sfms_robot.sources.net_messages import FACE, MICROPHONE, SPEECH, VOICE, json_message, sound_message
+from sfms_robot.sources.net_person import SILENT_S, NetPerson, NetSight, NetSpeech, NetVoice, PageVisitor
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.registry import open_source
 
@@ -62,7 +55,6 @@ class Tcp:
 
     def __init__(self, run, **hello):
         self.socket = socket.create_connection(("127.0.0.1", run.person.address[1]), WAIT_S)
-        self.buffer, self.messages = MessageBuffer(), []
         if hello:
             self.say(type="hello", **{"version": 1, **hello})
 
@@ -74,15 +66,19 @@ class Tcp:
 
     def receive(self):
         """The next message; None: the robot has closed."""
-        while not self.messages:
-            try:
-                data = self.socket.recv(65536)
-            except ConnectionError:
-                return None
-            if not data:
-                return None
-            self.messages += self.buffer.push(data)
-        return self.messages.pop(0)
+        try:
+            (length,) = LENGTH.unpack(self.exactly(LENGTH.size))
+            return self.exactly(length)
+        except (ConnectionError, EOFError):
+            return None
+
+    def exactly(self, count):
+        data = b""
+        while len(data) < count:
+            if not (part := self.socket.recv(count - len(data))):
+                raise EOFError
+            data += part
+        return data
 
     def close(self):
         self.socket.close()
@@ -242,7 +238,7 @@ def test_the_place_of_one_who_is_cut_off_is_free(run):
 
 def test_the_system_finds_out_who_has_gone_without_a_word():
     with closing(socket.socket()) as wire:
-        net_server._tell_of_the_dead(wire)
+        net_server._find_the_dead(wire)
         assert wire.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         assert wire.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 5
 
@@ -290,7 +286,7 @@ def test_what_was_not_announced_or_not_asked_for_is_refused(run):
     assert last_words(program) == "speech was not announced in its hello"
     program = Tcp(run)
     program.send(sound_message(SPEECH, 16000, 0, 0, SECOND))
-    assert last_words(program) == "the first message is no hello"
+    assert last_words(program) == "the first message must be a hello"
     program = Tcp(run)
     program.socket.sendall(struct.pack("<I", 2**31))
     assert "a message of 2147483648 bytes" in last_words(program)
@@ -444,13 +440,15 @@ def test_flags_that_name_one_address_share_it_and_it_is_free_afterwards():
         with pytest.raises(PortError, match=f"--audio push: port {port} is used by another run of this program"):
             open_source(f"push:{port}")
     with closing(socket.create_server(("127.0.0.1", port))):
-        with pytest.raises(PortError, match=f"--agent-audio tcp: TCP port {port} on 127.0.0.1: is used by another"):
+        with pytest.raises(
+            PortError, match=f"--agent-audio tcp: TCP port {port} on 127.0.0.1: is used by another program"
+        ):
             open_source("none", agent_audio=f"tcp:{port}")
 
 
 @pytest.mark.parametrize("place", ["70000", "x", ":5", "localhost:", "1.2.3.4"])
 def test_an_address_that_is_none_is_told_with_the_choices(place):
-    with pytest.raises(ConfigError, match=r"is no TCP port \(--audio push, --audio push:PORT"):
+    with pytest.raises(ConfigError, match=r"expected a TCP port \(valid: --audio push, --audio push:PORT"):
         open_source(f"push:{place}")
 
 
@@ -460,3 +458,81 @@ def test_a_run_that_ends_before_it_began_gives_the_port_back(caplog):
         address = source.outlets[0].address
     socket.create_server(address).close()
     assert not caplog.records
+
+
+# --- a visitor of the page: one at a time, with its own clock -------------------------------------------------------
+
+PIECE = np.full(960, 8192, np.int16)  # 20 ms of a quarter of full scale
+
+
+class Here:
+    """A visitor with a clock that is set, of which the sender's is `ahead_s`."""
+
+    def __init__(self):
+        self.now_s = 1000.0
+        self.visitor = PageVisitor(lambda: self.now_s)
+        self.voice, self.sight = self.visitor.voice, self.visitor.sight
+
+    def speaks(self, number, seconds, ahead_s=-990.0):
+        for _ in range(round(seconds * 50)):
+            self.now_s += 0.02
+            at_s = self.now_s + ahead_s
+            self.visitor.received(number, sound_message(VOICE, 48_000, at_s, at_s, PIECE))
+
+
+def test_the_voices_of_visitors_come_in_frames_whatever_their_clocks():
+    here = Here()
+    here.visitor.came(7, ["voice"])
+    here.voice.start(here.now_s)
+    here.speaks(7, 0.4)
+    frames = [here.voice.take(index) for index in range(8)]
+    assert all(frame is not None and frame.shape == (640,) for frame in frames)
+    assert np.allclose(frames[5], 0.25, atol=0.01) and not here.voice.lost
+    here.visitor.gone(7)
+    here.visitor.came(8, ["voice"])
+    here.speaks(8, 1.0, ahead_s=+5000.0)
+    assert here.visitor.statistics() == {"old": 0, "too_fast": 0}
+    assert here.voice.take(round(1.2 / FRAME_S)) is not None
+
+
+def test_a_visitors_face_is_given_at_its_time_and_grows_old_when_none_comes():
+    here = Here()
+    here.visitor.came(7, ["face"])
+    here.sight.start(here.now_s)
+    here.visitor.received(7, face_message(5.0, 5.0, np.zeros(58)))
+    here.visitor.received(7, face_message(5.1, 5.1, None))
+    assert here.sight.at(1.0).face.time_s == pytest.approx(0.0, abs=0.11)
+
+
+def test_what_a_visitor_did_not_announce_is_refused():
+    visitor = Here().visitor
+    sound, face = sound_message(VOICE, 48_000, 1.0, 1.0, PIECE), face_message(1.0, 1.0, np.zeros(58))
+    for feeds, number, message, said in (
+        ([], 7, sound, "voice was not announced by `source`"),
+        (["voice"], 7, face, "face was not announced"),
+        (["voice"], 8, sound, "voice was not announced"),
+        (["voice"], 7, sound_message(SPEECH, 48_000, 1.0, 1.0, PIECE), "only voice and face"),
+        (["voice"], 7, bytes([FACE]), "shorter than a header"),
+    ):
+        visitor.came(7, feeds)
+        with pytest.raises(PacketError, match=said):
+            visitor.received(number, message)
+
+
+def test_a_visitor_who_has_gone_is_lost_until_another_comes():
+    here = Here()
+    assert not here.voice.lost and not here.sight.lost  # no visitor yet: none is missed
+    here.visitor.came(7, ["voice", "face"])
+    here.visitor.gone(8)
+    assert not here.voice.lost
+    here.visitor.gone(7)
+    assert here.voice.lost and here.sight.lost
+    here.visitor.came(9, ["voice"])
+    assert not here.voice.lost and here.sight.lost
+
+
+def test_a_source_of_a_visitor_needs_a_page():
+    with pytest.raises(ConfigError, match="there is no page"):
+        open_source("none", "browser")
+    with closing(open_source("browser", "browser", visitor=PageVisitor())) as source:
+        assert source.duration_s is None

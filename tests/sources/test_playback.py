@@ -19,8 +19,17 @@ from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.microphone import OwnVoice
 from sfms_robot.sources.paired import PairedSource
-from sfms_robot.sources.playback import EARLY_S, HUSH_S, MARGIN_S, PlayedVoice, open_playback
-from sfms_robot.sources.playback_worker import PlaybackOpened, PlaybackStream, Playout, leaves_after_s
+from sfms_robot.sources.playback import (
+    EARLY_S,
+    HUSH_S,
+    MARGIN_S,
+    PlaybackOpened,
+    PlaybackStream,
+    PlayedVoice,
+    Playout,
+    leaves_after_s,
+    open_playback,
+)
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
@@ -279,7 +288,7 @@ def test_a_block_leaves_when_its_device_says_so_where_that_can_be(ahead_s, expec
 
 @pytest.mark.parametrize("channels", [1, 2, 8])
 def test_of_many_channels_the_first_two_speak(channels):
-    stream = PlaybackStream(SoundDevice("room", 3, channels, 48_000.0), 48_000.0, channels)
+    stream = PlaybackStream(SoundDevice(name="room", number=3, channels=channels, rate_hz=48_000.0), 48_000.0, channels)
     stream.playout.start(time.monotonic())
     stream.playout.tell(0, np.full(50 * FRAME_SAMPLES, 0.25, np.float32))
     stamp = type("Stamp", (), {"outputBufferDacTime": 5.2, "currentTime": 5.0})
@@ -299,7 +308,7 @@ def pause(played):
 
 def recorded(seconds, begin):
     """What `person.monitor` records meanwhile, on the grid that begins now, and what `begin(origin)` gave."""
-    from sfms_robot.sources.microphone_worker import open_capture
+    from sfms_robot.sources.microphone import open_capture
 
     heard = LiveVoice()
     with open_capture("person.monitor", "--audio mic") as capture:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
-from sfms_robot.sources.playback_worker import Playout
+from sfms_robot.sources.playback import Playout
 
 ORIGIN_S = 1000.0
 TONE_HZ = 40.0  # of which an instant can be told to a few milliseconds

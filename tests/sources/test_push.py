@@ -85,7 +85,7 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
 @pytest.mark.parametrize(
     ("pcm", "rate_hz", "told"),
     [
-        (np.zeros(9), 1, "rate_hz = 1 is no rate"),
+        (np.zeros(9), 1, "rate_hz = 1: expected a rate"),
         (np.zeros(9), float("nan"), "rate_hz = nan"),
         (b"abc", 16000, "3 bytes is not of 16-bit"),
         (np.zeros(9, dtype=np.int64), 16000, "pcm is int64"),
@@ -247,7 +247,7 @@ def test_what_is_said_after_its_time_is_left_out_and_counted():
     assert speech.take(0).all()
     speech.say(np.full(1280, -0.5), 16000, 0.01)
     assert (np.flatnonzero(speech.take(1)) == np.arange(640)).all() and speech.statistics()["late"] == 480
-    with pytest.raises(ConfigError, match="at_s = nan is no time"):
+    with pytest.raises(ConfigError, match="at_s = nan: expected a finite time"):
         speech.say(np.zeros(9), 16000, float("nan"))
 
 

@@ -14,8 +14,7 @@ from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.tracks import Track, write_track
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedSight, RecordedVoice
-from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import open_source, shipped_speaker
 
 
 def recorded(audio, track, duration_s=None, loop=True, agent_audio=None):

@@ -13,8 +13,7 @@ from sfms_robot.ports import Source
 from sfms_robot.sources.paired import LONGEST_WAIT_S
 from sfms_robot.sources.push import PushedSight, PushedVoice
 from sfms_robot.sources.recording import RecordedVoice
-from sfms_robot.sources.registry import SIGHTS, VOICES, check_source, open_source, source_kinds
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import SIGHTS, VOICES, check_source, open_source, shipped_speaker, source_kinds
 
 
 class Entry:

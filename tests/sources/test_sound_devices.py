@@ -10,12 +10,12 @@ from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.sources.sound_devices import SoundDevice, choose_device, portaudio
 
 FLAG = "--audio mic"
-BUILT_IN = SoundDevice("HDA Intel PCH: ALC257 Analog (hw:0,0)", 0, 2, 44_100.0)
-USB = SoundDevice("USB PnP Sound Device: Audio (hw:1,0)", 4, 1, 48_000.0)
-ARRAY = SoundDevice("ReSpeaker 4 Mic Array: USB Audio (hw:2,0)", 5, 6, 16_000.0)
-SERVER = SoundDevice("pulse", 8, 32, 44_100.0, default=True)
-SOURCE = SoundDevice("alsa_input.usb-PnP.mono", 8, 32, 44_100.0, server="source")
-MONITOR = SoundDevice("robot.monitor", 8, 32, 44_100.0, server="source")
+BUILT_IN = SoundDevice(name="HDA Intel PCH: ALC257 Analog (hw:0,0)", number=0, channels=2, rate_hz=44_100.0)
+USB = SoundDevice(name="USB PnP Sound Device: Audio (hw:1,0)", number=4, channels=1, rate_hz=48_000.0)
+ARRAY = SoundDevice(name="ReSpeaker 4 Mic Array: USB Audio (hw:2,0)", number=5, channels=6, rate_hz=16_000.0)
+SERVER = SoundDevice(name="pulse", number=8, channels=32, rate_hz=44_100.0, default=True)
+SOURCE = SoundDevice(name="alsa_input.usb-PnP.mono", number=8, channels=32, rate_hz=44_100.0, server="source")
+MONITOR = SoundDevice(name="robot.monitor", number=8, channels=32, rate_hz=44_100.0, server="source")
 ALL = [BUILT_IN, USB, ARRAY, SERVER, SOURCE, MONITOR]
 
 
@@ -37,7 +37,7 @@ def test_a_device_is_chosen_by_number_name_or_part_of_its_name(wanted, device):
 
 
 def test_one_of_two_like_devices_is_told_by_its_card():
-    twin = SoundDevice("USB PnP Sound Device: Audio (hw:6,0)", 9, 1, 48_000.0)
+    twin = SoundDevice(name="USB PnP Sound Device: Audio (hw:6,0)", number=9, channels=1, rate_hz=48_000.0)
     assert choose_device([USB, twin], twin.name, FLAG) is twin
     with pytest.raises(ConfigError, match=r"^--audio mic:PnP: fits several devices \(4 USB PnP .*, 9 USB PnP .*\)$"):
         choose_device([USB, twin], "PnP", FLAG)

@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
-from sfms_robot.sources.live_face import FaceArgument, LiveFace
-from sfms_robot.sources.udp_sight import (
+from sfms_robot.sources.live_face import (
     LOST_S,
     PACKETS_PER_CALL,
     SILENT_S,
     UNHEARD_S,
     Datagram,
     DatagramSocket,
+    FaceArgument,
+    LiveFace,
     UdpSight,
 )
 
@@ -68,7 +69,7 @@ def test_a_second_sender_is_refused_and_said_once(sight, caplog):
     feed(sight, SECOND, 0.1, 0.2, 0.3)
     assert counts(sight) == {"faces": 1, "refused": 3, "malformed": 0}
     (said,) = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    assert "192.0.2.2:2 sends too and is refused: 192.0.2.1:1 is listened to" in said
+    assert "192.0.2.2:2 sends too and is refused until 192.0.2.1:1 is silent" in said
 
 
 def test_a_second_sender_takes_over_when_the_first_is_silent(sight):
@@ -103,7 +104,7 @@ def test_what_to_do_is_said_when_nobody_sends(sight, caplog):
     assert not caplog.records
     sight.at(UNHEARD_S + 1)
     sight.at(UNHEARD_S + 2)
-    assert [record.message for record in caplog.records] == ["test: nobody sends yet: call 42"]
+    assert [record.message for record in caplog.records] == ["test: no packets yet: call 42"]
 
 
 def test_a_sender_that_falls_silent_is_lost_after_half_a_second_until_it_is_back(sight):

@@ -12,7 +12,7 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from scipy.spatial.transform import Rotation
 
-from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.sources.vmc import VmcDecoder, angles_of_unity, elements, open_vmc, parse_message
@@ -262,50 +262,18 @@ def test_a_damaged_frame_is_refused_or_finite(damage):
     assert motion is None or (np.isfinite(motion).all() and motion[SHAPES].min() >= 0 and motion[SHAPES].max() <= 1)
 
 
-@pytest.mark.slow
-def test_a_million_packets_of_noise_never_raise():
-    random = np.random.default_rng(0)
-    whole = bundle(*(blend(name, 0.5) for name in BLENDSHAPES[:8]), bone("Head", IDENTITY), APPLY)
-    decoder, refused = VmcDecoder(), 0
-    for number in range(1_000_000):
-        data = bytearray(whole)
-        if number % 3 == 0:
-            data[random.integers(len(data))] = random.integers(256)
-        elif number % 3 == 1:
-            del data[random.integers(len(data)) :]
-        else:
-            data[20:] = random.bytes(int(random.integers(300)))
-        try:
-            decoder.decode(bytes(data), 0.0)
-        except PacketError:
-            refused += 1
-    assert 300_000 < refused < 900_000
-
-
 # --- over a socket ----------------------------------------------------------------------------------------------
 
 
 def test_avatar_software_on_this_machine_is_seen():
-    sight = open_vmc(":".join(("127.0.0.1", str(free_port()))))
+    sight = open_vmc(str(free_port()))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.sendto(bundle(blend("jawOpen", 0.0), APPLY), sight.address)
         sight.at(1e9)
         out.sendto(bundle(blend("jawOpen", 0.5), APPLY), sight.address)
         assert sight.at(1e9).face.blendshapes[BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5, abs=0.01)
-    with pytest.raises(PortError, match="vmc: UDP port .* is used by another program"):
-        open_vmc(str(sight.address[1]))
-    sight.close()
-
-
-def test_only_this_machine_is_heard_unless_told_otherwise():
-    sight = open_vmc(str(free_port()))
     assert sight.address[0] == "127.0.0.1"
     sight.close()
-
-
-def test_an_argument_that_cannot_be_used_is_one_line():
-    with pytest.raises(ConfigError, match="is no UDP port"):
-        open_vmc("avatar")
 
 
 def free_port():

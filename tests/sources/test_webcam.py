@@ -12,8 +12,18 @@ from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.face.drawing import VirtualWebcam
 from sfms_robot.lab.bench.webcam_bench import face_of, webcam, write_video
 from sfms_robot.sources.live_face import FaceArgument, LiveFace
-from sfms_robot.sources.webcam import Webcam, open_webcam
-from sfms_robot.sources.webcam_worker import Landmarker, Opened, Seen, SeenFace, live, open_video, played, watch
+from sfms_robot.sources.webcam import (
+    Landmarker,
+    SeenFace,
+    SeenPicture,
+    Webcam,
+    WebcamOpened,
+    live,
+    open_video,
+    open_webcam,
+    played,
+    watch,
+)
 from sfms_robot.sources.worker import SourceWorker
 
 pytestmark = pytest.mark.realtime
@@ -25,7 +35,8 @@ FACE = SeenFace(face_of(pitch=0.1), PLACE_M)
 
 def seen(time_s, face=FACE, others=0, dark=False):
     """A picture of loop time `time_s`, known 20 ms later."""
-    return Seen(ORIGIN_S + time_s, ORIGIN_S + time_s + 0.02, face, others, dark)
+    taken_s = ORIGIN_S + time_s
+    return SeenPicture(taken_s=taken_s, known_s=taken_s + 0.02, face=face, others=others, dark=dark)
 
 
 @pytest.fixture
@@ -118,7 +129,7 @@ def test_a_video_waits_for_its_time_and_leaves_out_what_is_late(grey_video):
 
 def test_a_worker_says_what_it_opened_and_waits_to_be_told_when_to_begin(grey_video):
     work = watch(grey_video)
-    assert next(work) == Opened(0.5)
+    assert next(work) == WebcamOpened(0.5)
     assert work.send(None) is None
     first = work.send(time.monotonic())
     while first is None:

@@ -7,8 +7,7 @@ from contextlib import closing
 import pytest
 from chromium import Page, missing
 
-from sfms_robot.app.fleet.fleet_client import Fleet, fleet_page
-from sfms_robot.app.fleet.fleet_head import FleetControls, FleetHead, fleet_key
+from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key, fleet_page
 from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt

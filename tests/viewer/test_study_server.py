@@ -1,7 +1,6 @@
 """The page of a blind comparison, on a real socket and in a real browser."""
 
 import json
-import shutil
 import socket
 import threading
 import urllib.error
@@ -17,6 +16,7 @@ from sfms_robot.lab.evaluate.people_study import Study, clip_name, read_answers
 from sfms_robot.viewer.study_server import study_app
 
 LIMIT_S = 60.0
+QUIET = ("--autoplay-policy=no-user-gesture-required", "--mute-audio")
 VOICE_S = 0.6
 
 
@@ -51,7 +51,8 @@ class Served:
 
     def ask(self, path, told=None, **headers):
         data = None if told is None else told if isinstance(told, bytes) else json.dumps(told).encode()
-        request = urllib.request.Request(self.url + path, data, {k.replace("_", "-"): v for k, v in headers.items()})
+        headers = {"Content-Type": "application/json"} | {k.replace("_", "-"): v for k, v in headers.items()}
+        request = urllib.request.Request(self.url + path, data, headers)
         try:
             with urllib.request.urlopen(request, timeout=LIMIT_S) as answer:
                 return answer.status, answer.read()
@@ -102,38 +103,21 @@ def test_strangers_and_files_beside_the_clips_are_refused(study):
 
 
 @pytest.mark.slow
-def test_in_a_browser_by_keys(study):
-    if not shutil.which("chromium") or not shutil.which("chromedriver"):
-        pytest.skip("needs chromium and chromedriver")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for flag in (
-        "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-        "--autoplay-policy=no-user-gesture-required", "--mute-audio", "--disable-background-networking",
-    ):  # fmt: skip
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which("chromedriver")))
-    wait = WebDriverWait(browser, LIMIT_S)
-    try:
-        with Served(study_app(study)) as served:
-            browser.get(served.url)
-            wait.until(lambda _: browser.execute_script("return !document.getElementById('trial').hidden"))
-            keys(browser, "\ue012")  # arrow left, before anything was seen
-            assert not study.results()["answers"]
-            for side in ("1", "2"):
-                keys(browser, side)
-                wait.until(lambda _: not browser.execute_script("return document.body.dataset.playing"))
-            wait.until(lambda _: browser.execute_script("return !document.querySelector('fieldset').disabled"))
-            for arrow in "\ue012\ue014\ue015\ue012":  # left, right, down, left
-                keys(browser, arrow)
-            wait.until(lambda _: browser.execute_script("return document.getElementById('progress').value") == 1)
-            assert [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
-    finally:
-        browser.quit()
+@pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")
+def test_in_a_browser_by_keys(study, tmp_path):
+    with Served(study_app(study)) as served, Page(tmp_path / "chromium", *QUIET) as page:
+        page.driver.get(served.url)
+        page.until("!document.getElementById('trial').hidden")
+        keys(page.driver, "\ue012")  # arrow left, before anything was seen
+        assert not study.results()["answers"]
+        for side in ("1", "2"):
+            keys(page.driver, side)
+            page.until("!document.body.dataset.playing")
+        page.until("!document.querySelector('fieldset').disabled")
+        for arrow in "\ue012\ue014\ue015\ue012":  # left, right, down, left
+            keys(page.driver, arrow)
+        page.until("document.getElementById('progress').value == 1")
+        assert page.complaints() == []
     given = read_answers(study.folder / "answers.csv")
     sides = ["neither" if a.chosen == "neither" else "left" if a.chosen == a.left else "right" for a in given]
     assert sides == ["left", "right", "neither", "left"]

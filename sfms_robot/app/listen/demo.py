@@ -17,7 +17,7 @@ from sfms_robot.app.options import RunOptions, open_browser
 from sfms_robot.config import load_head
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = "sfms-demo"

@@ -1,42 +1,136 @@
-"""A run as its page shows it: 25 pictures a second, events as they are decided, once a second how it is.
+"""A run as its page receives it: its facts at the start, 25 pictures a second, events as they are decided, recordings.
 
-The loop packs a picture's numbers and hands them over, 25 times a second; they are turned into text in the page's
-process. What takes a millisecond, once a second, is done by a thread.
+The loop packs a picture's numbers and hands them over; they are turned into text in the page's process. Work of a
+millisecond, once a second, is done by a thread.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, Reading, SpeakerFrame
+from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
+from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.config import Calmness, Head
+from sfms_robot.config.listener import load_listener
+from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.listeners.events.model import load_tables
+from sfms_robot.plugins import listener_folder
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.planned_events import PlannedEvents
+from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
+from sfms_robot.viewer.page_messages import NOTHING, VERSION, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-TOLD_S: Final = 1.0  # between two documents, and two looks for events in the plans of a listener that decides none
-_WAITING: Final = 50  # plans that nobody has looked at
+TELL_S: Final = 1.0  # between two documents, and two looks for events in the plans of a listener that decides none
+LONGEST_S: Final = 300.0  # of one recording; what comes after it is left out
+_WAITING: Final = 50  # plans that wait for the thread
 _EPS_FRAMES: Final = 1e-6
 
-T = TypeVar("T")
+
+def _both(**values: float) -> dict[str, float]:
+    """Return the values of pairs of channels, left and right."""
+    return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
+
+
+# Faces by name, for buttons of a page: channels of `frames.CHANNELS`, everything else is left to the listener.
+NAMED_EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
+    "smile": _both(mouthSmile=0.8, cheekSquint=0.4, eyeSquint=0.2),
+    "laugh": {**_both(mouthSmile=1.0, cheekSquint=0.8, eyeSquint=0.5), "jawOpen": 0.35, "pitch": -0.08},
+    "surprise": {**_both(browOuterUp=0.9, eyeWide=0.9), "browInnerUp": 0.9, "jawOpen": 0.4},
+    "doubt": {"browDownLeft": 0.6, "browOuterUpRight": 0.8, "mouthLeft": 0.4, "roll": 0.12},
+    "frown": _both(browDown=0.9, eyeSquint=0.3, mouthFrown=0.3),
+    "sad": {**_both(mouthFrown=0.8), "browInnerUp": 0.8, "mouthShrugLower": 0.4, "pitch": 0.15},
+    "disgust": _both(noseSneer=0.9, mouthUpperUp=0.6, browDown=0.5, eyeSquint=0.4),
+    "kiss": {"mouthPucker": 0.9, "mouthFunnel": 0.2},
+    "wink": {"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.6, "mouthSmileLeft": 0.5},
+    "eyes closed": _both(eyeBlink=1.0),
+}
+
+
+def page_facts(
+    head: Head,
+    *,
+    port: str,
+    listener: str,
+    speaker: str | None,
+    seed: int,
+    calmness: Calmness,
+    people: Mapping[str, float],
+    knobs: LiveKnobs,
+    source: Mapping[str, bool],
+    choices: bool,
+) -> dict[str, Any]:
+    """Return the `hello` of docs/protocol.md, but for what visitors differ in.
+
+    Args:
+        speaker: name of the recorded person; None: a live person.
+        people: see `people_per_minute`.
+        source: what a visitor may bring of the person.
+        choices: another listener, speaker or seed may be chosen.
+    """
+    return {
+        "version": VERSION,
+        "head": head.name,
+        "port": port,
+        "listener": Path(listener).name,
+        "speaker": speaker,
+        "seed": seed,
+        "listeners": _lines(shipped_listeners()) if choices else [],
+        "speakers": _lines(shipped_speakers()) if choices else [],
+        "joints": [
+            {
+                "name": name,
+                **{key: getattr(joint, key) for key in ("min_rad", "max_rad", "rest_rad", "bus", "id", "model")},
+            }
+            for name, joint in head.joints.items()
+        ],
+        "urdf_joints": list(head.joints),
+        "urdf": None,
+        "channels": list(CHANNELS),
+        "regions": list(knobs),
+        "expressions": NAMED_EXPRESSIONS,
+        **knobs.values,
+        "calmness": calmness.model_dump(exclude={"addressed"}),
+        "people_per_minute": dict(people),
+        "human": "human/head.bin",
+        "source": dict(source),
+        "replay": False,
+    }
+
+
+def people_per_minute(listener: str) -> dict[str, float]:
+    """Return events a minute by kind, as learned from people: the meaning of a rate of None. {}: none are decided.
+
+    A listener of another package or machine may decide them; what it learned is not known here, so it is taken for a
+    shipped one. Raises ConfigError.
+    """
+    folder = listener_folder(listener)
+    if folder is not None and not load_listener(folder / "config.yaml").events:
+        return {}
+    return {kind: hazard.per_minute for kind, hazard in load_tables().hazards.items()}
+
+
+def _lines(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    return [{"name": row["name"], "line": row["description"]} for row in rows]
 
 
 class PageObserver(Observer):
-    """`ports.Observer`. The page is closed by the code that opened it.
+    """`ports.Observer` that shows a run on a page, which is closed by the code that opened it.
 
     Args:
         joints: names, in the order of `Tick.goals_rad`.
 
     Attributes:
-        document: how the run is, for who looks: see `runtime.observers`; None: not known yet.
+        document: returns the state of the run (`runtime.observers`); None: not known yet.
     """
 
     def __init__(self, page: PageProcess, joints: Sequence[str]) -> None:
@@ -53,17 +147,19 @@ class PageObserver(Observer):
         self._events = PlannedEvents()  # of the thread that sends
 
     def tick(self, seen: Tick) -> None:
+        """Send a picture, 25 times a second, and once a second the state of the run."""
         index = math.floor(seen.time_s * FRAME_HZ + _EPS_FRAMES)
         if index == self._index:
             return
         self._index = index
         self._page.watch(seen.time_s)
-        self._page.show(self._packed(seen))
-        if seen.time_s - self._told_s >= TOLD_S:
+        self._page.show(self._picture(seen))
+        if seen.time_s - self._told_s >= TELL_S:
             self._told_s = seen.time_s
             self._page.later(self._tell)
 
     def heard(self, frame: SpeakerFrame) -> None:
+        """Measure the levels of both voices."""
         self._frame = frame
         self._voice_db = energy_db(frame.audio) if len(frame.audio) else NOTHING
         if len(frame.audio):
@@ -71,38 +167,39 @@ class PageObserver(Observer):
         self._own_db = NOTHING if frame.agent_audio is None else energy_db(frame.agent_audio)
 
     def planned(self, plan: Plan) -> None:
+        """Keep hazards, and have events sent."""
         self._plans.append(plan)
         self._hazards_hz = plan.hazards_hz
         if plan.events:
             self._page.later(self._tell_events)
 
-    def _packed(self, seen: Tick) -> bytes:
+    def _picture(self, seen: Tick) -> bytes:
         frame = self._frame
-        place_m = None if frame is None else frame.place_m
-        attention = None if frame is None else frame.attention
         return pack_picture(
-            Picture(
-                seen.time_s, seen.motion, seen.goals_rad, self._read_rad(seen), self._rare_json(seen),
-                self._voice_db, self._own_db, NOTHING if attention is None else attention,
-                (NOTHING, NOTHING, NOTHING) if place_m is None else place_m, self._ear.active,
-            )
+            seen.time_s, seen.motion, seen.goals_rad, self._read_rad(seen), self._rare_json(seen),
+            voice_db=self._voice_db, own_voice_db=self._own_db, talking=self._ear.active,
+            attention=None if frame is None else frame.attention, place_m=None if frame is None else frame.place_m,
         )  # fmt: skip
 
     def _tell(self) -> None:
-        """Once a second; some milliseconds."""
+        """Send events and the state of the run; takes some milliseconds."""
         self._tell_events()
         if self.document is not None and self._page.visitors:
             self._page.say("status", status=self.document())
 
     def _tell_events(self) -> None:
-        for plan in _drained(self._plans):
-            self._events.join(plan)
+        while self._plans:
+            self._events.join(self._plans.popleft())
         for event in self._events.news():
             self._page.say("event", **_event(event))
 
     def _read_rad(self, seen: Tick) -> Floats:
-        """(J,) NaN where nothing was read of late: legs of a platform read at other times fit no pose of today's."""
-        read = (_position_rad(seen.readings.get(joint)) for joint in self._joints)
+        """Return (J,) angles; NaN without a recent one: legs of a platform read at other times fit no pose of now."""
+        readings = (seen.readings.get(joint) for joint in self._joints)
+        read = (
+            math.nan if each is None or each.position_rad is None or each.age_s > AWAY_S else each.position_rad
+            for each in readings
+        )  # fmt: skip
         return np.fromiter(read, np.float32, len(self._joints))
 
     def _rare_json(self, seen: Tick) -> bytes:
@@ -111,17 +208,6 @@ class PageObserver(Observer):
         if key != self._rare[0]:
             self._rare = (key, rare_json(*key))
         return self._rare[1]
-
-
-def _position_rad(reading: Reading | None) -> float:
-    if reading is None or reading.position_rad is None or reading.age_s > AWAY_S:
-        return math.nan
-    return reading.position_rad
-
-
-def _drained(waiting: deque[T]) -> Iterator[T]:
-    while waiting:
-        yield waiting.popleft()
 
 
 def _event(event: ListenerEvent) -> dict[str, Any]:
@@ -134,3 +220,59 @@ def _event(event: ListenerEvent) -> dict[str, Any]:
         "probability": None if event.probability is None else round(event.probability, 5),
         "evidence": {name: round(float(value), 3) for name, value in event.evidence.items()},
     }
+
+
+class PageRecorder(Observer):
+    """`ports.Observer` that passes a run on to a `Recorder` while a visitor records. `record`: in the page's thread.
+
+    Args:
+        folder: where recordings go, each into another folder.
+        about: see `Recorder`.
+    """
+
+    def __init__(self, page: PageProcess, folder: Path, joints: Sequence[str], about: Mapping[str, str]) -> None:
+        self._page, self._folder, self._joints, self._about = page, folder, tuple(joints), dict(about)
+        self._recorder: Recorder | None = None
+        self._into: Path | None = None
+        self._began_s = self._now_s = 0.0
+        self._tell(False, None)
+
+    def record(self, on: bool) -> None:
+        """Begin a recording, or end it and offer it for download; blocks until it is written. Raises ConfigError."""
+        if on and self._recorder is None:
+            into = self._folder / f"recording-{len(list(self._folder.iterdir())) + 1}"
+            recorder = Recorder(into, self._joints, about=self._about)
+            self._into, self._began_s, self._recorder = into, self._now_s, recorder
+            self._tell(True, 0.0)
+        elif not on:
+            self.close()
+
+    def tick(self, seen: Tick) -> None:
+        """Record a tick."""
+        self._now_s = seen.time_s
+        if recorder := self._at(seen.time_s):
+            recorder.tick(seen)
+
+    def heard(self, frame: SpeakerFrame) -> None:
+        """Record a frame."""
+        if recorder := self._at(frame.time_s):
+            recorder.heard(frame)
+
+    def planned(self, plan: Plan) -> None:
+        """Record a plan."""
+        if recorder := self._at(plan.made_at_s):
+            recorder.planned(plan)
+
+    def close(self) -> None:
+        """End the recording that is in progress."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is not None:
+            recorder.close()
+            self._tell(False, min(LONGEST_S, math.ceil(self._now_s - self._began_s)))
+
+    def _at(self, time_s: float) -> Recorder | None:
+        return self._recorder if time_s - self._began_s <= LONGEST_S else None
+
+    def _tell(self, on: bool, seconds: float | None) -> None:
+        file = None if on or self._into is None else str(self._into / RUN_FILE)
+        self._page.say("recorded", file=file, record={"on": on, "seconds": seconds})

@@ -1,4 +1,4 @@
-"""What the page's process runs: the server of `viewer`, with the robot's picture and its forward kinematics."""
+"""Main function of the page's process: the server of `viewer`, with the robot's picture and its forward kinematics."""
 
 from __future__ import annotations
 

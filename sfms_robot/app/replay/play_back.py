@@ -17,7 +17,7 @@ import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
-from sfms_robot.app.listen.page_facts import page_facts
+from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.report import figures_so_far, outcome
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
@@ -30,8 +30,8 @@ from sfms_robot.runtime.halt import HaltLatch, halt_signals
 from sfms_robot.runtime.observers import RunStatus
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
-from sfms_robot.viewer.frame_record import NOTHING, Picture, pack_picture, rare_json
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
+from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
 LEFT_S: Final = 5.0  # without a visitor, after which the page ends
@@ -129,16 +129,14 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
             states.pop(0)
         faults = {recording.joints[joint]: FAULTY for joint in np.flatnonzero(recording.faults[row])}
         yield pack_picture(
-            Picture(
-                time_s=time_s,
-                motion=recording.motion[row],
-                asked_rad=recording.goals_rad[row].astype(np.float64),
-                read_rad=recording.present_rad[row],
-                rare=rare_json(states[0][1], states[0][2], faults, None),
-                voice_db=float(recording.energy_db[frame]) if 0 <= frame < len(recording.heard_s) else NOTHING,
-                own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
-                talking=bool(talking),
-            )
+            time_s,
+            recording.motion[row],
+            recording.goals_rad[row].astype(np.float64),
+            recording.present_rad[row],
+            rare_json(states[0][1], states[0][2], faults, None),
+            voice_db=float(recording.energy_db[frame]) if 0 <= frame < len(recording.heard_s) else NOTHING,
+            own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
+            talking=bool(talking),
         )
 
 

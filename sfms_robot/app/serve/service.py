@@ -21,10 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.loopback_server import Answer, Document, LoopbackServer
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
-from sfms_robot.errors import ConfigError, ModelError, PacketError, PortError, RobotError, optional
+from sfms_robot.endpoint import HIGHEST_PORT, port_number
+from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
 from sfms_robot.listeners.capacity import Capacity
 from sfms_robot.listeners.remote import ROOT, down_key, join_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
@@ -34,6 +33,8 @@ from sfms_robot.processes import Child, Ended, cores
 
 if TYPE_CHECKING:
     import zenoh
+
+    from sfms_robot.viewer.web_server import Document, LocalServer
 
 FIGURES_LIMIT_S: Final = 2.0  # for the figures of a process; later, its last ones count
 CLOSE_LIMIT_S: Final = 1.0
@@ -322,31 +323,30 @@ def serve(
 # --- figures for Prometheus -----------------------------------------------------------------------------------------
 
 
-def metrics_server(wanted: str) -> LoopbackServer:
+def metrics_server(wanted: str) -> LocalServer:
     """Bind the port of `serve --metrics [HOST:]PORT`: figures for Prometheus, by prometheus_client.
 
     `wanted`: a port, "0" for any that is free; HOST:PORT beyond loopback. Raises ConfigError, MissingExtra, PortError.
     """
     with optional("--metrics"):
-        import prometheus_client  # noqa: F401
+        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+    from starlette.requests import Request
+    from starlette.responses import Response
+    from starlette.routing import Route
+
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:
         valid = f"0 to {HIGHEST_PORT}, 0 for a free one, HOST:PORT"
         raise ConfigError(f"--metrics {wanted}: not a TCP port (valid: {valid})")
-    try:
-        server = LoopbackServer(port, _Answer, "metrics", host=host or LOOPBACK)
-    except OSError as error:
-        raise PortError(f"--metrics {wanted}: {error.strerror or error}") from error
+
+    def routes(statistics: Document) -> list[Route]:
+        def metrics(request: Request) -> Response:
+            return Response(generate_latest(_Collector(statistics)), media_type=CONTENT_TYPE_LATEST)
+
+    server = LocalServer("--metrics", routes, host or LOOPBACK, port)
     server.url += "metrics"
     return server
-
-
-class _Answer(Answer):
-    def do_GET(self) -> None:
-        from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-
-        self.answer(200, generate_latest(_Collector(self.server.document)), CONTENT_TYPE_LATEST)
 
 
 class _Collector:

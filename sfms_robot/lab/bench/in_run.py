@@ -13,7 +13,7 @@ from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
 from sfms_robot.lab.bench.measure import HEAD
 from sfms_robot.listeners.process import threads
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 RUN_S: Final = 8.0
 VOICE: Final = "katie"

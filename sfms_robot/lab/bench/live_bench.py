@@ -54,8 +54,7 @@ from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.sources.live_link import open_live_link
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.push import PushedVoice
-from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER, voice_file
+from sfms_robot.sources.registry import DEFAULT_SPEAKER, open_source, voice_file
 
 Audio = Literal["mic", "push"]
 MINUTES: Final = 10.0

@@ -41,7 +41,7 @@ from sfms_robot.listeners.remote_messages import (
 )
 from sfms_robot.listeners.stream_server import DEADLINE_S
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.sources.speakers import voice_file
+from sfms_robot.sources.registry import voice_file
 
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 SPEAKER: Final = "katie"

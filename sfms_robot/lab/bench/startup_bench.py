@@ -27,7 +27,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.lab.bench.measure import HEAD, MAIN, Row, environment, row
 from sfms_robot.lab.bench.procfs import memory_mb
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 REPEATS: Final = 5
 RUN_S: Final = 1.0

@@ -38,7 +38,7 @@ from sfms_robot.listeners.thread import HUNG_S, LATE_S
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.runtime.states import ARROWS
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 Change = tuple[float, str, tuple[str, ...]]  # time_s, state, why
 

@@ -37,7 +37,7 @@ from sfms_robot.lab.bench.measure import HEAD, Told, machine, row
 from sfms_robot.lab.bench.procfs import processor_time_s
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import Child, ParentPipe
-from sfms_robot.sources.speakers import DEFAULT_SPEAKER
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import THREAD, PageProcess
 
 SETTLE_S: Final = 4.0

@@ -21,8 +21,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.face.drawing import PLACE_M, SIZE_PX, VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 from sfms_robot.lab.bench.measure import Told, times
-from sfms_robot.sources.webcam import open_webcam
-from sfms_robot.sources.webcam_worker import Landmarker, Picture, SeenFace
+from sfms_robot.sources.webcam import Landmarker, Picture, SeenFace, open_webcam
 
 SEEN_CORRELATION: Final = 0.8  # a channel that follows this well, and this far, counts as seen
 SEEN_SLOPE: Final = 0.1

@@ -17,7 +17,7 @@ from sfms_robot.listeners.events.evidence import HEARD, Sensed
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.events import runs
-from sfms_robot.sources.speakers import shipped_speaker
+from sfms_robot.sources.registry import shipped_speaker
 
 MINUTES = 6
 FRAMES = MINUTES * 60 * FRAME_HZ

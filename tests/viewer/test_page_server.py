@@ -6,10 +6,7 @@ import json
 import pytest
 
 from sfms_robot.errors import PacketError
-from sfms_robot.viewer.visitor_commands import Command
-from sfms_robot.viewer.visitors import IDLE_S, MOST_VISITORS, OUTBOX, Visitors
-
-HALT, SHOW = Command("halt", {}), Command("show", {})
+from sfms_robot.viewer.page_server import IDLE_S, MOST_VISITORS, OUTBOX, Visitors
 
 
 class Here:
@@ -36,14 +33,14 @@ def told(visitor):
 def test_who_does_something_first_has_the_controls_until_they_are_given_back() -> None:
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
-    here.visitors.admit(a, SHOW)
+    here.visitors.admit(a, "show")
     assert here.visitors.controls(a) == "you" and here.visitors.controls(b) == "other"
     assert told(b) == [{"type": "controls", "held": "other", "needs_token": False}]
-    with pytest.raises(PacketError, match="somebody else holds the controls"):
-        here.visitors.admit(b, SHOW)
+    with pytest.raises(PacketError, match="another visitor holds the controls"):
+        here.visitors.admit(b, "show")
     here.visitors.give(a)
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody"
-    here.visitors.admit(b, SHOW)
+    here.visitors.admit(b, "show")
     assert here.visitors.controls(b) == "you"
 
 
@@ -51,7 +48,7 @@ def test_anybody_may_halt() -> None:
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.take(a)
-    here.visitors.admit(b, HALT)
+    here.visitors.admit(b, "halt")
     assert here.visitors.controls(a) == "you"
 
 
@@ -77,23 +74,23 @@ def test_who_goes_leaves_the_controls() -> None:
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody" and len(here.visitors) == 1
 
 
-@pytest.mark.parametrize("command", [HALT, SHOW])
+@pytest.mark.parametrize("command", ["halt", "show"])
 def test_with_a_token_who_has_not_shown_it_only_looks(command) -> None:
     here = Here("secret")
     visitor = here.visitors.enter()
     with pytest.raises(PacketError, match="the token is needed"):
         here.visitors.admit(visitor, command)
     with pytest.raises(PacketError, match="the token is not the one"):
-        here.visitors.greeted(visitor, Command("hello", {"version": 1, "token": "guess"}))
+        here.visitors.greet(visitor, 1, "guess")
     assert not visitor.allowed
-    here.visitors.greeted(visitor, Command("hello", {"version": 1, "token": "secret"}))
+    here.visitors.greet(visitor, 1, "secret")
     here.visitors.admit(visitor, command)
 
 
-def test_a_page_of_another_version_is_told_to_be_loaded_anew() -> None:
+def test_a_page_of_another_version_is_to_be_loaded_again() -> None:
     here = Here()
-    with pytest.raises(PacketError, match="this page is of version 0, not 1: load it anew"):
-        here.visitors.greeted(here.visitors.enter(), Command("hello", {"version": 0, "token": ""}))
+    with pytest.raises(PacketError, match="version: expected 1, got 0: load the page again"):
+        here.visitors.greet(here.visitors.enter(), 0, "")
 
 
 def test_there_is_room_for_some_and_not_for_all() -> None:

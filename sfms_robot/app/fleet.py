@@ -1,0 +1,442 @@
+"""Heads among others, over zenoh: `run --fleet NAME` (`FleetHead`), `sfms-robot fleet` (`Fleet`) and its page.
+
+    sfms/NAME/state     the status document (`RunStatus`) as JSON: once a second, at every change of state, and as
+                        the answer to a query; with a `nonce`, and `malformed`, the count of refused messages
+    sfms/NAME/command   JSON, as a query that is answered {"done": command} or {"error": line}, or as a put:
+                        {"command": "halt"}
+                        {"command": "resume", "proof": hex} {"command": "end", "proof": hex}
+                        {"command": "calm", "rates": {kind: per minute}}
+                        {"command": "knobs", "intensity": {region: value}, "style": {region: value}}
+    sfms/NAME/halt      anything that is put here halts the head; the text names the sender. sfms/*/halt halts all
+
+`proof` is an HMAC by the fleet's key over name, command and nonce (`proof`): the key itself is never sent, and a nonce
+counts once, so that a message that was overheard is of no use.
+
+The network may be away: the head continues, and sends again when it is back. Halting by network is a convenience: an
+emergency stop is a switch on the head (docs/safety.md).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import os
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
+
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+
+from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
+from sfms_robot.config import Calmness
+from sfms_robot.config.base import Finite, one_line, parse
+from sfms_robot.config.overlay import config_folder
+from sfms_robot.endpoint import LOOPBACK
+from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.network import AWAY_S, LOCAL, Connection, Router, check_name, session_config
+from sfms_robot.ports import Observer, Tick
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from sfms_robot.viewer.web_server import LocalServer
+
+ROOT: Final = "sfms"
+TAKEN: Final = ("listen",)  # names whose keys mean something else
+TELL_S: Final = 1.0
+ASK_S: Final = 2.0  # that heads have to answer
+GONE_S: Final = 3.0  # a head without news for so long is away
+PORT: Final = 8776
+PAGE: Final = Path(__file__).with_name("fleet_page.html")
+_LONGEST: Final = 4096
+_LONGEST_NAME: Final = 80
+_SHORTEST_KEY: Final = 32
+
+Document = Mapping[str, Any]
+
+log = logging.getLogger(__name__)
+
+
+def fleet_name(name: str) -> str:
+    """Return the name of a head. Raises ConfigError for one that it cannot have."""
+    if name in TAKEN:
+        raise ConfigError(f"--fleet {name!r}: that name is taken ({', '.join(TAKEN)})")
+    return check_name(name, "--fleet")
+
+
+def fleet_key(file: Path | None) -> bytes:
+    """Return the key in `file` (None: `fleet.key` beside the overlays of heads), which is made if it is not there.
+
+    Raises ConfigError for a file that others can read, or that holds no key.
+    """
+    file = file or config_folder() / "fleet.key"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="ascii") as made:
+            made.write(secrets.token_hex(32))
+    if (mode := file.stat().st_mode & 0o777) & 0o077:
+        raise ConfigError(f"--fleet-key {file}: expected mode 600, got {mode:o}: chmod 600 {file}")
+    key = file.read_bytes().strip()
+    if len(key) < _SHORTEST_KEY:
+        raise ConfigError(f"--fleet-key {file}: expected a key of {_SHORTEST_KEY} characters or more, got {len(key)}")
+    return key
+
+
+def proof(key: bytes, name: str, command: str, nonce: str) -> str:
+    """Return what shows a head that the sender of a command holds the key: HMAC-SHA256 of "NAME COMMAND NONCE", hex."""
+    return hmac.new(key, f"{name} {command} {nonce}".encode(), "sha256").hexdigest()
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+class _Halt(BaseModel):
+    command: Literal["halt"]
+    by: Any = ""
+
+
+class _Keyed(BaseModel):
+    """A command that needs the fleet's key."""
+
+    command: Literal["resume", "end"]
+    proof: Any = None
+
+
+class _Calm(BaseModel):
+    command: Literal["calm"]
+    rates: dict[str, Any] = {}
+
+
+class _Knobs(BaseModel):
+    command: Literal["knobs"]
+    intensity: dict[str, Annotated[Finite, Field(strict=True)]] = {}
+    style: dict[str, Annotated[Finite, Field(strict=True)]] = {}
+
+
+_Command = Annotated[_Halt | _Keyed | _Calm | _Knobs, Field(discriminator="command")]
+_COMMAND: Final[TypeAdapter[_Command]] = TypeAdapter(_Command)
+
+
+class FleetControls:
+    """Carries out commands on a run, from any thread.
+
+    Attributes:
+        nonce: goes into the proof of the next command that needs the key.
+    """
+
+    def __init__(
+        self,
+        halt: HaltLatch,
+        interrupt: Interrupt,
+        knobs: LiveKnobs | None,
+        calm: Callable[[Calmness], None] | None,
+    ) -> None:
+        self._lock = threading.Lock()
+        self.nonce = secrets.token_hex(8)
+        self._halt, self._interrupt, self._knobs, self._calm = halt, interrupt, knobs, calm
+
+    def halt(self, by: str) -> None:
+        """Halt; `by` is the name that the client gives itself."""
+        name = "".join(each for each in by if each.isprintable())[:_LONGEST_NAME].strip()
+        self._halt.close(name or "the fleet", "fleet")
+
+    def obey(self, message: bytes, name: str = "", key: bytes | None = None) -> dict[str, str]:
+        """Return the effect of a command, or why it has none. Never raises.
+
+        `name`: of the head; `key`: of the fleet, which `_Keyed` commands need; None where none is needed.
+        """
+        try:
+            command = _COMMAND.validate_json(message if len(message) <= _LONGEST else b"")
+            self._do(command, name, key)
+        except ValidationError as error:
+            return {"error": " ".join(one_line(error.errors()[0]).split())}
+        except RobotError as error:
+            return {"error": str(error).splitlines()[0]}
+        return {"done": command.command}
+
+    def _do(self, command: _Command, name: str, key: bytes | None) -> None:
+        match command:
+            case _Halt():
+                self.halt(str(command.by))
+            case _Keyed():
+                if key is not None:
+                    self._check_proof(command, name, key)
+                if command.command == "end":
+                    self._interrupt.ask()
+                else:
+                    self._halt.resume("fleet")
+            case _Calm():
+                calmness = parse(Calmness, command.rates, "calm")
+                if self._calm is None:
+                    raise ConfigError("calm: this run's listener decides no events")
+                self._calm(calmness)
+            case _Knobs():
+                if self._knobs is None:
+                    raise ConfigError("knobs: this run has none")
+                for kind in KNOB_KINDS:
+                    for region, value in getattr(command, kind).items():
+                        setattr(self._knobs[region], kind, value)
+
+    def _check_proof(self, command: _Keyed, name: str, key: bytes) -> None:
+        """Raise ConfigError unless a command comes from a holder of the key; the nonce is used up then."""
+        with self._lock:
+            wanted = proof(key, name, command.command, self.nonce)
+            given = str(command.proof).encode(errors="replace")
+            if not hmac.compare_digest(wanted.encode(), given):
+                raise ConfigError(
+                    f"{command.command}: proof: expected the fleet's key (--fleet-key) and the last nonce"
+                )
+            self.nonce = secrets.token_hex(8)
+
+
+class FleetHead(Observer):
+    """`ports.Observer` that sends the state of a run to the fleet, in a thread.
+
+    Args:
+        name: of this head among others.
+        document: returns the state that is sent.
+        router: that joins the fleet.
+        key: of the fleet (`fleet_key`); None: commands need none.
+
+    Raises ConfigError, MissingExtra.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        document: Callable[[], Document],
+        controls: FleetControls,
+        router: Router = LOCAL,
+        key: bytes | None = None,
+    ) -> None:
+        self._key = key
+        self._name, self._document, self._controls = fleet_name(name), document, controls
+        self._connection = Connection(session_config("call", router))
+        self._changed = threading.Condition()
+        self._news = self._over = False
+        self._malformed = 0
+        self._state: tuple[str, tuple[str, ...]] = ("", ())
+        self._thread = threading.Thread(target=self._work, name="fleet", daemon=True)
+        self._thread.start()
+
+    def tick(self, seen: Tick) -> None:
+        """Send the state soon where it has changed."""
+        state = seen.state, seen.why
+        if state != self._state:
+            self._state = state
+            with self._changed:
+                self._news = True
+                self._changed.notify()
+
+    def close(self) -> None:
+        """Send how the run ended, and disconnect. Idempotent."""
+        with self._changed:
+            self._over = True
+            self._changed.notify()
+        self._thread.join(TELL_S)
+        self._connection.close()
+
+    def _work(self) -> None:
+        session = None
+        while session is None:
+            try:
+                session = self._connection.wait(TELL_S)
+            except RobotError as error:
+                log.error("fleet: %s; the head continues without it", error)
+                return
+            if self._over:
+                return
+        key = f"{ROOT}/{self._name}"
+        session.declare_queryable(f"{key}/state", lambda query: query.reply(f"{key}/state", self._state_json()))
+        session.declare_queryable(f"{key}/command", self._on_query)
+        session.declare_subscriber(f"{key}/command", lambda sample: self._obey(sample.payload.to_bytes()))
+        session.declare_subscriber(f"{key}/halt", self._on_halt)
+        while True:
+            session.put(f"{key}/state", self._state_json())
+            with self._changed:
+                if self._over:
+                    return
+                self._changed.wait_for(lambda: self._news or self._over, TELL_S)
+                self._news = False
+
+    def _state_json(self) -> bytes:
+        more = {"name": self._name, "nonce": self._controls.nonce, "malformed": self._malformed}
+        return json.dumps({**self._document(), **more}, allow_nan=False).encode()
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        answer = self._obey(b"" if query.payload is None else query.payload.to_bytes())
+        query.reply(f"{ROOT}/{self._name}/command", json.dumps({"name": self._name, **answer}).encode())
+
+    def _obey(self, message: bytes) -> dict[str, str]:
+        answer = self._controls.obey(message, self._name, self._key)
+        if "error" in answer:
+            self._malformed += 1
+            if self._malformed == 1:
+                log.warning("fleet: %s/%s/command: %s (more are only counted)", ROOT, self._name, answer["error"])
+        return answer
+
+    def _on_halt(self, sample: zenoh.Sample) -> None:
+        self._controls.halt(sample.payload.to_bytes()[:_LONGEST_NAME].decode(errors="replace"))
+
+
+# --- the other side -------------------------------------------------------------------------------------------------
+
+
+class Fleet:
+    """A connection to the router that joins the heads. Opens in `__enter__`, which waits for `AWAY_S` at most.
+
+    Attributes:
+        malformed: count of messages that hold no document.
+
+    Raises PortError when no router answers, ConfigError, MissingExtra.
+    """
+
+    def __init__(self, zenoh: Path | None = None, insecure: bool = False, key: Path | None = None) -> None:
+        self._router, self._key = Router(zenoh, insecure), key
+        self.malformed = 0
+        self._connection: Connection | None = None
+        self._session: Any = None
+
+    def __enter__(self) -> Self:
+        self._connection = Connection(session_config("call", self._router))
+        self._session = self._connection.wait(AWAY_S)
+        if self._session is None:
+            self._connection.close()
+            raise PortError(f"no answer at {self._router}: is `sfms-robot serve`, or another zenoh router, running?")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._connection is not None:
+            self._connection.close()
+
+    def states(self) -> list[Document]:
+        """Return the status document of every head that answers, by name. Blocks for `ASK_S` at most."""
+        found = self._ask(f"{ROOT}/*/state", b"")
+        return sorted(found, key=lambda each: str(each.get("name")))
+
+    def command(self, heads: Sequence[str], command: Document) -> list[Document]:
+        """Send a command to `heads`, or all where none is named; return their answers."""
+        keys = [f"{ROOT}/{fleet_name(head)}/command" for head in heads] or [f"{ROOT}/*/command"]
+        return [answer for key in keys for answer in self._ask(key, json.dumps(dict(command)).encode())]
+
+    def resume(self, heads: Sequence[str]) -> list[Document]:
+        """Resume `heads`, or all, by the fleet's key. Raises ConfigError for a key that cannot be used."""
+        key = fleet_key(self._key)
+        answers: list[Document] = []
+        for each in self.states():
+            name = str(each.get("name"))
+            if not heads or name in heads:
+                signed = proof(key, name, "resume", str(each.get("nonce")))
+                answers += self.command([name], {"command": "resume", "proof": signed})
+        return answers
+
+    def halt(self, heads: Sequence[str], by: str) -> list[Document]:
+        """Halt `heads`, or all; sent twice: on the keys for halting, which need no answer, and as a command."""
+        for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
+            self._session.put(key, by.encode())
+        return self.command(heads, {"command": "halt", "by": by})
+
+    def follow(self, receive: Callable[[Document], None]) -> None:
+        """Call `receive` with every document from now on, in a thread of zenoh's."""
+        self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._read(sample, receive))
+
+    def _ask(self, key: str, payload: bytes) -> list[Document]:
+        answers: list[Document] = []
+        for reply in self._session.get(key, payload=payload, timeout=ASK_S):
+            if reply.ok is not None:
+                self._read(reply.ok, answers.append)
+        return answers
+
+    def _read(self, sample: Any, receive: Callable[[Document], None]) -> None:
+        try:
+            given = json.loads(sample.payload.to_bytes())
+        except (ValueError, RecursionError):
+            given = None
+        if isinstance(given, dict) and isinstance(given.get("person") or {}, dict):
+            receive(given)
+            return
+        self.malformed += 1
+        if self.malformed == 1:
+            log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
+
+
+class FleetBoard:
+    """The newest document of every head, and which heads are away. From any thread."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._heads: dict[str, tuple[float, Document]] = {}
+        self._lock = threading.Lock()
+
+    def put(self, document: Document) -> None:
+        """Take a document in."""
+        with self._lock:
+            self._heads[str(document.get("name", "?"))] = (self._now_s(), document)
+
+    def tiles(self) -> list[dict[str, Any]]:
+        """Return what a page shows of each head, by name."""
+        with self._lock:
+            heads = sorted(self._heads.items())
+        return [tile(name, document, self._now_s() - at_s) for name, (at_s, document) in heads]
+
+
+def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
+    """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
+    state = str(document.get("state", "?"))
+    return {
+        "name": name,
+        **{key: document.get(key) for key in ("head", "listener", "port", "note", "time_s", "motion", "hottest")},
+        "here": age_s < GONE_S and state not in ("stopped", "fault"),
+        "age_s": round(age_s, 1),
+        "state": state,
+        "why": document.get("why", []),
+        "voice_db": (document.get("person") or {}).get("voice_db"),
+        "faults": document.get("faults", {}),
+    }
+
+
+def fleet_page(fleet: Fleet, port: int = PORT) -> LocalServer:
+    """Serve a tile per head and a button that halts all, on loopback, until `close`. Raises PortError.
+
+    GET /: the page. GET /heads: {"heads": [tile, ...]}. POST /halt, /resume: {"heads": [name, ...]}, none: all.
+    """
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse, JSONResponse, Response
+    from starlette.routing import Route
+
+    from sfms_robot.viewer.web_server import LocalServer, json_body
+
+    board = FleetBoard()
+    for document in fleet.states():
+        board.put(document)
+    fleet.follow(board.put)
+
+    def page(request: Request) -> Response:
+        inline = "default-src 'self' data: 'unsafe-inline'; frame-ancestors 'none'"
+        return HTMLResponse(PAGE.read_bytes(), headers={"content-security-policy": inline})
+
+    def tiles(request: Request) -> Response:
+        return JSONResponse({"heads": board.tiles()})
+
+    async def order(request: Request) -> Response:
+        heads = (await json_body(request)).get("heads", [])
+        if not isinstance(heads, list) or not all(isinstance(each, str) for each in heads):
+            raise ConfigError("heads: expected a list of names")
+        if request.url.path == "/resume":
+            answers = await asyncio.to_thread(fleet.resume, heads)
+        else:
+            answers = await asyncio.to_thread(fleet.halt, heads, "the fleet's page")
+        return JSONResponse({"answers": answers})
+
+    routes = [Route("/", page), Route("/heads", tiles)]
+    routes += [Route(path, order, methods=["POST"]) for path in ("/halt", "/resume")]
+    server = LocalServer("--port", lambda _: routes, LOOPBACK, port)
+    server.begin()
+    return server

@@ -1,0 +1,369 @@
+"""Web server of every door of this program: the page, the people study, status, metrics, the fleet's page.
+
+Each door is a list of routes. `application` puts them behind the access rules, `web_server` serves the application and
+limits what a client may cost, `LocalServer` does both in a thread. The rules, the same at each door:
+
+1. Host: a request that calls this machine by a name that is not its own is refused (`endpoint.host_problem`).
+2. Origin: WebSockets, and requests other than GET and HEAD, are refused to pages of other sites.
+3. Token: bound beyond loopback, commands and recordings need the token of the printed address.
+4. Time: a TLS handshake and the head of a request must be complete within `CONNECTION_S`.
+
+A process that has servos or listeners to serve uses a `LocalServer`: a connection is for one request and ends
+`CONNECTION_S` after it began, and the oldest of more than `MOST_CONNECTIONS` makes room for a new one. So a client that
+sends its request at once is answered beside any number of slow ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import logging
+import lzma
+import secrets
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import orjson
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from sfms_robot.endpoint import LOOPBACK, host_problem, is_loopback, listen, origin_problem, port_number, shown
+from sfms_robot.errors import ConfigError, InputError, RobotError
+from sfms_robot.viewer.page_process import Address
+
+MOST_CONNECTIONS: Final = 32
+CONNECTION_S: Final = 10.0
+LONGEST_BODY: Final = 4096  # bytes of a command
+STATUS_PORT: Final = 8775
+AUTO: Final = "auto"  # `--status` without a port: `STATUS_PORT`, or the next that is free
+OTHER_PORTS: Final = 20  # that are tried where the usual one is taken
+SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor: pictures that are a second old are of no use
+STATIC: Final = Path(__file__).with_name("static")
+_HEADERS: Final = {
+    "content-security-policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; "
+    "connect-src 'self' ws: wss:; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-cache",
+}
+_GZIP_LEVEL: Final = 6
+
+Document = Callable[[], Mapping[str, Any]]
+
+
+# --- the access rules -----------------------------------------------------------------------------------------------
+
+
+def application(routes: Sequence[BaseRoute]) -> ASGIApp:
+    """Return the application of some routes behind the access rules; a RobotError of a route is answered 400."""
+    app = Starlette(routes=list(routes), exception_handlers={RobotError: _refused})
+
+    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            return
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        problem = host_problem(host)
+        if problem is None and scope.get("method") not in ("GET", "HEAD"):  # a WebSocket has none
+            problem = origin_problem(headers.get("origin"), host)
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                answer = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    answer.setdefault(name, value)
+            await send(message)
+
+        inner = app if problem is None else PlainTextResponse(problem + "\n", 403)
+        await inner(scope, receive, with_headers)
+
+    return guarded
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    return PlainTextResponse(f"{error}\n", 400)
+
+
+async def json_body(request: Request) -> dict[str, Any]:
+    """Return the JSON object that a request carries; {} for an empty body. Raises InputError."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > LONGEST_BODY:
+            raise InputError(f"a message of more than {LONGEST_BODY} bytes")
+    if request.headers.get("content-type", "").partition(";")[0] != "application/json":  # others need no permission
+        raise InputError("a message is JSON (Content-Type: application/json)")
+    try:
+        given = orjson.loads(body or b"{}")
+    except orjson.JSONDecodeError:
+        given = None
+    if not isinstance(given, dict):
+        raise InputError("a message is one JSON object")
+    return given
+
+
+# --- connections ----------------------------------------------------------------------------------------------------
+
+
+class PromptConnection(H11Protocol):
+    """HTTP connection that ends when the head of a request is not complete in time."""
+
+    limit_s = CONNECTION_S
+    deadline: asyncio.TimerHandle
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._await_request()
+
+    def handle_events(self) -> None:
+        """Read what arrived, and stop waiting when a request begins."""
+        before = self.scope
+        super().handle_events()
+        if self.scope is not before:
+            self.deadline.cancel()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request, which may be here already."""
+        self._await_request()
+        super().on_response_complete()
+
+    def _await_request(self) -> None:
+        self.deadline = self.loop.call_later(self.limit_s, self.transport.abort)
+
+
+class BriefConnection(PromptConnection):
+    """HTTP connection for one request, with its answer within the limit; the oldest of too many is ended."""
+
+    handle_events = H11Protocol.handle_events
+    on_response_complete = H11Protocol.on_response_complete
+
+    def connection_made(self, transport: Any) -> None:
+        """Make room for this connection."""
+        super().connection_made(transport)
+        if len(self.connections) > MOST_CONNECTIONS:
+            others = (each for each in self.connections if isinstance(each, PromptConnection))
+            oldest = min(others, key=lambda each: each.deadline.when())
+            self.connections.discard(oldest)
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the limit."""
+        self.deadline.cancel()
+        super().connection_lost(exc)
+
+
+class WebLoop(asyncio.SelectorEventLoop):
+    """Event loop whose servers end a TLS handshake that is not over in time, and wait quietly for descriptors."""
+
+    async def create_server(self, *given: Any, ssl: Any = None, **more: Any) -> asyncio.Server:
+        """Make a server as asyncio does."""
+        return await super().create_server(*given, ssl=ssl, ssl_handshake_timeout=ssl and CONNECTION_S, **more)
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Report an error, unless no descriptor is free for a connection: asyncio tries again a second later."""
+        if "out of system resource" not in context["message"]:
+            super().call_exception_handler(context)
+
+
+def web_server(app: ASGIApp, connection: type[H11Protocol] = PromptConnection, **options: Any) -> uvicorn.Server:
+    """Return the server of an application. `options`: further ones of `uvicorn.Config`.
+
+    A text message that is not UTF-8 is not logged: its connection is closed with code 1007.
+    """
+    logging.getLogger("uvicorn.error").addFilter(lambda record: UnicodeDecodeError not in (record.exc_info or ()))
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=connection,
+            loop="none",
+            lifespan="off",
+            log_config=None,
+            log_level="error",
+            access_log=False,
+            timeout_graceful_shutdown=1,
+            server_header=False,
+            **options,
+        )
+    )
+
+
+class LocalServer:
+    """Server in a thread. It holds its port from construction until `close`; clients wait until `begin`.
+
+    Args:
+        flag: names its option in errors, and its thread.
+        routes: made from a function that returns the document of the moment.
+        others: further ports that are tried.
+
+    Attributes:
+        port: the port that is bound; of 0, a free one.
+        url: of its root. note: " (PORT is taken)" for another port than the one that was asked for.
+
+    Raises PortError.
+    """
+
+    def __init__(
+        self, flag: str, routes: Callable[[Document], Sequence[BaseRoute]], host: str, port: int, others: int = 0
+    ) -> None:
+        self._socket = listen(flag, host, port, others)
+        self.port: int = self._socket.getsockname()[1]
+        self.url = f"http://{shown(host, self.port)}/"
+        self.note = "" if port in (0, self.port) else f" ({port} is taken)"
+        self._document: Document = dict
+        app = application(routes(lambda: self._document()))
+        self._server = web_server(app, BriefConnection, ws="none", headers=[("connection", "close")])
+        self._thread = threading.Thread(target=self._run, name=flag, daemon=True)
+
+    def begin(self, document: Document = dict) -> None:
+        """Answer from now on, with this document."""
+        self._document = document
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Give the port back; blocks for a second at most. Idempotent."""
+        self._server.should_exit = True
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=WebLoop) as runner:
+            runner.run(self._server.serve(sockets=[self._socket]))
+
+
+def status_server(wanted: str) -> LocalServer:
+    """Bind the port of `--status [PORT]`: the state of a run as one JSON document (`runtime.observers`). Read only.
+
+    `wanted`: a port, "0" for any that is free, or `AUTO`. Raises ConfigError, PortError.
+    """
+    port = STATUS_PORT if wanted == AUTO else port_number(wanted)
+    if port is None:
+        raise ConfigError(f"--status {wanted}: expected a TCP port from 0 to 65535 (0: any free one), or no value")
+
+    def routes(document: Document) -> list[BaseRoute]:
+        def status(request: Request) -> Response:
+            return JSONResponse(document())
+
+        return [Route(path, status) for path in ("/", "/status")]
+
+    return LocalServer("--status", routes, LOOPBACK, port, OTHER_PORTS if wanted == AUTO else 0)
+
+
+class ListeningSocket(NamedTuple):
+    """A socket that listens, and its address.
+
+    Attributes:
+        url: address to open in a browser, with its token where there is one.
+        taken: port that was asked for and is used by another program; None where it was free.
+    """
+
+    socket: socket.socket
+    url: str
+    token: str | None
+    taken: int | None
+
+
+def listen_at(address: Address) -> ListeningSocket:
+    """Listen at an address of `--view`, or on the next port that is free. Raises PortError, ConfigError."""
+    listening = listen("--view", address.host, address.port, OTHER_PORTS)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    if address.certificate is not None:
+        try:
+            ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(address.certificate, address.key)
+        except (ssl.SSLError, OSError) as error:
+            problem = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
+            pair = f"--view-cert {address.certificate}, --view-key {address.key}"
+            raise ConfigError(f"{pair}: not a certificate with its key: {problem}") from error
+    host, port = listening.getsockname()[:2]
+    token = None if is_loopback(host) else secrets.token_urlsafe(12)
+    name = f"{socket.gethostname().partition('.')[0]}.local" if host in ("0.0.0.0", "::") else host
+    scheme = "http" if address.certificate is None else "https"
+    url = f"{scheme}://{shown(name, port)}/" + ("" if token is None else f"?token={token}")
+    return ListeningSocket(listening, url, token, None if address.port in (0, port) else address.port)
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+class CompressedFiles(StaticFiles):
+    """Files of a folder: with gzip for clients that take it, else plain, as are parts of a file.
+
+    A file that is stored as FILE.xz, to be small where it is installed, is served as FILE, and always whole.
+    """
+
+    def __init__(self, folder: Path = STATIC) -> None:
+        super().__init__(directory=folder)
+        self._folder = folder
+        self._stored = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.xz")}
+        self._packed: dict[object, asyncio.Task[bytes]] = {}
+
+    def prepare(self) -> None:
+        """Begin to compress the virtual human and the files of the folder itself; others wait for the first request."""
+        self._once(_human)
+        for file in sorted(self._folder.iterdir()):
+            if file.is_file():
+                self._gzip(file)
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """Return a file."""
+        stored = path in self._stored
+        plain = await super().get_response(f"{path}.xz" if stored else path, scope)
+        wanted = Headers(scope=scope)
+        if not isinstance(plain, FileResponse) or plain.status_code != 200 or (scope["method"] != "GET" and not stored):
+            return plain
+        plain.headers["Vary"] = "Accept-Encoding"
+        headers = {key: value for key, value in plain.headers.items() if key not in ("content-length", "accept-ranges")}
+        file = Path(plain.path)
+        if _takes_gzip(wanted) and (stored or "range" not in wanted):
+            return Response(await self._gzip(file), headers=headers | {"Content-Encoding": "gzip"})
+        return Response(await asyncio.to_thread(_plain, file), headers=headers) if stored else plain
+
+    async def human_mesh(self, request: Request) -> Response:
+        """Answer with the mesh of the virtual human (`face.human`)."""
+        packed, headers = await self._once(_human), {"Vary": "Accept-Encoding"}
+        if _takes_gzip(request.headers):
+            headers["Content-Encoding"] = "gzip"
+        else:
+            packed = gzip.decompress(packed)
+        return Response(packed, media_type="application/octet-stream", headers=headers)
+
+    def _gzip(self, file: Path) -> asyncio.Task[bytes]:
+        return self._once(_gzip, file, file.stat().st_mtime)
+
+    def _once(self, pack: Callable[..., bytes], *what: Any) -> asyncio.Task[bytes]:
+        """Return the task of a thread that packs something, started once."""
+        if (pack, what) not in self._packed:
+            self._packed[pack, what] = asyncio.create_task(asyncio.to_thread(pack, *what))
+        return self._packed[pack, what]
+
+
+def _takes_gzip(headers: Headers) -> bool:
+    return "gzip" in headers.get("accept-encoding", "")
+
+
+def _gzip(file: Path, changed_s: float) -> bytes:
+    return gzip.compress(_plain(file), _GZIP_LEVEL, mtime=0)
+
+
+def _plain(file: Path) -> bytes:
+    return lzma.decompress(file.read_bytes()) if file.suffix == ".xz" else file.read_bytes()
+
+
+def _human() -> bytes:
+    """Return the mesh of the virtual human, compressed. Blocks for a second."""
+    from sfms_robot.face.human import load_human, packed_human  # scipy: in this thread, not at start-up
+
+    return gzip.compress(packed_human(load_human()), _GZIP_LEVEL)
