@@ -18,7 +18,7 @@ from hypothesis import settings
 from sound_server import SoundServer
 
 from sfms_robot.cli.main import main
-from sfms_robot.config import head_names
+from sfms_robot.data import head_names
 
 # A busy computer is not a failure: no deadlines.
 settings.register_profile("quick", max_examples=20, deadline=None, derandomize=True)
