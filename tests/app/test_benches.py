@@ -7,8 +7,8 @@ from types import ModuleType
 
 import pytest
 
-from sfms_robot.lab import bench
 from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.lab import bench
 from sfms_robot.lab.bench import BENCHES, Bench, measure_all, performance_page, run_bench
 from sfms_robot.lab.bench.compute_budget import Board
 from sfms_robot.lab.bench.measure import Told, row

@@ -20,7 +20,7 @@ from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.lab.evaluation.paper.recipes import SIZES, SizeName
 from sfms_robot.lab.evaluation.paper.restoration import Windows
 from sfms_robot.lab.evaluation.paper.tokenizer_tables import TABLES, Table, build, needed
-from sfms_robot.signals.tracks import Take
+from sfms_robot.signals.tracks import Take, folder_takes
 
 ALL: Final = "all"
 RECORDED: Final = "takes.npz"
@@ -58,7 +58,7 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     chosen = _chosen(options)
     folder = options.models or data_dir("configs") / "tokenizers"
     recorded = takes.load(data_dir("sim") / "listeners" / RECORDED)
-    held_out = recorded[takes.HELD_OUT] if options.data is None else takes.folder_takes(options.data)
+    held_out = recorded[takes.HELD_OUT] if options.data is None else folder_takes(options.data)
     wanted = list(dict.fromkeys(name for table in chosen for name in needed(table, options.models is None)))
     train_missing(options, wanted, folder, recorded)
     loaded = {name: models.read(folder / name) for name in wanted}
