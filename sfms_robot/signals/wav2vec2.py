@@ -1,13 +1,14 @@
 """wav2vec2 of each 40 ms frame, from a model folder on disk; one path offline and streaming.
 
-The transformer sees a whole recording at once, future and all. A listener hears a stream, so each frame gets a window
-of its own: the last 50 frames (2 s) and 80 samples, which makes the last two latents end with the frame; their mean is
-the frame's feature. That is a pass over 2 s a frame: on a GPU it streams, on a processor it does not.
+The transformer sees a whole recording at once, the future included. A listener takes a stream, so each frame gets a
+separate window: the last 50 frames (2 s) and 80 samples, so that the last two latents end with the frame; their mean is
+the frame's feature. That is a pass over 2 s a frame: a GPU keeps up with a stream, a processor does not.
 
 With a hop of h frames one pass gives h rows, when the last of them is complete, for an h-th of the cost: a listener
-that plans every h frames loses nothing by it. Its windows are h - 1 frames longer, so that every row has its 2 s.
+that plans every h frames loses nothing. Its windows are h - 1 frames longer, so that every row has its 2 s.
 
-Deviation: REACT's baselines run whole recordings and stretch 50 latents a second to 25; those rows know the future.
+Ours, because rows of a whole recording know the future: REACT's baselines run whole recordings and stretch 50 latents a
+second to 25.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ _WEIGHTS: Final = ("model.safetensors", "pytorch_model.bin")
 
 
 class Wav2Vec2:
-    """A wav2vec2 model of a local folder. Holds weights; what a stream has heard is a value of the caller's."""
+    """A wav2vec2 model of a local folder. It holds weights only; the past of a stream is a value of the caller."""
 
     def __init__(self, folder: Path | str, device: str = "cpu", hop_frames: int = 1) -> None:
-        """Raises MissingExtra without transformers, ModelError for a folder that holds no such model."""
+        """Load a model. Raises MissingExtra without transformers, ModelError for a folder without such a model."""
         with optional("wav2vec2"):
             import transformers
         self.folder = Path(folder)
@@ -63,19 +64,19 @@ class Wav2Vec2:
         self.dim = int(model.config.hidden_size)
 
     def start(self) -> Floats:
-        """Past of a stream that has heard nothing: (31440,) zeros."""
+        """Return the past of a stream before any sound: (31440,) zeros."""
         return np.zeros(self._window - self._hop, dtype=np.float32)
 
     def step(self, samples: Floats, past: Floats) -> tuple[Floats, Floats]:
-        """Rows of the hops that `samples` complete, and the past of the next call.
+        """Return rows of the hops that `samples` complete, and the past of the next call.
 
         Args:
             samples: (n,) mono 16 kHz, -1..1; any n.
-            past: what the last call returned, or `start()`; not changed.
+            past: of the last call, or `start()`; not changed.
 
         Returns:
-            (frames, dim), a multiple of `hop_frames`, and the samples to hand in next time: 31440 and those of a hop
-            that is not complete.
+            (frames, dim), a multiple of `hop_frames`, and the samples to pass next time: 31440 and those of an
+            incomplete hop.
         """
         seen = np.concatenate([past, samples]).astype(np.float32)
         hops = max(0, (len(seen) - self._window) // self._hop + 1)
@@ -85,10 +86,10 @@ class Wav2Vec2:
         return self._rows(windows), seen[hops * self._hop :].copy()
 
     def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
-        """(frames, dim) of a whole recording.
+        """Return (frames, dim) of a whole recording.
 
-        At 25 fps what a stream gives; a last hop that is not complete ends in silence. At other rates windows end with
-        their frame, which takes a hop of one: raises ValueError for others.
+        At 25 fps the same as a stream; an incomplete last hop ends in silence. At other rates windows end with their
+        frame, which needs a hop of one: raises ValueError for others.
         """
         frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
         if fps == FRAME_HZ:
@@ -104,7 +105,7 @@ class Wav2Vec2:
 
     @torch.no_grad()
     def _rows(self, windows: Floats) -> Floats:
-        """(hops, window) -> (hops * hop_frames, dim)."""
+        """Return rows (hops * hop_frames, dim) of windows (hops, window)."""
         rows = []
         for at in range(0, len(windows), BATCH):
             sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
@@ -118,14 +119,14 @@ class Wav2Vec2:
 
 
 def feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
-    """To be kept by `signals.audio_features.cached`; its version tells the hop and a hash of the model's files."""
+    """Return a feature for `signals.audio_features.cached`; its version is the hop and a hash of the model's files."""
     model = Wav2Vec2(folder, device, hop_frames)
     compute = partial(model.of_recording, fps=fps)
     return Feature("wav2vec2", f"1 hop {hop_frames} {_digest(model.folder)}", model.dim, fps, compute)
 
 
 def _reach(kernels: list[int], strides: list[int]) -> tuple[int, int]:
-    """Samples that a latent sees, and samples from one to the next."""
+    """Return the samples that a latent sees, and the samples from one to the next."""
     field, stride = 1, 1
     for kernel, step in zip(kernels, strides, strict=True):
         field += (kernel - 1) * stride

@@ -25,7 +25,7 @@ from sfms_robot.listeners.events.hazards import STEP_FRAMES
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel
 from sfms_robot.listeners.events.sensing import Sensed, scene_in
 from sfms_robot.listeners.events.whole import hazards_in, most_in, steps_in
-from sfms_robot.listeners.lots import Use, uniforms_of
+from sfms_robot.listeners.stream_rng import Use, uniforms_of
 
 
 def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> tuple[Doubles, Doubles]:

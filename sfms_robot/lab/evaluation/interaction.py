@@ -13,7 +13,7 @@ from sfms_robot.config.arig import STATES
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
-from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners import audio_frontend
 from sfms_robot.signals.events import near
 
 LAGS: Final = 12  # frames either way in which the jaw is looked for

@@ -26,7 +26,7 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, Spea
 from sfms_robot.listeners.events.evidence import AT, begun_before, done, remembered
 from sfms_robot.listeners.events.hazards import STEP_FRAMES, STEP_S, EventTables, HazardBank, load_tables
 from sfms_robot.listeners.events.sensing import Sensed, SenseMemory, sense
-from sfms_robot.listeners.lots import Use, uniforms
+from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 
 LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES

@@ -5,12 +5,12 @@ import torch
 from tiny_arig import arig_listener, arig_model, talk
 from torch import nn
 
-from sfms_robot.listeners.arig import fast, torch_engine
-from sfms_robot.listeners.arig.fast import Int8Linear
+from sfms_robot.listeners.arig import networks, torch_engine
+from sfms_robot.listeners.arig.networks import Int8Linear
 
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8, "precision": "int8"}
 
-pytestmark = pytest.mark.skipif(not fast.supported(), reason="this processor has no fast integers")
+pytestmark = pytest.mark.skipif(not networks.supported(), reason="this processor has no fast integers")
 
 
 def integers(module: nn.Module) -> list[str]:
@@ -28,12 +28,12 @@ def test_a_layer_in_integers_is_the_layer_within_a_percent_or_two():
 
 def test_large_layers_in_bf16_are_the_layers_within_a_percent():
     model = arig_model(**MIDDLE)
-    quick = fast.with_layers(model, fast.Bf16Linear)
+    quick = networks.with_layers(model, networks.Bf16Linear)
     x = torch.randn(3, 256)
     with torch.no_grad():
         found, exact = quick.merge_user(x, x), model.merge_user(x, x)
     assert 0 < (found - exact).norm() < 0.01 * exact.norm()
-    assert not any(isinstance(part, fast.Bf16Linear) for part in model.modules())
+    assert not any(isinstance(part, networks.Bf16Linear) for part in model.modules())
 
 
 def test_motion_differs_by_less_than_a_twentieth_of_its_spread():
@@ -62,20 +62,20 @@ def test_the_model_given_stays_as_it_is():
 
 @pytest.mark.parametrize(("precision", "replaced"), [("fp32", False), ("int8", True), ("auto", True)])
 def test_precision_decides(precision: str, replaced: bool):
-    assert bool(integers(fast.with_precision(arig_model(**MIDDLE), precision))) == replaced
+    assert bool(integers(networks.with_precision(arig_model(**MIDDLE), precision))) == replaced
 
 
 def test_sampler_and_small_layers_stay_exact():
-    names = integers(fast.with_precision(arig_model(**MIDDLE), "int8"))
+    names = integers(networks.with_precision(arig_model(**MIDDLE), "int8"))
     assert any(name.startswith("short.") for name in names)
     assert not any(name.startswith("head.") for name in names)
-    assert integers(fast.with_precision(arig_model(), "int8")) == []  # 16 wide
+    assert integers(networks.with_precision(arig_model(), "int8")) == []  # 16 wide
 
 
 def test_graphs_have_the_blocks_of_the_sampler_in_integers_too():
     diffusion = {"width": 256, "steps": 4, "train_steps": 50, "blocks": 1}
-    exact = {f"{name}.weight" for name in integers(fast.with_precision(arig_model(**MIDDLE), "int8"))}
-    found = set(fast.large_layers(arig_model(**MIDDLE, diffusion=diffusion)))
+    exact = {f"{name}.weight" for name in integers(networks.with_precision(arig_model(**MIDDLE), "int8"))}
+    found = set(networks.large_layers(arig_model(**MIDDLE, diffusion=diffusion)))
     assert found - exact == {"head.modulation.linear.weight", "head.up.0.weight", "head.down.0.weight"}
 
 

@@ -6,7 +6,7 @@ import torch
 from tiny_arig import arig_listener, arig_model, streamed, talk
 
 from sfms_robot.listeners import arig, checkpoint
-from sfms_robot.listeners.arig import fast
+from sfms_robot.listeners.arig import networks
 
 INTEGERS = {"width": 256, "feedforward": 512, "heads": 4, "precision": "int8"}
 
@@ -23,7 +23,7 @@ INTEGERS = {"width": 256, "feedforward": 512, "heads": 4, "precision": "int8"}
         {"draws": "innovation"},
         {"events": True, "draws": "innovation"},
         {"events": True, "draws": "innovation", "sway": True},
-        pytest.param(INTEGERS, marks=pytest.mark.skipif(not fast.supported(), reason="no fast integers here")),
+        pytest.param(INTEGERS, marks=pytest.mark.skipif(not networks.supported(), reason="no fast integers here")),
     ],
     ids=str,
 )

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
+from tiny_arig import arig_listener, arig_model, dyad_of, generate, noise_of, streamed, talk
 
 from sfms_robot import config
 from sfms_robot.config.arig import STATES
@@ -45,7 +45,7 @@ def assert_stream_is_offline(listener: ArigListener, frames: int, atol: float) -
     speaker = talk(frames)
     made = torch.from_numpy(streamed(listener, speaker, seed=3))
     with torch.no_grad():
-        offline = listener.model.generate(dyad_of(listener, speaker, made), noise_of(listener, frames, seed=3))
+        offline = generate(listener.model, dyad_of(listener, speaker, made), noise_of(listener, frames, seed=3))
     assert 0 < made[:, 6:].min() and made[:, 6:].max() < 1
     np.testing.assert_allclose(made, offline[0], atol=atol)
 

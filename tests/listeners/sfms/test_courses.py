@@ -9,7 +9,7 @@ from tiny_sfms import plans_of, speech, tiny_listener, told_listener
 from sfms_robot.config import NodCourse, SmileCourse
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_CORNERS, ListenerEvent
-from sfms_robot.listeners.sfms.draw import ToldCourse, nod_course, smile_course, smile_share
+from sfms_robot.listeners.sfms.draw import EventCourse, nod_course, smile_course, smile_share
 from sfms_robot.signals.control import COLUMNS, control_track
 
 SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
@@ -52,7 +52,7 @@ def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
 def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
     """The transition as much as the code that is held; with none held, as one at rest."""
     wanted = np.array([np.nan, 0.5, 0.5, 0.2])
-    smiling, lost = ToldCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
+    smiling, lost = EventCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
     assert smiling.tolist() == [1, 2, 3] and lost.shape == (3, 12) and (lost >= 0).all()
     np.testing.assert_allclose(lost[0, 1:], (CODES - 0.5) ** 2 / 0.02, rtol=1e-5)
     np.testing.assert_allclose(lost[:, 0], [lost[0, 6], lost[1, 1], lost[2, 3]])

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.piecewise_linear import Neighbours
 from sfms_robot.listeners.sfms.placement import place_exact, place_penalised
 
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])

@@ -7,18 +7,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.exact import completion_errors, mask_cost, segments
-from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.piecewise_linear import Neighbours, completion_errors, mask_cost, segments
 from sfms_robot.listeners.sfms.placement import (
+    ConditionalScore,
+    ScoreNetwork,
     Strategy,
     choose,
     place,
     place_exact,
     place_learned,
     place_static,
+    stretch_errors,
     sweep,
+    tracks,
 )
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, stretch_errors, tracks
 
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 

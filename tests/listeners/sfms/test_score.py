@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
+from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, tracks
 
 
 def test_the_papers_network_gives_one_logit_per_frame_and_group():

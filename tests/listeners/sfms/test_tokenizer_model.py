@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tiny_sfms import tiny_settings
 
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.piecewise_linear import Neighbours
 from sfms_robot.listeners.sfms.placement import Strategy
 
 

@@ -11,7 +11,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
-from sfms_robot.listeners.sfms.keyframes import KEPT_FRAMES, UNDECIDED, later, passed, revoked
+from sfms_robot.listeners.sfms.draw import KEPT_FRAMES, UNDECIDED, later, passed, revoked
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -137,8 +137,9 @@ def test_the_head_sways_from_rest_and_each_stream_its_own_way(told):
 def context(told, control: torch.Tensor) -> Context:
     memory = told.start(0)
     s = memory.speaker
-    known = (s.face, s.face_known, s.voice, s.heard, s.phase, memory.tokens)
-    return Context(*(torch.from_numpy(one[None]) for one in known), control)
+    known = {name: getattr(s, name) for name in ("face", "face_known", "voice", "heard", "phase")}
+    known = {name: torch.from_numpy(one[None]) for name, one in (known | {"tokens": memory.tokens}).items()}
+    return Context(**known, control=control)
 
 
 def test_every_told_number_has_a_gradient_and_so_has_every_weight():
