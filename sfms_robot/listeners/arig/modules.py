@@ -83,6 +83,7 @@ class Bidirectional(PlainModule):
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> tuple[Tensor, Tensor]:
         """Return both tracks (N, c, D); newest sounds (N, D) with SiLU applied."""
+        # One attention over the 2c tokens of both: each track's queries see both tracks' keys.
         agent_qkv, agent_parts = self.agent.ask(agent, agent_sound)
         user_qkv, user_parts = self.user.ask(user, user_sound)
         seen = _attend(torch.cat([agent_qkv, user_qkv], dim=1), self.heads)
@@ -103,6 +104,7 @@ class Integrated(PlainModule):
 
     def forward(self, x: Tensor, condition: Tensor, wanted: int) -> Tensor:
         """Return the first `wanted` tokens (N, wanted, D) of x (N, 2c, D); condition (N, D) with SiLU applied."""
+        # One product makes queries, keys, values and the hidden layer; one brings attention and hidden layer back.
         shift, scale, gate = self.modulation.of_tokens(condition)
         wide = self.wide(modulated(x, shift, scale))
         qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)[:, :wanted]
@@ -138,20 +140,20 @@ class ShortRange(PlainModule):
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> Tensor:
         """Return the summary (N, D) of behaviours (N, c, D), oldest first, and the newest sounds (N, D)."""
         c = agent.shape[1]
-        agent, user = agent + self.places[0], user + self.places[1]
+        agent, user = agent + self.places[0], user + self.places[1]  # ours: learned places in the chunk
         if self.plain is not None and self.plain_both is not None:
             sounds = [sound[:, None].expand(-1, c, -1) for sound in (agent_sound, user_sound)]
             both = torch.cat([self.plain[0](agent), self.plain[1](user), *sounds], dim=-1)
             summed: Tensor = self.compress(self.norm(self.plain_both(both)).flatten(1))
             return summed
-        of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)
+        of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)  # the updated audio modulates each track (A.1)
         for block in self.bidirectional:
             agent, user = block(agent, user, of_agent, of_user)
         # The paper does not say which sound modulates the two tracks as one sequence. Ours: both do.
         x, condition = torch.cat([agent, user], dim=1), F.silu(agent_sound + user_sound)
         for left, block in enumerate(self.integrated, 1 - len(self.integrated)):
             x = block(x, condition, 2 * c if left else c)
-        out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))
+        out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))  # the agent's part (A.1), c frames -> one vector
         return out
 
 
@@ -222,11 +224,13 @@ class LongRange(nn.Module):
 
         Frame t belongs to chunk t // c, and the last of its frames makes the summary that stays.
         """
+        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each of its frames makes a new summary,
+        # as a stream refreshes it; later chunks see only that of its last frame.
         t = summaries.shape[1]
         frame = torch.arange(t, device=summaries.device)
         of = frame // self.chunk
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
-        behind = of[:, None] - of[whole]
+        behind = of[:, None] - of[whole]  # chunks from a kept summary to that of each frame, (T, S)
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
         x, turned = summaries, torch.from_numpy(rotary(of.numpy(force=True), self.head_width))
         turned = turned.transpose(0, 1).to(x.device)
@@ -300,7 +304,7 @@ class StateUnderstanding(PlainModule):
 
     def forward(self, keys: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
         """Return state feature (N, D) and logits (N, S) of `condition` (N, 3, 2D) and previous states (N,)."""
-        feature = self.norm(self.look(self.previous(previous), keys))
+        feature = self.norm(self.look(self.previous(previous), keys))  # s_(T-1) is the query, its condition the keys
         return feature, self.classify(feature)
 
     def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
@@ -357,6 +361,7 @@ class Progressive(PlainModule):
             state: (N, D) feature, or None without state guidance.
             events: (N, D) embedded control rows, or None without events.
         """
+        # A.1: cis-token, state feature and A^a_T condition the fine motion; then five motions, for continuity.
         tokens = [token for token in (cis, state, sound, events) if token is not None]
         x = self.fine(outline, self.fine.keys(torch.stack(tokens, dim=1)))
         out: Tensor = self.norm(self.temporal(x, motion_keys))

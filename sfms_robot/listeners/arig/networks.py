@@ -90,19 +90,20 @@ class FrameNetwork(PlainModule):
         model = self.model
         absent = torch.stack([model.no_user_sound, model.no_agent_sound])
         embedded = model.embed_sound(sounds, heard, absent)
-        user_sound, now = embedded[:, 0], embedded[:, 1]
-        face = model.embed_face(face, seen)
+        user_sound, now = embedded[:, 0], embedded[:, 1]  # A^u_(T-1) and A^a_T, (N, D)
+        face = model.embed_face(face, seen)  # M^u_(T-1)
+        # 3.2: behaviours I_(T-1) of both; the agent's is made with the sound kept from the frame before.
         agent_behaviour = _after(agent_behaviour, model.merge_agent(agent_sound, motion), first)
         user_behaviour = _after(user_behaviour, model.merge_user(user_sound, face), first)
         sound_keys = push(sound_keys, model.progress.coarse.keys(now))
-        summary = model.short(agent_behaviour, user_behaviour, now, user_sound)
-        cis, made = model.long.step(summary, past, view, rotary)
+        summary = model.short(agent_behaviour, user_behaviour, now, user_sound)  # 3.2, short range
+        cis, made = model.long.step(summary, past, view, rotary)  # 3.2, long range: the cis-token
         feature, logits = None, cis[:, :0]
-        if model.states is not None:
+        if model.states is not None:  # 3.3: S_T and s_T
             feature, logits = model.states(model.states.condition(cis, voiced), state)
-        events = model.embed_events(rows)
-        outline = model.progress.coarse(motion, sound_keys)
-        z = model.progress.refine(outline, motion_keys, now, cis, feature, events)
+        events = model.embed_events(rows)  # ours
+        outline = model.progress.coarse(motion, sound_keys)  # 3.4: M^a_(T-1) looks at the sounds of three frames
+        z = model.progress.refine(outline, motion_keys, now, cis, feature, events)  # 3.4: latent z
         z = model.beside(z, events, sample)
         return z, logits, made, now, agent_behaviour, user_behaviour, sound_keys
 
@@ -149,8 +150,8 @@ class DrawNetwork(PlainModule):
         levels = self.levels
         if levels is None and self.places is not None and isinstance(model.head, Denoiser):
             levels = model.head.time(self.places)
-        made = model.drawn(model.sample(z, noise, levels), standard, rows, speaks)
-        motion = model.embed_own(made)
+        made = model.drawn(model.sample(z, noise, levels), standard, rows, speaks)  # equation (4), then ours
+        motion = model.embed_own(made)  # M^a_T, the past of the next frame
         keys = push(motion_keys, model.progress.temporal.keys(motion))
         return model.restore(made), made, model.moved(made, standard, rows), motion, keys
 

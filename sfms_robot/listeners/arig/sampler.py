@@ -47,6 +47,7 @@ class Denoiser(nn.Module):
         self.high = nn.Buffer(torch.full((channels,), most))
         self.alpha_bar = nn.Buffer(cosine_alpha_bar(settings.train_steps).float(), persistent=False)
         self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)
+        # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
         self.condition = Linear(condition, width)
         self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
@@ -100,6 +101,7 @@ class Denoiser(nn.Module):
         t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
         noise = torch.randn(motion.shape, generator=generator).to(motion.device)
         alpha_bar = self.alpha_bar[t][:, None]
+        # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
         found = self(noisy, self.modulate(z, self.level(t)))
         return weighted_mean((noise - found).square(), weights)
@@ -117,7 +119,7 @@ class Denoiser(nn.Module):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
         if levels is None:
             levels = self.level(torch.tensor(self.levels, device=z.device))
-        # The modulation of every step in one product, the noisiest last; those of a single sample are vectors.
+        # Ours, for speed: the modulation of every step in one product, the noisiest last; of a single sample as vectors.
         told = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
         kinds = self.modulation.parts
         parts = (told if n > 1 else told[0]).chunk(k * kinds, dim=-1)
@@ -126,10 +128,10 @@ class Denoiser(nn.Module):
         for index, step in enumerate(self.table):
             level = kinds * (k - 1 - index)
             found = _denoise(x, parts[level : level + kinds], weights)
-            # Ours: the clean motion is clamped to the range of the data, which (4) does not do (`clamp: false`).
+            # Ours: the clean motion is clamped to the range of the data; (4) does not do that (`clamp: false`).
             clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)
-            x = clean.mul_(step.motion).add_(x, alpha=step.stay)
-            if step.spread:
+            x = clean.mul_(step.motion).add_(x, alpha=step.stay)  # the mean of M_s, `steps_of`
+            if step.spread:  # sigma_t eps
                 x.add_(added[index])
         return x
 

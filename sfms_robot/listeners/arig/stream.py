@@ -88,11 +88,11 @@ def draw_sojourn(
     may = possible[int(voiced[0]), int(voiced[1])] > 0  # (7,), a new array
     if before.left > 0 and may[before.state]:
         return Sojourn(before.state, before.left - 1)
-    may[before.state] &= not may.sum() > 1
+    may[before.state] &= not may.sum() > 1  # another one, if there is any
     scores = np.where(may, logits[: len(STATES)].astype(np.float64), -np.inf)
-    chances = np.exp(scores - scores.max()).cumsum()
+    chances = np.exp(scores - scores.max()).cumsum()  # inverse transform of the softmax
     state = min(int((chances <= uniforms[0] * chances[-1]).sum()), len(STATES) - 1)
-    place = float(uniforms[1]) * (QUANTILES - 1)
+    place = float(uniforms[1]) * (QUANTILES - 1)  # inverse transform of the durations, linear between quantiles
     low, high = durations[state, int(place)], durations[state, min(int(place) + 1, QUANTILES - 1)]
     return Sojourn(state, max(0, round(float(low + (place % 1) * (high - low))) - 1))
 
@@ -220,6 +220,8 @@ class ArigListener(RunsOnEngine):
         still = self.standardise(self.space.neutral.astype(np.float32))
         motion, silence, motion_key, sound_key = (part[0] for part in self.engine.run("rest", still[None]))
         room = settings.context_chunks - 1
+        # A.2: caches begin with the reference motion and the first sound repeated; ours: silence, and a neutral face.
+        # Chunks begin with the first behaviour repeated, which the network `frame` does where `first`.
         return ArigMemory(
             seed=seed,
             frames=0,
@@ -280,6 +282,7 @@ class ArigListener(RunsOnEngine):
         heard = self._hear(speakers, memories[: len(speakers)])
         if len(heard) < len(memories):
             heard = heard * len(memories)
+        # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         z, logits, now = self._conditions(heard, memories, rows)
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
@@ -307,7 +310,7 @@ class ArigListener(RunsOnEngine):
         after = []
         for index, (one, memory) in enumerate(zip(heard, memories, strict=True)):
             frames, context = memory.frames + 1, memory.context
-            if frames % self.settings.chunk_frames == 0:
+            if frames % self.settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
                 context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
             own = dict(zip(REMEMBERED[:4], (part[index] for part in rest), strict=True))
             voices = {"user_voice": one.user_voice, "agent_voice": one.agent_voice}
@@ -324,6 +327,7 @@ class ArigListener(RunsOnEngine):
         if not self.settings.events:
             return before, logits.argmax(-1).tolist()
         durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
+        # Ours: a state lasts as long as in the data, and feedback that is seen comes from the events.
         sojourns = [
             draw_sojourn(durations, possible, scores, one.voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, one, last, own in zip(logits, heard, before, now, strict=True)

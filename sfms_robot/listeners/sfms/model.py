@@ -83,21 +83,21 @@ class Inpainter(nn.Module):
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
             rows, seen, found = around.rows, around.seen, around.places
-        places = sinusoidal(mask.shape[1], self.width).to(codes)
+        places = sinusoidal(mask.shape[1], self.width).to(codes)  # (T, W)
         # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
-        z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places
+        z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
         # Other frames are not looked at and not kept; but the gradient that learned placement needs passes there.
-        z_keys = F.embedding(rows, z_kf.flatten(0, 1))
+        z_keys = F.embedding(rows, z_kf.flatten(0, 1))  # (B, K, W): the keyframes of each window, in a row
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
         z_kf = F.embedding(found, z_keys.flatten(0, 1)) * mask.amax(-1, keepdim=True)
-        between = neighbours.interpolate(keyed)
+        between = neighbours.interpolate(keyed)  # codes on straight lines, (B, T, G, D)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
-        z_tf = self.transition_in(query) + places
+        z_tf = self.transition_in(query) + places  # Phi^tf of equation (10): T^tf queries z^kf
         for block in self.transition_encoder:
             z_tf = block(z_tf, memory=z_keys, memory_seen=seen)
-        joined = self.join(torch.cat([z_kf, z_tf], dim=-1))
+        joined = self.join(torch.cat([z_kf, z_tf], dim=-1))  # Phi^full of equation (10)
         *inner, outer = self.decoder
         for block in inner:
             joined = block(joined)
@@ -165,6 +165,7 @@ class Tokenizer(nn.Module):
             strategy or self.strategy,
             member=self.member,
             score=self.score,
+            # A bound on gaps is made for the configured rate; fewer keyframes could not keep it.
             max_gap=self.max_gap if frames >= self.window and keyframes is None else None,
             sweeps=self.settings.scores.sweeps,
             costs=self.costs,
@@ -173,7 +174,7 @@ class Tokenizer(nn.Module):
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
         """Return the tokens (B, T, G) of motion (B, T, C) with keyframes at a mask (B, T, G)."""
-        indices = self.quantizer.indices(self.quantizer.encode(motion))
+        indices = self.quantizer.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
         return torch.where(mask > 0.5, indices + 1, 0)
 
     def decode(self, tokens: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
@@ -181,7 +182,7 @@ class Tokenizer(nn.Module):
 
         `last`, `around`: see `Inpainter`.
         """
-        codes = self.quantizer.codes((tokens - 1).clamp(min=0))
+        codes = self.quantizer.codes((tokens - 1).clamp(min=0))  # of transitions arbitrary: the mask hides them
         out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 

@@ -84,8 +84,8 @@ class GatedCross(nn.Module):
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Return x (B, P, W) after looking at itself and at y (B, P, W)."""
-        normed = self.norm(x)
-        own = self.own(normed, normed)
+        normed = self.norm(x)  # ours: pre-norm, as in all blocks here
+        own = self.own(normed, normed)  # x~
         x = x + own + self.alpha * self.other(own, y)
         out: Tensor = x + self.ffn(x)
         return out
@@ -123,7 +123,7 @@ class SpeakerEncoder(nn.Module):
         x = torch.where(c.face_known[..., None], self.face_in(c.face), self.no_face)
         voice = c.voice if self.phase_in is None else c.voice + self.phase_in(c.phase)
         y = torch.where(c.heard[..., None], voice, self.no_voice)
-        places = sinusoidal(x.shape[1], x.shape[2]).to(x)
+        places = sinusoidal(x.shape[1], x.shape[2]).to(x)  # (P, W)
         x, y = x + places, y + places
         for face_layer, voice_layer in zip(self.face, self.voice, strict=True):
             x, y = face_layer(x, y), voice_layer(y, x)
@@ -187,11 +187,12 @@ class Predictor(nn.Module):
         c = context
         speaker = self.speaker(c)
         own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
+        # The place in the phrase at the newest frame also goes to every future frame directly.
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
         speaker = speaker.expand(own.shape[0], -1, -1)
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
         memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B, 2P + P + H, W)
-        x = self.slots + own[:, -self.future :]
+        x = self.slots + own[:, -self.future :]  # (B, H, W): queries of the future frames
         if self.phase_in is not None:
             x = x + self.phase_in(newest)[:, None]
         for block in self.decoder:
@@ -201,6 +202,7 @@ class Predictor(nn.Module):
     def _own(self, tokens: Tensor, recent: LastKeyframes[Tensor], control: Tensor) -> Tensor:
         """Return (B, P + H, W) of tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K)."""
         features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
+        # Frames that are not drawn yet are one learned vector; their control rows tell them apart.
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         if self.control_in is not None:
             x = x + self.control_in(control)
@@ -212,6 +214,7 @@ class Predictor(nn.Module):
     def describe(self, recent: LastKeyframes[Tensor], frame: Tensor | int) -> Tensor:
         """Return (..., G * (2D + 2)): the codes of last keyframes (..., G, 2) and their ages at `frame`."""
         codes = F.embedding(recent.tokens + self.first, self.codes.flatten(0, 1))  # (..., G, 2, D)
+        # Near keyframes differ by single frames, old ones hardly: ages on a logarithmic axis.
         ages = torch.log1p((frame - recent.at) / AGE_SCALE_FRAMES)
         return torch.cat([codes.flatten(-2), ages], dim=-1).flatten(-2)
 
@@ -234,6 +237,7 @@ class Predictor(nn.Module):
         `target`: the true tokens (B, H, G). V are the most classes of a group, -inf for those that a group lacks.
         """
         tokens = torch.cat([context.tokens[:, : -self.future], target], dim=1)
+        # The last keyframes up to the frame before each future frame: frames P - 1 to P + H - 2.
         before = slice(-self.future - 1, -1)
         recent = LastKeyframes(*(part[:, before] for part in last_keyframes(tokens)))
         slots = self(context)

@@ -30,10 +30,10 @@ def as_levels(levels: Sequence[Sequence[int]]) -> Tensor:
 
 def quantize(latent: Tensor, levels: Tensor) -> Tensor:
     """Return the nearest grid point of tanh(latent), (..., G, D) in -1..1; the gradient skips the rounding."""
-    bounded = torch.tanh(latent)
-    position = (bounded + 1) / 2 * (levels - 1)
+    bounded = torch.tanh(latent)  # -1..1
+    position = (bounded + 1) / 2 * (levels - 1)  # 0..L - 1
     code = torch.round(position) / (levels - 1) * 2 - 1
-    return bounded + (code - bounded).detach()
+    return bounded + (code - bounded).detach()  # straight through: d code / d bounded = 1
 
 
 def codes_to_indices(codes: Tensor, levels: Tensor, radix: Tensor | None = None) -> Tensor:
@@ -101,6 +101,7 @@ class Codebook(nn.Module):
     @torch.no_grad()
     def indices(self, codes: Tensor) -> Tensor:
         """Return the indices (..., G) of the vectors nearest to (..., G, D), which need not be codes."""
+        # argmin |z - c|^2 of equation (3) = argmin |c|^2 - 2 <z, c>
         flat = codes.detach().float().flatten(0, -3).transpose(0, 1)  # (G, N, D)
         with torch.autocast(codes.device.type, enabled=False):  # nearest is a matter of small differences
             distance = self.vectors.square().sum(-1)[:, None] - 2 * flat @ self.vectors.transpose(1, 2)
@@ -133,6 +134,7 @@ class Codebook(nn.Module):
         now = chosen.sum(0)
         with torch.autocast(latent.device.type, enabled=False):
             mean = torch.einsum("ngv,ngd->gvd", chosen, flat) / now.clamp(min=1.0)[..., None]
+        # Running sums of keyframes and of their vectors, as in VQ-VAE-2: c = sums / counts.
         counts = DECAY * self.counts + (1 - DECAY) * now
         share = ((1 - DECAY) * now / counts.clamp(min=1e-9))[..., None]  # weight of this step in the running mean
         self.vectors.lerp_(mean, share.clamp(max=1.0))

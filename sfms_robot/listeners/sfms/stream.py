@@ -244,7 +244,7 @@ class SfmsListener(RunsOnEngine):
             (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
             for memory, speaker in zip(memories, heard, strict=True)
         ]
-        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]
+        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
             control = self.told([None if controls is None else controls[row] for row in due])
             planned = self._planned([speakers[row].time_s for row in due], [found[row][1] for row in due], control)
@@ -259,17 +259,22 @@ class SfmsListener(RunsOnEngine):
         tokens, path, drawn_under = (
             stacked([getattr(memory, name) for memory in memories]) for name in ("tokens", "path", "control")
         )
+        # 1. The window moves on by the frames since the last plan, which differ from stream to stream.
         since = np.array([len(memory.speaker.sounds) for memory in memories])
         moved, way, under = np.empty_like(tokens), np.empty_like(path), np.empty_like(drawn_under)
         for frames in set(since.tolist()):
             rows = since == frames
             moved[rows], way[rows] = passed(tokens[rows], path[rows], frames, self.holds)
             under[rows] = later(drawn_under[rows], frames)
+        # 2. Events that were decided since then call tokens off (`draw.revoked`).
         tokens, settled = revoked(moved, under, control, self.horizon)
+        # 3. Sound and faces since then become features.
         speakers, seen = self._taken_in([memory.speaker for memory in memories])
         newest = [memory.frames - 1 for memory in memories]
+        # 4. Undecided tokens are drawn and decoded.
         inputs = PlanInputs(**seen, tokens=tokens, control=control, settled=settled)
         tokens, path = self.plan(inputs, way, [memory.seed for memory in memories], newest)
+        # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
         sway = stacked([memory.sway for memory in memories])
         motion, jaw_rad = self.space.decode(
             self.with_sway(self.shown(path), sway, np.array(newest) + 1).reshape(-1, path.shape[-1])
@@ -314,6 +319,7 @@ class SfmsListener(RunsOnEngine):
         """Return the future (..., H, C) of a path (..., 2 + H, C), standardised, with the head smoothed."""
         if not self.settings.sampling.smoothing:
             return path[..., 2:, :]
+        # x_t + s ((x_(t-1) + x_(t+1)) / 2 - x_t); behind the last frame the motion continues straight.
         beyond = 2 * path[..., -1:, :] - path[..., -2:-1, :]
         before, own = path[..., 1:-1, :], path[..., 2:, :]
         after = np.concatenate([path[..., 3:, :], beyond], axis=-2)
@@ -360,6 +366,7 @@ class SfmsListener(RunsOnEngine):
             [state.sounds for state in states], [state.audio for state in states]
         )
         heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
+        # A frame without sound is 0, the mean of the data, not silence.
         rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
         # Each frame behind the one before it, the first of a stream behind the newest of its last plan: (N, 2R, bins).
         last = np.concatenate([rows[:1], rows[:-1]])
@@ -406,7 +413,7 @@ def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[
     end = 0
     for row, (queue, count) in enumerate(zip(queues, counts, strict=True)):
         end += count
-        kept = max(longest - count, 0)
+        kept = max(longest - count, 0)  # more frames than P: only the newest P of them
         out[row, :kept] = queue[longest - kept :]
         out[row, kept:] = new[end - (longest - kept) : end]
     return out

@@ -162,15 +162,3 @@ def test_ten_minutes_of_clock_drift_do_not_add_up(ppm: float):
     for edge in edges:
         near[edge - 1 : edge + 4] = True  # two loud frames in a row are speech
     np.testing.assert_array_equal(found[100:][~near[100:]], truth[100:][~near[100:]])
-
-
-@pytest.mark.slow
-def test_a_listener_runs_through_ten_minutes_of_clock_drift():
-    rng = np.random.default_rng(1)
-    said = rng.normal(0, 0.05, FRAMES * FRAME_SAMPLES + AUDIO_HZ).astype(np.float32)
-    listener = arig_listener()
-    memory = listener.start(0)
-    for index, frame in enumerate(drifting(said, PPM)[:FRAMES]):
-        plan, memory = listener.step(SpeakerFrame((index + 1) * FRAME_S, SILENCE, None, frame), memory)
-        assert np.isfinite(plan.frames).all()
-    assert memory.frames == FRAMES

@@ -93,13 +93,6 @@ def test_later_control_never_changes_earlier_plans(told, changed_from: int):
     assert not np.array_equal(before[changed_from:], after[changed_from:])
 
 
-def test_nothing_told_is_nothing_happening(told):
-    speaker = talk(6)
-    silent = streamed(told, speaker, 1, nods(7))
-    np.testing.assert_array_equal(streamed(told, speaker), silent)
-    assert not np.array_equal(streamed(told, speaker, 1, nods(7, 0.05)), silent)
-
-
 def test_gradients_reach_the_control_input():
     listener = soft(arig_listener(**TOLD))
     speaker = talk(12)
@@ -122,13 +115,6 @@ def test_a_listener_without_events_takes_no_control():
     assert deaf.control_frames == (0, 0) and arig_listener(**TOLD).control_frames == (1, 1)
     with pytest.raises(ValueError, match="control is for a listener with events: true"):
         deaf.step(talk(1)[0], deaf.start(1), nods(2))
-
-
-def test_offline_control_of_another_shape_is_refused_by_name(told):
-    dyad = dyad_of(told, talk(5), torch.rand(5, 58), nods(6))
-    for wrong in (None, torch.zeros(1, 6, 3), torch.zeros(1, 5, len(COLUMNS))):
-        with pytest.raises(ValueError, match="control is"):
-            told.model.condition(dataclasses.replace(dyad, control=wrong))
 
 
 @pytest.mark.parametrize("draws", ["motion", "step", "innovation"])

@@ -12,7 +12,6 @@ from sfms_robot.config.arig import STATES
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.modules import LongRange
 from sfms_robot.listeners.arig.stream import FIRST, rotary
-from sfms_robot.listeners.audio_frontend import WIDTHS
 from sfms_robot.listeners.layers import windows
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
@@ -136,12 +135,6 @@ def test_one_frame_is_no_dyad(tiny):
         tiny.condition(random_dyad(tiny, frames=1))
 
 
-def test_widths_follow_space_and_sound():
-    model = arig_model(motion_space="deca56", sound="wav2vec2")
-    assert (model.channels, model.sound_width) == (56, 768 + 21)
-    assert WIDTHS["mel"] == 4 * 128 + 21
-
-
 def test_without_phase_it_hears_the_sound_alone():
     model = arig_model(phase=False)
     sound, heard, absent = torch.randn(3, model.sound_width), torch.ones(3, dtype=torch.bool), torch.zeros(16)
@@ -191,7 +184,3 @@ def test_context_depends_on_how_far_apart_chunks_are_not_on_when():
         return made
 
     torch.testing.assert_close(cis(0), cis(500_000), rtol=1e-4, atol=1e-5)  # days later
-
-
-def test_states_have_the_papers_seven_names():
-    assert len(STATES) == len(set(STATES)) == 7 and 0 <= FIRST < 7

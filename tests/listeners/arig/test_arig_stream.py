@@ -207,12 +207,6 @@ def test_a_robot_that_falls_silent_listens_on(tiny):
     assert np.isfinite(out).all()
 
 
-@pytest.mark.parametrize("samples", [639, 641])
-def test_a_clock_that_drifts_costs_the_agent_track_a_sample(tiny, samples: int):
-    drifting = [dataclasses.replace(f, agent_audio=np.resize(f.agent_audio, samples)) for f in talk(10)]
-    assert np.isfinite(streamed(tiny, drifting)).all()
-
-
 def test_frames_of_another_length_are_refused(tiny):
     with pytest.raises(ValueError, match="640 samples or none, got 100"):
         tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))

@@ -96,10 +96,8 @@ def dyad_of(
     )
 
 
-def losses(
-    model: ArigModel, dyad: Dyad, states: torch.Tensor, seed: int = 0
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return equation (3) and the cross-entropy of the states (None without), (B, N-1), every frame given the true past."""
+def losses(model: ArigModel, dyad: Dyad, states: torch.Tensor, seed: int = 0):
+    """Return equation (3) and the cross-entropy of the states (None without); every frame is given the true past."""
     found = model.condition(dyad, torch.where(states < 0, FIRST, states))
     standard = model.standardise(dyad.agent_motion)
     wanted = model.moved(standard[:, 1:], standard[:, :-1], model.rows(dyad)).flatten(0, 1)

@@ -109,21 +109,6 @@ def test_smiles_that_are_not_told_are_as_they_were():
         np.testing.assert_array_equal(after[index].frames, plan.frames)
 
 
-def test_streams_that_smile_beside_others_do_what_each_does_alone():
-    listener = told_listener(hop=2, sampling={"smile": {"spread": 0.05}})
-    past, ahead = listener.control_frames
-    own = ((SMILE,), (), (LAUGH, ListenerEvent("smile", 0.4, 1.5, 0.3)))
-    alone = [plans_of(listener, speech(40), seed, events) for seed, events in zip((1, 2, 3), own, strict=True)]
-    memories = [listener.start(seed) for seed in (1, 2, 3)]
-    for index, frame in enumerate(speech(40)):
-        known = [[e for e in events if e.start_s <= (index + 3) * 0.04 + 1e-9] for events in own]
-        plans, memories = listener.step_many(
-            frame, memories, [control_track(each, index + 1 - past, past + ahead) for each in known]
-        )
-        for plan, each in zip(plans, alone, strict=False):
-            np.testing.assert_allclose(plan.frames, each[index].frames, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     "smile, text",
     [

@@ -8,7 +8,7 @@ from tiny_sfms import tiny_listener, tiny_settings
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms import draw
 from sfms_robot.listeners.sfms.draw import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder, last_keyframes
+from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
@@ -105,13 +105,6 @@ def test_listening_in_chunks_equals_listening_at_once(audio: str, chunk: int):
     torch.testing.assert_close(torch.cat(parts, dim=1)[:, :21], whole)
 
 
-def test_trails_are_the_last_two_keyframes_at_every_frame():
-    tokens = torch.tensor([0, 3, 0, 5, 0])[None, :, None]
-    recent = last_keyframes(tokens)
-    assert recent.tokens[0, :, 0].tolist() == [[0, 0], [3, 0], [3, 0], [5, 3], [5, 3]]
-    assert recent.at[0, :, 0].tolist() == [[-1, -1], [1, -1], [1, -1], [3, 1], [3, 1]]
-
-
 def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
     tokens = np.random.default_rng(0).integers(0, 3, (4, 30, 5))
     whole = draw.last_keyframes(tokens)
@@ -120,9 +113,3 @@ def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
         grown = draw.with_drawn(grown, tokens[:, frame], frame)
         for a, b in zip(grown, whole, strict=True):
             assert np.array_equal(a, b[:, frame])
-
-
-def test_learned_vectors_take_a_parameter_where_a_grid_needs_none():
-    grid, vectors = (tiny_listener(quantizer=kind).model.predictor for kind in ("fsq", "vq"))
-    assert "codes" not in dict(grid.named_parameters()) and "codes" in dict(vectors.named_parameters())
-    assert logits(vectors, context()).isfinite().any()
