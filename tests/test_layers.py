@@ -37,7 +37,6 @@ SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
 
 # File names that stand more than once, each with the part that it plays for both families.
 SHARED_NAMES = {
-    "audio_frontend": "sound into features, of the SFMS and of the ARIG listener",
     "model": "the network of SFMS, that of ARIG, and the hazards of events",
     "stream": "the listener that plans with SFMS, and that with ARIG",
     "features": "what SFMS is trained on, and what ARIG is trained on",

@@ -1,4 +1,4 @@
-"""A listener as it is shipped: graphs of its networks for onnxruntime, weights in few bits."""
+"""Export of a listener: graphs of its networks for onnxruntime, weights in few bits."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, load_config, read_wei
 
 
 def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None = None) -> list[Path]:
-    """Write the graphs of a listener by shipped name or folder, below its own folder or `out`; the files written.
+    """Write the graphs of a listener, by shipped name or folder, below its folder or `out`, and return the files.
 
-    `int8`: those with large layers in 8 bits too. `weight_bits`: the weights as well, stored so (8, 16 or 32: see
+    `int8`: also graphs with large layers in 8 bits. `weight_bits`: also the weights, stored in 8, 16 or 32 bits (see
     `checkpoint.write_tensors`). Takes a minute. Raises ConfigError, MissingExtra, ModelError.
     """
     if weight_bits not in (None, *get_args(Bits)):

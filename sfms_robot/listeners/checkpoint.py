@@ -1,32 +1,49 @@
-"""A listener's folder: config.yaml, model.safetensors. Everything that can be wrong with it is one ModelError."""
+"""A listener's folder: config.yaml and model.safetensors. Every fault of them is one ModelError."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from safetensors import SafetensorError, deserialize, safe_open
 from safetensors.numpy import save_file
 
 from sfms_robot import config
-from sfms_robot.errors import ModelError
-from sfms_robot.listeners.engine import Array
+from sfms_robot.errors import ConfigError, ModelError
 
 if TYPE_CHECKING:
     from torch import nn
 
+Array = NDArray[Any]
+Shapes = Mapping[str, tuple[tuple[int, ...], bool]]  # of tensors by name; True where they hold real numbers
 Bits = Literal[8, 16, 32]
+Settings = TypeVar("Settings", bound=config.Listener)
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
 BFLOAT16, INT8 = "BF16", "I8"
 PIECE_BYTES = 16 * 2**20
-ROW_SCALE: Final = ".row_scale"  # behind the name of a matrix in 8 bits
-LARGE: Final = 4096  # numbers of a matrix: less than that is not worth 8 bits
-LARGEST = 1e6  # of a tensor; a speed nobody measured is stored as this, weights are below 200, and 1e30 overflows
+ROW_SCALE: Final = ".row_scale"  # added to the name of a matrix in 8 bits
+LARGE: Final = 4096  # numbers; a smaller matrix is not worth 8 bits
+LARGEST = 1e6  # of any value: an unmeasured speed is stored as this, weights are below 200, and 1e30 overflows
+
+
+def load_config(folder: Path) -> config.Listener:
+    """Read `folder`/config.yaml. Raises ConfigError."""
+    return config.load_listener(folder / CONFIG)
+
+
+def config_of(folder: Path, kind: type[Settings]) -> Settings:
+    """Read `folder`/config.yaml of one kind of listener. Raises ConfigError."""
+    settings = load_config(folder)
+    if not isinstance(settings, kind):
+        wanted = kind.__name__.lower()
+        raise ConfigError(f"{folder / CONFIG}: kind: expected {wanted}, got {settings.kind}")
+    return settings
 
 
 def save_config(folder: Path, settings: config.Listener) -> None:
@@ -40,18 +57,18 @@ def save_config(folder: Path, settings: config.Listener) -> None:
 
 
 def save_weights(file: Path, module: nn.Module, bits: Bits = 32) -> None:
-    """`write_tensors` of the state of `module`."""
+    """Write the state of `module`, see `write_tensors`."""
     write_tensors(file, {name: value.cpu().numpy() for name, value in module.state_dict().items()}, bits)
 
 
 def write_tensors(file: Path, tensors: Mapping[str, Array], bits: Bits = 32) -> None:
-    """Write them, replacing `file` in one move so that an interrupted run leaves the old one.
+    """Write tensors and replace `file` in one move, so that an interrupted run leaves the old file.
 
-    `bits`: 16 takes half the room of 32. 8 takes a quarter, for matrices of `LARGE` numbers and more: whole numbers of
-    -127 to 127, and beside them NAME.row_scale, one real number a row to multiply them by, so that none is off by more
-    than a 254th of the largest of its row; all else in 16 where that loses nothing. What loads them computes in 32.
+    `bits`: 16 halves the size. 8 quarters it for matrices of `LARGE` numbers and more, which become integers of -127 to
+    127 and one factor per row (NAME.row_scale), so that no number is off by more than 1/254 of the largest of its row;
+    everything else is stored in 16 bits where that loses nothing. Loading always gives 32 bits.
 
-    Raises ModelError where it cannot be written, and leaves no part of it.
+    Raises ModelError where the file cannot be written; no part of it stays.
     """
     part = file.with_suffix(".part")
     try:
@@ -82,30 +99,26 @@ def _packed(tensors: Mapping[str, Array], bits: Bits) -> Iterator[tuple[str, Arr
 
 
 def load_weights(file: Path, module: nn.Module) -> None:
-    """Fill `module` from a safetensors file: plain numbers, no code is run. Raises ModelError as `read_weights`."""
+    """Fill `module` from a safetensors file. Runs no code of the file; raises ModelError as `stored_tensors`."""
     import torch
 
-    wanted = module.state_dict()
-    shapes = {name: (tuple(value.shape), value.is_floating_point()) for name, value in wanted.items()}
-    found = read_weights(file, shapes)
-    module.load_state_dict({name: torch.from_numpy(value) for name, value in found.items()})
+    wanted = {name: (tuple(value.shape), value.is_floating_point()) for name, value in module.state_dict().items()}
+    module.load_state_dict({name: torch.from_numpy(value) for name, value in stored_tensors(file, wanted)})
 
 
-def read_weights(file: Path, wanted: Mapping[str, tuple[tuple[int, ...], bool]] | None = None) -> dict[str, Array]:
-    """All `stored_tensors` of a file, by name."""
+def read_weights(file: Path, wanted: Shapes | None = None) -> dict[str, Array]:
+    """Return all `stored_tensors` of a file, by name."""
     return dict(stored_tensors(file, wanted))
 
 
-def stored_tensors(
-    file: Path, wanted: Mapping[str, tuple[tuple[int, ...], bool]] | None = None
-) -> Iterator[tuple[str, Array]]:
-    """Names and tensors of a safetensors file, one after another, real numbers in 32 bits: plain numbers, no code is
-    run. Whoever keeps none of them needs little more memory than the largest takes.
+def stored_tensors(file: Path, wanted: Shapes | None = None) -> Iterator[tuple[str, Array]]:
+    """Yield names and tensors of a safetensors file, real numbers in 32 bits. Runs no code of the file.
 
-    `wanted`: shape of every tensor, and whether it is of real numbers; None: whatever there is.
+    They come one after another: a caller that keeps none needs little more memory than the largest takes. `wanted`:
+    the tensors that must be there, and no others; None accepts any.
 
     Raises ModelError when the file or a tensor is missing, cut off, of another shape or type, not finite, or of values
-    that no trained model has; where names are wrong, before the first tensor.
+    that no trained model has; for wrong names, before the first tensor.
     """
     if not file.is_file():
         raise ModelError(f"{file}: no such weights file")
@@ -120,31 +133,31 @@ def stored_tensors(
             if wanted is not None and name not in wanted and name not in scales:
                 raise ModelError(f"{file}: tensor {name} is not part of the configured model")
         for name, value in _read(file, kinds, scales):
-            _check(file, name, value, None if wanted is None else wanted[name])
-            yield name, value
+            plain = value.astype(np.float32) if value.dtype.kind == "f" else value
+            _check(f"{file}: tensor {name}", plain, None if wanted is None else wanted[name])
+            yield name, plain
     except (SafetensorError, OSError, TypeError) as error:
         raise ModelError(f"{file}: not a readable safetensors file: {error}") from error
 
 
-def _check(file: Path, name: str, value: Array, wanted: tuple[tuple[int, ...], bool] | None) -> None:
-    if wanted is not None:
-        shape, real = wanted
-        if value.shape != shape:
-            raise ModelError(f"{file}: tensor {name} has shape {value.shape}, the configuration needs {shape}")
-        if (value.dtype.kind == "f") != real:
-            needs = "float32" if real else "int64"
-            raise ModelError(f"{file}: tensor {name} is of {value.dtype}, the model needs {needs}")
-    if value.dtype.kind != "f" or not value.size:
+def _check(tensor: str, value: Array, wanted: tuple[tuple[int, ...], bool] | None) -> None:
+    """Raise ModelError, beginning with `tensor`, for a wrong shape or type and for impossible values."""
+    shape, real = wanted or (value.shape, value.dtype.kind == "f")
+    if value.shape != shape:
+        raise ModelError(f"{tensor} has shape {value.shape}, the configuration needs {shape}")
+    if (value.dtype.kind == "f") != real:
+        raise ModelError(f"{tensor} is of {value.dtype}, the model needs {'float32' if real else 'int64'}")
+    if not real or not value.size:
         return
-    largest = float(max(value.max(), -value.min()))  # NaN where there is any
+    largest = float(max(value.max(), -value.min()))  # NaN if any value is
     if not math.isfinite(largest):
-        raise ModelError(f"{file}: tensor {name} holds values that are not finite")
+        raise ModelError(f"{tensor} holds values that are not finite")
     if largest > LARGEST:
-        raise ModelError(f"{file}: tensor {name} holds {largest:g}, no trained model is above {LARGEST:g}")
+        raise ModelError(f"{tensor} holds {largest:g}, no trained model is above {LARGEST:g}")
 
 
 def _read(file: Path, kinds: Mapping[str, str], scales: Set[str]) -> Iterator[tuple[str, Array]]:
-    """Tensors, opening the file anew every `PIECE_BYTES`: it is mapped, and what was read stays resident until then."""
+    """Yield tensors as stored. The file is opened again every `PIECE_BYTES`: while it is mapped, read pages stay."""
     names = [name for name, kind in kinds.items() if kind != BFLOAT16 and name not in scales]
     while names:
         with safe_open(file, "np") as stored:
@@ -153,33 +166,19 @@ def _read(file: Path, kinds: Mapping[str, str], scales: Set[str]) -> Iterator[tu
                 value = stored.get_tensor(name := names.pop(0))
                 left -= value.nbytes
                 if name + ROW_SCALE in scales:
-                    value = _scaled(file, name, value, stored.get_tensor(name + ROW_SCALE))
-                yield name, _plain(value)
-    if BFLOAT16 in kinds.values():
-        yield from _read_bfloat16(file)
+                    value = _scaled(f"{file}: tensor {name}", value, stored.get_tensor(name + ROW_SCALE))
+                yield name, value
+    if BFLOAT16 in kinds.values():  # numpy has no such type: it is the upper half of a 32-bit number
+        for name, raw in deserialize(file.read_bytes()):  # type: ignore[no-untyped-call]
+            if raw["dtype"] == BFLOAT16:
+                upper = np.frombuffer(raw["data"], np.uint16).astype(np.uint32) << 16
+                yield name, upper.view(np.float32).reshape(raw["shape"])
 
 
-def _read_bfloat16(file: Path) -> Iterator[tuple[str, Array]]:
-    """Tensors of a kind that numpy does not know: the upper half of a 32-bit number."""
-    for name, stored in deserialize(file.read_bytes()):  # type: ignore[no-untyped-call]
-        if stored["dtype"] == BFLOAT16:
-            upper = np.frombuffer(stored["data"], np.uint16).astype(np.uint32) << 16
-            yield name, upper.view(np.float32).reshape(stored["shape"])
-
-
-def _scaled(file: Path, name: str, value: Array, scale: Array) -> Array:
-    """A matrix in 8 bits as real numbers."""
+def _scaled(tensor: str, value: Array, scale: Array) -> Array:
+    """Return a matrix in 8 bits as real numbers."""
     if scale.shape != value.shape[:1] or scale.dtype.kind != "f":
-        raise ModelError(f"{file}: tensor {name}{ROW_SCALE} is not {value.shape[:1]} real numbers, one a row of {name}")
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told as such
+        raise ModelError(f"{tensor}{ROW_SCALE} is not {value.shape[:1]} real numbers, one per row")
+    with np.errstate(over="ignore", invalid="ignore"):  # `_check` reports what is not finite
         scaled: Array = value * scale.astype(np.float32).reshape(-1, *[1] * (value.ndim - 1))
     return scaled
-
-
-def _plain(value: Array) -> Array:
-    return value.astype(np.float32) if value.dtype.kind == "f" else value
-
-
-def load_config(folder: Path) -> config.Listener:
-    """Read `folder`/config.yaml. Raises ConfigError."""
-    return config.load_listener(folder / CONFIG)

@@ -1,31 +1,53 @@
-"""What computes a listener's networks: the seam between a stream, which is numpy, and the library that multiplies.
+"""Engines, which compute a listener's networks: the seam between a stream (numpy) and the library that multiplies.
 
-A stream asks networks by name: arrays in, arrays out, nothing kept. An engine holds their weights. There are two,
-`torch_engine` and `onnx_engine`; the second one never imports torch, and starts in a fraction of the time and memory.
+A stream calls networks by name: arrays in, arrays out, no state kept. There are two engines. `OnnxEngine` runs graphs
+in onnxruntime without torch: a tenth of torch's start-up time, and small models in half its time. `TorchEngine`
+(`torch_engine`) runs the modules, for listeners without graphs and for the lab.
+
+A listener's folder holds its graphs as onnx/NAME.onnx, without weights, and onnx/graphs.json, which lists the weights
+that each graph needs and the configuration that they belong to. So a graph that is cut short, belongs to another model
+or to weights of other shapes is reported in one line before anything runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol, Self
+import ctypes
+import hashlib
+import json
+import logging
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.errors import ModelError
+from sfms_robot import config
+from sfms_robot.errors import ModelError, optional
 from sfms_robot.frames import Floats
+from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
-Array = NDArray[Any]
 EngineName = Literal["auto", "torch", "onnx"]
+
+KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
+ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
+FULL, HALF = 127, 64  # older x86 processors add pairs of products in 16 bits, where full-range integers overflow
+
+log = logging.getLogger(__name__)
 
 
 class Engine(Protocol):
-    """Networks of one listener, by name.
+    """The networks of one listener.
 
     Attributes:
-        name: "torch" or "onnx", and what else tells how it computes: "onnx int8, 2 threads".
-        tensors: the listener's tensors that are no weights of a network, by their name in model.safetensors: scales of
-            its motion and sound, what streams draw from. Not to be changed.
+        name: "torch" or "onnx", and how it computes: "onnx int8, 2 threads".
+        tensors: tensors of model.safetensors by name that are not weights of a network: scales of motion and sound,
+            distributions that streams draw from. Read-only.
     """
 
     @property
@@ -35,24 +57,24 @@ class Engine(Protocol):
     def tensors(self) -> Mapping[str, Array]: ...
 
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
-        """Outputs of a network, each (N, ...), N streams.
+        """Return the outputs of a network, each (N, ...), for N streams.
 
         `inputs` are (N, ...) in the network's order; one of (1, ...) is the same for all streams.
         """
         ...
 
     def build_graphs(self) -> None:
-        """The weights stay as they are from now on: what a single stream asks is made as fast as it gets.
+        """Make calls for a single stream as fast as possible; the weights must not change from now on.
 
         Takes a second with torch, nothing with onnx.
         """
 
     def set_threads(self, threads: int) -> None:
-        """Use so many from now on."""
+        """Use this many threads from now on."""
 
 
 class RunsOnEngine:
-    """What listeners share whose networks an engine runs."""
+    """A listener whose networks an engine runs."""
 
     engine: Engine
 
@@ -63,7 +85,7 @@ class RunsOnEngine:
 
     @property
     def model(self) -> Any:
-        """The torch model behind it. Raises ModelError where it runs on another engine."""
+        """Return the torch model of the engine. Raises ModelError for an engine that has none."""
         try:
             return self.engine.model  # type: ignore[attr-defined]
         except AttributeError:
@@ -71,18 +93,282 @@ class RunsOnEngine:
             raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
 
     def build_graphs(self) -> Self:
-        """See `Engine`. Itself."""
+        """Build the engine's graphs and return this listener."""
         self.engine.build_graphs()
         return self
 
 
 def stacked(parts: Sequence[Array]) -> Array:
-    """Return (N, ...) of N arrays (...), not to be changed: a single one is not copied."""
+    """Return (N, ...) of N arrays (...), read-only: a single one is not copied."""
     return parts[0][None] if len(parts) == 1 else np.stack(parts)
 
 
-def one_of(array: Array, streams: int) -> Array:
-    """An input (N or 1, ...) as an array of its own of (N, ...)."""
-    if len(array) == streams:
-        return array if array.flags.c_contiguous else np.ascontiguousarray(array)
-    return np.ascontiguousarray(np.broadcast_to(array, (streams, *array.shape[1:])))
+# --- Graphs in a listener's folder ------------------------------------------------------------------------------------
+
+FOLDER: Final = "onnx"
+MANIFEST: Final = "graphs.json"
+FORMAT: Final = 1
+# Settings that graphs do not depend on: use of the networks' outputs, and training.
+OUTSIDE: Final = frozenset(
+    "description hop sampling precision neutral metres_per_unit flame_matrix wav2vec2 scores placement "
+    "max_gap_frames".split()
+)
+OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias")
+
+
+@dataclass(frozen=True)
+class Graph:
+    """One network.
+
+    Attributes:
+        data: the ONNX file.
+        weights: tensors of model.safetensors that it needs, by name.
+        rounded: those of them that it needs in 8 bits (`integers`).
+    """
+
+    data: bytes
+    weights: tuple[str, ...]
+    rounded: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GraphFolder:
+    """All graphs of a listener by network, and what `checkpoint.stored_tensors` has to find in model.safetensors."""
+
+    graphs: Mapping[str, Graph]
+    wanted: Shapes
+
+    @property
+    def in_integers(self) -> bool:
+        """Return whether any graph has layers in 8 bits."""
+        return any(graph.rounded for graph in self.graphs.values())
+
+
+def digest(settings: config.Listener) -> str:
+    """Return a hash of all settings that a listener's graphs depend on."""
+    known = settings.model_dump(mode="json", exclude=set(OUTSIDE))
+    for group in known.get("groups", {}).values():
+        for key in OUTSIDE_GROUPS:
+            group.pop(key)
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def has_graphs(folder: Path) -> bool:
+    """Return whether a listener's folder has graphs, usable or not."""
+    return (folder / FOLDER / MANIFEST).is_file()
+
+
+def read_graphs(folder: Path, settings: config.Listener, integers: bool = False) -> GraphFolder:
+    """Read the graphs of a listener's folder; with `integers` each network that has a graph in 8 bits uses that.
+
+    Raises ModelError when a file is missing, cut short, changed, or of another configuration.
+    """
+    file, remedy = folder / FOLDER / MANIFEST, f"export them again: sfms-robot export {folder}"
+    try:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+        version, made_for, networks = manifest["format"], manifest["settings"], manifest["networks"]
+        wanted = {name: (tuple(shape), real) for name, (shape, real) in manifest["tensors"].items()}
+    except OSError:
+        raise ModelError(f"{file}: no graphs of this listener for engine onnx; {remedy}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ModelError(f"{file}: not a list of graphs; {remedy}") from None
+    if version != FORMAT:
+        raise ModelError(f"{file}: graphs of format {version}, this version has {FORMAT}; {remedy}")
+    if made_for != digest(settings):
+        raise ModelError(f"{file}: graphs of another configuration than {folder / 'config.yaml'}; {remedy}")
+    found = {}
+    for name in {network.removesuffix(".int8") for network in networks}:
+        chosen = f"{name}.int8" if integers and f"{name}.int8" in networks else name
+        graph, known = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
+        try:
+            data = graph.read_bytes()
+        except OSError:
+            raise ModelError(f"{graph}: no such graph; {remedy}") from None
+        if hashlib.sha256(data).hexdigest() != known["sha256"]:
+            raise ModelError(f"{graph}: cut short, or of another model than {MANIFEST} next to it; {remedy}")
+        found[name] = Graph(data, tuple(known["weights"]), tuple(known.get("integers", ())))
+    return GraphFolder(found, wanted)
+
+
+# --- onnxruntime ------------------------------------------------------------------------------------------------------
+#
+# A session is made of a graph without weights and of the weights of model.safetensors. Large layers may be in 8-bit
+# integers: for one stream a layer costs what it takes to read its weights, and in bytes that is a quarter. Weights are
+# rounded per output row when they are loaded, the input by its own range.
+
+
+class OnnxEngine:
+    """An `Engine` on onnxruntime.
+
+    Args:
+        folder: of the listener, for messages.
+        graphs: of its networks.
+        weights: returns the tensors of model.safetensors with their names, one after another; called again whenever the
+            number of threads changes.
+        threads: that each network may use.
+    """
+
+    def __init__(
+        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Iterable[tuple[str, Array]]], threads: int = 1
+    ) -> None:
+        self._folder, self._graphs, self._weights = folder, graphs, weights
+        self.tensors: Mapping[str, Array] = {}
+        self._threads = 0
+        self._sessions: dict[str, tuple[Any, list[str]]] = {}  # of each network, with the names of its inputs
+        self.set_threads(threads)
+
+    @property
+    def name(self) -> str:
+        """Return "onnx", the precision and the threads."""
+        precision = " int8" if self._graphs.in_integers else ""
+        return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
+
+    def build_graphs(self) -> None:
+        """Do nothing: the networks are graphs already."""
+
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """Return the outputs of a network, see `Engine.run`."""
+        streams = max(map(len, inputs))
+        session, names = self._sessions[network]
+        arrays = (
+            each if len(each) == streams else np.broadcast_to(each, (streams, *each.shape[1:])) for each in inputs
+        )
+        return tuple(session.run(None, dict(zip(names, map(np.ascontiguousarray, arrays), strict=True))))
+
+    def set_threads(self, threads: int) -> None:
+        """Use this many threads from now on; takes as long as loading."""
+        if threads == self._threads:
+            return
+        graphs = self._graphs.graphs
+        plain = {name for graph in graphs.values() for name in {*graph.weights} - {*graph.rounded}}
+        rounded = {name for graph in graphs.values() for name in graph.rounded}
+        values, small = {}, {}
+        for name, weight in self._weights():
+            if name in plain:
+                values[name] = _value(weight)
+            if name in rounded:
+                values[f"{name}.int8"], values[f"{name}.scale"] = map(_value, integers(weight))
+            if weight.size <= KEPT:
+                small[name] = weight
+        self.tensors = small
+        _trim()
+        for name, graph in graphs.items():
+            session = _session(f"{self._folder}: onnxruntime cannot use graph {name}", graph, values, threads)
+            self._sessions[name] = session, [each.name for each in session.get_inputs()]
+        self._threads = threads
+        del values
+        _trim()
+
+
+def _trim() -> None:
+    """Return memory that loading has freed to the system: with large layers half of all, on a C library that can."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
+
+
+def _value(array: Array) -> Any:
+    return _onnxruntime().OrtValue.ortvalue_from_numpy(np.asarray(array, order="C"))
+
+
+def _session(failure: str, graph: Graph, values: Mapping[str, Any], threads: int) -> Any:
+    """Return a session of a graph. Raises ModelError, which begins with `failure`."""
+    onnxruntime = _onnxruntime()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo loop has the other core
+    options.log_severity_level = 3
+    names = [name for name in graph.weights if name not in graph.rounded]
+    names += [f"{name}.{part}" for name in graph.rounded for part in ("int8", "scale")]
+    options.add_external_initializers(names, [values[name] for name in names])
+    try:
+        return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has no class of its own for faults of a file
+        why = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ModelError(f"{failure}: {why}") from error
+
+
+def _onnxruntime() -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it looks up its maker's host
+    import onnxruntime
+
+    return onnxruntime
+
+
+def integers(weight: Floats) -> tuple[Array, Floats]:
+    """Return a layer's weight (out, in) as int8 (in, out), and the scale (out,) of each output."""
+    most = FULL if whole_integers() else HALF
+    rounded, scale = np.empty(weight.shape[::-1], np.int8), np.empty(len(weight), np.float32)
+    for row in range(0, len(weight), ROWS):
+        part = weight[row : row + ROWS]
+        of_rows = np.maximum(np.abs(part).max(1), 1e-12) / most
+        rounded[:, row : row + ROWS] = np.rint(part / of_rows[:, None]).astype(np.int8).T
+        scale[row : row + ROWS] = of_rows
+    return rounded, scale
+
+
+@lru_cache(maxsize=1)
+def whole_integers() -> bool:
+    """Return whether this processor adds products of 8-bit integers in 32 bits (VNNI, or ARM's dot products)."""
+    if platform.machine().lower() in ("aarch64", "arm64"):
+        return True
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    return "avx512_vnni" in flags or "avx_vnni" in flags
+
+
+# --- Choice of an engine ----------------------------------------------------------------------------------------------
+#
+# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process_child`) measures
+# whether one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two
+# seconds and 200 MB.
+
+
+def engine_of(
+    folder: Path,
+    settings: config.Listener,
+    wanted: EngineName,
+    torch_engine: Callable[[], Engine],
+    precision: str = "fp32",
+    threads: int | None = None,
+) -> Engine:
+    """Load the engine of a listener's folder.
+
+    Args:
+        folder: of the listener.
+        settings: of the listener.
+        wanted: the engine, or auto.
+        torch_engine: makes torch's, with the folder's weights.
+        precision: of large layers: fp32, int8, or auto, which is int8 where there are graphs of it.
+        threads: None for one, and with torch for the number that it uses.
+
+    Raises ModelError, and ConfigError where a package that `wanted` needs is not installed.
+    """
+    graphs = _graphs(folder, settings, wanted, precision)
+    if graphs is not None:
+        file, shapes = folder / WEIGHTS, graphs.wanted
+        return OnnxEngine(folder, graphs, lambda: stored_tensors(file, shapes), threads or 1)
+    with optional(f"{folder}: a listener without graphs of engine onnx"):
+        engine = torch_engine()
+    if threads is not None:
+        engine.set_threads(threads)
+    return engine
+
+
+def _graphs(folder: Path, settings: config.Listener, wanted: EngineName, precision: str) -> GraphFolder | None:
+    """Return the graphs to run; None for torch."""
+    if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
+        return None
+    try:
+        graphs = read_graphs(folder, settings, integers=precision != "fp32")
+    except ModelError as error:
+        if wanted == "onnx" or find_spec("torch") is None:
+            raise
+        log.warning("torch in place of onnx: %s", error)
+        return None
+    if precision == "int8" and not graphs.in_integers:
+        raise ModelError(f"{folder}: precision int8, and no graphs in 8 bits: sfms-robot export --int8 {folder}")
+    return graphs

@@ -54,7 +54,7 @@ from sfms_robot.frames import (
     Floats,
 )
 from sfms_robot.listeners.checkpoint import read_weights, write_tensors
-from sfms_robot.listeners.lots import Use, normals, uniforms
+from sfms_robot.listeners.stream_rng import Use, normals, uniforms
 
 BANDS_HZ = (0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.34, 0.46, 0.62, 0.85, 1.15, 1.6)  # edges
 BANDS = len(BANDS_HZ) - 1

@@ -1,12 +1,16 @@
-"""Transformer parts shared by the listeners: pre-norm blocks, written out so that a step is the same everywhere.
+"""Layers that both listeners share: attention, feed-forward, modulation, written out so that a step is plain to see.
 
-Shapes: B batch, T frames of the query, S frames of the memory, D width.
+SFMS is made of `Block`s over sequences. ARIG makes one frame at a time, where calling a module costs as much as its
+product: its layers skip the hooks of `nn.Module` (`PlainModule`), and a query looks at a few tokens (`CrossAttention`).
+
+Shapes: B batch, T frames of the query, S frames of the memory, N samples, D width, h heads.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,45 +18,38 @@ from torch.nn import functional as F
 
 
 @lru_cache(maxsize=16)
-@torch.inference_mode(False)  # what is kept has to serve training as well
+@torch.inference_mode(False)  # the cached tensor serves training as well
 def sinusoidal(length: int, width: int) -> Tensor:
-    """Sinusoidal positions (length, width) of Vaswani et al. 2017, not to be changed; `width` is even."""
+    """Return the sinusoidal positions (length, width) of Vaswani et al. 2017, read-only; `width` is even."""
     position = torch.arange(length, dtype=torch.float32)[:, None]
     rate = torch.exp(torch.arange(0, width, 2, dtype=torch.float32) * (-math.log(10_000.0) / width))
     return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)
 
 
+# --- Operators of onnxruntime -----------------------------------------------------------------------------------------
+#
+# While a graph is exported, attention and LayerNorm become the one operator that onnxruntime has for each. The dozen
+# operators that torch would write in its place cost more than the few frames they compute.
+
+
+def _operator(name: str, inputs: tuple[Any, ...], attributes: dict[str, Any], like: Tensor, version: int = 1) -> Tensor:
+    """Return the output, of the type and shape of `like`, of an ONNX operator."""
+    out: Tensor = torch.onnx.ops.symbolic(name, inputs, attributes, dtype=like.dtype, shape=like.shape, version=version)
+    return out
+
+
 def exported_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
-    """Full attention of q (B, T, D) over k, v (B, S, D) as the one operator that onnxruntime has for it, (B, T, D).
-
-    For graphs alone: in place of a dozen, which for a few frames cost more than what they compute. `seen` (B, S).
-    """
+    """Return full attention (B, T, D) of q (B, T, D) over k, v (B, S, D) as one operator; `seen` (B, S) masks keys."""
     mask = None if seen is None else seen.to(torch.int32)
-    out: Tensor = torch.onnx.ops.symbolic(
-        "com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, dtype=q.dtype, shape=q.shape,
-        version=1,
-    )  # fmt: skip
-    return out
-
-
-def exported_self_attention(x: Tensor, weight: Tensor, bias: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
-    """`exported_attention` of x (B, T, D) over itself with the product that makes queries, keys and values of it:
-    weight (3D, D), bias (3D,), in this order.
-    """
-    mask = None if seen is None else seen.to(torch.int32)
-    out: Tensor = torch.onnx.ops.symbolic(
-        "com.microsoft::Attention", (x, weight.T, bias, mask), {"num_heads": heads}, dtype=x.dtype, shape=x.shape,
-        version=1,
-    )  # fmt: skip
-    return out
+    return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
 
 
 def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator: for graphs alone."""
-    out: Tensor = torch.onnx.ops.symbolic(
-        "LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, dtype=x.dtype, shape=x.shape, version=17
-    )
-    return out
+    """Return LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator."""
+    return _operator("LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, x, 17)
+
+
+# --- Blocks over sequences (SFMS) -------------------------------------------------------------------------------------
 
 
 class Attention(nn.Module):
@@ -66,7 +63,7 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, x: Tensor, memory: Tensor, seen: Tensor | None = None) -> Tensor:
-        """`seen` (B, S): True where the memory may be looked at; at least one per row."""
+        """Return (B, T, D). `seen` (B, S) is True where the memory may be looked at, at least once per row."""
         if torch.compiler.is_exporting():
             return self._exported(x, memory, seen)
         (b, t, d), s = x.shape, memory.shape[1]
@@ -78,21 +75,22 @@ class Attention(nn.Module):
         return out
 
     def _exported(self, x: Tensor, memory: Tensor, seen: Tensor | None) -> Tensor:
-        """`forward` in as few operators as there are; what hangs on weights alone is worked out with the graph."""
+        """Return `forward` in as few operators as possible; terms of weights alone are folded when a graph loads."""
         own, other = self.query, self.key_value
-        if memory is x:
+        if memory is x:  # one operator with the projection of queries, keys and values
             weight, bias = torch.cat([own.weight, other.weight]), torch.cat([own.bias, other.bias])
-            y = exported_self_attention(x, weight, bias, self.heads, seen)
+            mask = None if seen is None else seen.to(torch.int32)
+            y = _operator("com.microsoft::Attention", (x, weight.T, bias, mask), {"num_heads": self.heads}, x)
             return F.linear(y, self.out.weight, self.out.bias)
-        # A bias of all keys changes no softmax, and one of all values is a bias of what is seen of them.
+        # softmax(q (k + c)^T) does not depend on c, and a bias of all values is a bias of the result.
         k, v = F.linear(memory, other.weight).chunk(2, dim=-1)
         y = exported_attention(self.query(x), k, v, self.heads, seen)
         bias = self.out.bias + self.out.weight @ other.bias.chunk(2)[1]
         return F.linear(y, self.out.weight, bias)
 
 
-class FeedForward(nn.Module):
-    """Norm, widen twofold, narrow: the residual branch of a block."""
+class NormFeedForward(nn.Module):
+    """Norm, widen twofold, GELU, narrow: the residual branch of a block."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -101,6 +99,7 @@ class FeedForward(nn.Module):
         self.down = nn.Linear(2 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the branch (..., D) of x (..., D), not yet added to it."""
         y: Tensor = self.down(F.gelu(self.up(self.norm(x))))
         return y
 
@@ -114,7 +113,7 @@ class Block(nn.Module):
         self.attention = Attention(width, heads)
         self.cross_norm = nn.LayerNorm(width) if cross else None
         self.cross = Attention(width, heads) if cross else None
-        self.forward_part = FeedForward(width)
+        self.forward_part = NormFeedForward(width)
 
     def forward(
         self,
@@ -124,9 +123,9 @@ class Block(nn.Module):
         memory_seen: Tensor | None = None,
         last: int | None = None,
     ) -> Tensor:
-        """x (B, T, D) -> (B, T, D); `seen` masks x (B, T), `memory_seen` the memory (B, S).
+        """Return (B, T, D) of x (B, T, D); `seen` masks x (B, T), `memory_seen` the memory (B, S).
 
-        `last`: only so many frames at the end of x are wanted (B, last, D); they look at all of it nevertheless.
+        `last`: return only that many frames at the end (B, last, D); their queries still see all of x.
         """
         y = self.norm(x)
         if last is None:
@@ -136,4 +135,143 @@ class Block(nn.Module):
         if self.cross is not None and self.cross_norm is not None and memory is not None:
             x = x + self.cross(self.cross_norm(x), memory, memory_seen)
         out: Tensor = x + self.forward_part(x)
+        return out
+
+
+# --- Layers of single frames (ARIG) -----------------------------------------------------------------------------------
+
+
+class PlainModule(nn.Module):
+    """A module that is called without hooks, which nothing here uses: for one frame they cost as much as a product."""
+
+    def __call__(self, *args: Any) -> Any:
+        return self.forward(*args)
+
+
+class Linear(nn.Linear):
+    """A linear layer without hooks, as `PlainModule`."""
+
+    __call__ = nn.Linear.forward
+
+
+class LayerNorm(nn.LayerNorm):
+    """A LayerNorm without hooks, as `PlainModule`."""
+
+    __call__ = nn.LayerNorm.forward
+
+
+def split_heads(x: Tensor, heads: int) -> Tensor:
+    """Return x (N, S, D) as (N, h, S, D/h)."""
+    n, s, d = x.shape
+    return x.view(n, s, heads, d // heads).transpose(1, 2)
+
+
+def join_heads(x: Tensor) -> Tensor:
+    """Return x (N, h, S, D/h) as (N, S, D)."""
+    n, h, s, d = x.shape
+    return x.transpose(1, 2).reshape(n, s, h * d)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """Return full attention of (N, h, S, D/h), in 32 bits where a CPU trains in 16: its gradient is slow in those."""
+    if q.dtype == torch.bfloat16 and not q.is_cuda:
+        with torch.autocast(q.device.type, enabled=False):
+            return F.scaled_dot_product_attention(q.float(), k.float(), v.float())
+    return F.scaled_dot_product_attention(q, k, v)
+
+
+class FeedForward(PlainModule):
+    """Widen to `hidden`, GELU, narrow."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.up = Linear(width, hidden)
+        self.down = Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., D) of x (..., D)."""
+        out: Tensor = self.down(F.gelu(self.up(x)))
+        return out
+
+
+class Modulation(PlainModule):
+    """adaLN (Peebles and Xie 2023; A.1): shifts, scales and gates of a block, computed from a condition.
+
+    Ours: a new one leaves its block a plain one (shifts about 0, scales and gates about 1), because gates of 0, with
+    which DiT begins, only delay learning at these depths.
+    """
+
+    def __init__(self, width: int, size: int, kinds: str) -> None:
+        """Make vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
+        super().__init__()
+        self.parts = len(kinds)
+        self.linear = Linear(width, self.parts * size)
+        nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
+        with torch.no_grad():
+            self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
+
+    def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
+        """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
+        return self.linear(condition).chunk(self.parts, dim=-1)
+
+    def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
+        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample; (size,) if N is 1."""
+        parts = self.linear(condition)
+        return (parts[0] if parts.shape[0] == 1 else parts[:, None]).chunk(self.parts, dim=-1)
+
+
+def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """Return LayerNorm of x (..., D) without weights, then scaled and shifted; `shift`, `scale` broadcast to x."""
+    if torch.compiler.is_exporting():
+        return exported_norm(x, scale, shift)
+    if shift.dim() == 1:  # the same for all: LayerNorm applies it as its own weights
+        return torch.layer_norm(x, x.shape[-1:], scale, shift)
+    return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
+
+
+def weighted_mean(x: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the mean (...) of x (..., C) over channels, by weights (C,) that add up to 1; None weighs all equally."""
+    return x.mean(-1) if weights is None else (x * weights).sum(-1)
+
+
+def windows(x: Tensor, size: int) -> Tensor:
+    """Return (B, T, size, D) of x (B, T, D): each frame and those before it, the first one repeated (A.2)."""
+    padded = torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1)
+    return padded.unfold(1, size, 1).transpose(-1, -2)
+
+
+class CrossAttention(PlainModule):
+    """A query that looks at a few tokens, then a feed-forward; pre-norm, residual.
+
+    Keys and values of a token do not depend on its slot: the meaning of a slot is added to the finished key. So a
+    stream projects every token once, however long it stays in view.
+    """
+
+    def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = LayerNorm(width)
+        self.query = Linear(width, width)
+        self.key_value = Linear(width, 2 * width)
+        self.slots = nn.Parameter(torch.randn(slots, 2 * width) * 0.02)
+        self.out = Linear(width, width)
+        self.ffn_norm = LayerNorm(width)
+        self.ffn = FeedForward(width, hidden)
+
+    def keys(self, tokens: Tensor) -> Tensor:
+        """Return keys and values (..., 2D) of tokens (..., D), for `forward`."""
+        out: Tensor = self.key_value(tokens)
+        return out
+
+    def forward(self, x: Tensor, keys: Tensor) -> Tensor:
+        """Return (N, D) of x (N, D) looking at keys (N, slots, 2D)."""
+        query, told = self.query(self.norm(x))[:, None], keys + self.slots
+        if torch.compiler.is_exporting():
+            k, v = told.chunk(2, dim=-1)
+            seen = exported_attention(query, k, v, self.heads)
+        else:
+            k, v = split_heads(told, 2 * self.heads).chunk(2, dim=1)
+            seen = join_heads(attend(split_heads(query, self.heads), k, v))
+        x = x + self.out(seen[:, 0])
+        out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out

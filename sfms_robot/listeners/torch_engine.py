@@ -1,80 +1,296 @@
-"""Networks computed by torch: as modules, or as graphs, which for a single stream of a small model take a fifth less.
+"""Networks on torch: run as modules or traced graphs, or written as ONNX graphs without weights.
 
-Imports torch. A graph is made by torch.jit, which is on its way out; what takes its place wants a C++ compiler on the
-machine that runs, and where speed counts there is `onnx_engine`.
+`TorchEngine` runs a listener's networks. `export` writes them for `engine.OnnxEngine`: torch.export traces a network
+for any number of streams, torch.onnx writes it, onnxscript simplifies it. Weights keep the names that they have in
+model.safetensors and none of their values goes into a graph: so graphs are small, and all weights trained for the same
+configuration run on them. `export` needs the extra `export`.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
-from sfms_robot.listeners.engine import Array
+from sfms_robot import config
+from sfms_robot.errors import ModelError, optional
+from sfms_robot.listeners.checkpoint import WEIGHTS, Array
+from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, digest
 
-WARM_UPS: Final = 3  # a graph is put together in its first two runs
+Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
+Examples = Mapping[str, Mapping[str, Tensor]]  # of their inputs, by network and name
+
+WARM_UPS: Final = 3  # torch.jit specialises a graph in its first two runs
+MODEL: Final = "model."  # before the name of a weight, in every network
+MOST_STREAMS: Final = 4096
+EXAMPLE_STREAMS: Final = 3
+ONE_STREAM: Final = "rest"  # the network that is called once, for one stream, when a listener is loaded
 
 
 class TorchEngine:
-    """`engine.Engine`.
+    """An `engine.Engine` on torch.
 
     Args:
-        model: whose state `tensors` shows, as it is at any time.
-        networks: by name; modules of tensors alone.
-        examples: of their inputs, for one stream; what can become a graph.
+        model: `tensors` shows its current state.
+        networks: of the model.
+        examples: inputs for one stream, from which graphs are traced.
     """
 
-    def __init__(
-        self,
-        model: nn.Module,
-        networks: Mapping[str, nn.Module],
-        examples: Mapping[str, Mapping[str, Tensor]],
-    ) -> None:
+    def __init__(self, model: nn.Module, networks: Networks, examples: Examples) -> None:
         self.model = model.eval()
-        self.tensors = {name: value.detach().numpy() for name, value in model.state_dict().items() if _plain(value)}
+        state = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+        self.tensors = {name: value.detach().numpy() for name, value in state.items() if not value.is_quantized}
         self._networks, self._examples = networks, examples
         self._graphs: dict[str, Callable[..., Any]] = {}
 
     @property
     def name(self) -> str:
+        """Return "torch"."""
         return "torch"
 
+    @torch.inference_mode()
     def build_graphs(self) -> None:
-        """The weights stay as they are from now on: what a single stream asks becomes graphs."""
-        for name, example in self._examples.items():
-            self._graphs[name] = graph(self._networks[name], tuple(example.values()))
+        """Trace every network for a single stream: a small model takes a fifth less time. The weights must not change.
+
+        Sizes that a module turns into Python numbers stay those of the example. torch.jit is being retired; what takes
+        its place needs a C++ compiler on the machine that runs.
+        """
+        for name, named in self._examples.items():
+            network, example = self._networks[name].eval(), tuple(named.values())
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                traced = torch.jit.trace(network, example, check_trace=False)  # type: ignore[no-untyped-call]
+                self._graphs[name] = torch.jit.freeze(traced)
+            for _ in range(WARM_UPS):
+                self._graphs[name](*example)
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
-        """See `engine.Engine`."""
-        told = [torch.from_numpy(each if each.flags.writeable else each.copy()) for each in inputs]
-        streams = max(map(len, told))
-        module = self._graphs.get(network) if streams == 1 else None
-        outputs = (self._networks[network] if module is None else module)(*told)
-        return tuple(output.numpy() for output in outputs)
+        """Return the outputs of a network, see `engine.Engine.run`."""
+        tensors = [torch.from_numpy(each if each.flags.writeable else each.copy()) for each in inputs]
+        module = self._graphs.get(network) if max(map(len, tensors)) == 1 else None
+        return tuple(output.numpy() for output in (module or self._networks[network])(*tensors))
 
     def set_threads(self, threads: int) -> None:
-        """Of the whole process: torch knows no other."""
+        """Use this many threads in the whole process: torch has no other setting."""
         torch.set_num_threads(threads)
 
 
-def _plain(value: Tensor) -> bool:
-    return isinstance(value, Tensor) and not value.is_quantized
+# --- Export -----------------------------------------------------------------------------------------------------------
+#
+# What is done to the graph of a network:
+#
+#     1. torch.export: a program in which the number of streams N is a symbol. Modules write attention and LayerNorm as
+#        the one operator that onnxruntime has for each (`layers.exported_attention`).
+#     2. torch.onnx: initialisers hold the weights, "model.NAME", and constants.
+#     3. Weights become inputs, onnxscript folds constants and removes what is not used, weights become initialisers
+#        again. As initialisers they would be folded into the graph; values of inputs are not known.
+#     4. For 8 bits, each product of a large layer is replaced (`_with_integers`):
+#
+#            W -> Transpose -> MatMul(x, .) -> Add(., b)   }
+#            Gemm(x, W, b)                                 }  ->  DynamicQuantizeMatMul(x, W.int8, W.scale, -, b)
+#
+#        onnxruntime rounds x by its own range, multiplies integers and scales the result.
+#     5. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
+#        their content, which `engine` hands to the session (`_written`).
 
 
-@torch.inference_mode()
-def graph(part: nn.Module, example: tuple[Tensor, ...]) -> Callable[..., Any]:
-    """`part`, a module of tensors alone whose weights stay as they are, as one graph for inputs such as `example`.
+def export(
+    folder: Path, settings: config.Listener, networks: Networks, examples: Examples, integers: Iterable[str] = ()
+) -> list[Path]:
+    """Write the graphs of a listener into its folder and return the files. Takes half a minute to two.
 
-    Sizes that the module turns into Python numbers stay those of the example.
+    Args:
+        folder: of the listener.
+        settings: of the listener.
+        networks: modules with the model as their attribute `model`.
+        examples: inputs of every network, of several streams.
+        integers: weights of layers, by name, for a second graph of each network that has them in 8 bits.
+
+    Raises MissingExtra, and ModelError where the folder cannot be written.
     """
+    layers = list(integers)
+    graphs: dict[str, Any] = {}
+    for name, network in networks.items():
+        with torch.no_grad():
+            network(*examples[name].values())  # fills caches, which must not be traced
+            graphs[name] = _graph(network.eval(), examples[name], several=name != ONE_STREAM)
+        if layers:
+            graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
+    state: dict[str, Tensor] = next(iter(networks.values())).get_submodule("model").state_dict()
+    known: dict[str, Any] = {}
+    files: list[Path] = []
+    try:
+        (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+        for name, graph in graphs.items():
+            data, known[name] = _written(graph, state)
+            files.append(folder / FOLDER / f"{name}.onnx")
+            files[-1].write_bytes(data)
+        manifest = {
+            "format": FORMAT,
+            "settings": digest(settings),
+            "tensors": {name: (list(value.shape), value.is_floating_point()) for name, value in state.items()},
+            "networks": known,
+        }
+        files.append(folder / FOLDER / MANIFEST)
+        files[-1].write_text(json.dumps(manifest, indent=0) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ModelError(f"{folder / FOLDER}: cannot be written: {error.strerror}") from error
+    return files
+
+
+def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> Any:
+    """Return a simplified `onnx_ir.Model` whose weights are values without content (steps 1 to 3)."""
+    with optional("sfms-robot export"):
+        import onnxscript
+    streams = torch.export.Dim("streams", min=1, max=MOST_STREAMS)
+    free = torch.export.Dim("free", min=1, max=MOST_STREAMS)
+    also = {name: {1: free} for name in getattr(network, "free", ())}
+    dynamic = _like_arguments(network, [{0: streams} | also.get(name, {}) for name in example]) if several else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        traced = torch.jit.trace(part.eval(), example, check_trace=False)  # type: ignore[no-untyped-call]
-        made: Callable[..., Any] = torch.jit.freeze(traced)
-    for _ in range(WARM_UPS):
-        made(*example)
-    return made
+        quiet = logging.getLogger("torch.onnx")
+        level = quiet.level
+        quiet.setLevel(logging.ERROR)
+        try:
+            program = torch.export.export(network, tuple(example.values()), dynamic_shapes=dynamic, strict=False)
+            exported = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False, input_names=list(example))
+        finally:
+            quiet.setLevel(level)
+    if exported is None:
+        raise ModelError("torch.onnx made no graph")
+    graph: Any = exported.model.graph
+    held = [value for name, value in graph.initializers.items() if name.startswith(MODEL)]
+    kept = {value.name: value.const_value for value in held}
+    for value in held:  # step 3: as inputs, whose values cannot be folded into the graph
+        del graph.initializers[value.name]
+        value.const_value = None
+        graph.inputs.append(value)
+    onnxscript.optimizer.optimize_ir(exported.model)
+    for value in held:
+        graph.inputs.remove(value)
+        value.const_value = kept[value.name]
+        if value.uses():
+            graph.initializers[value.name] = value
+    return exported.model
+
+
+def _like_arguments(network: nn.Module, shapes: list[Any]) -> tuple[Any, ...]:
+    """Return shapes in the form of the arguments of `forward`, where all of *parts are one argument."""
+    code = network.forward.__code__
+    named = code.co_argcount - 1
+    rest = code.co_flags & 0x04  # CO_VARARGS
+    return (*shapes[:named], tuple(shapes[named:])) if rest else tuple(shapes)
+
+
+def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, Any]]:
+    """Return the file of a graph (step 5) and its entry in the manifest."""
+    import onnx
+    import onnx_ir
+
+    proto = onnx_ir.to_proto(model)
+    graph = proto.graph
+    # Nothing about the machine and the source files that made it.
+    for part in (proto, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    graph.ClearField("value_info")
+    proto.producer_name, proto.producer_version = "sfms-robot", ""
+    weights, layers = [], []
+    names: dict[str, str] = {}  # of initialisers, as they were and as they are written
+    for tensor in graph.initializer:
+        name = tensor.name.removeprefix(MODEL)
+        if name.removesuffix(".int8") in state and name.endswith(".int8"):
+            layers.append(name.removesuffix(".int8"))
+        elif name in state and tensor.name.startswith(MODEL):
+            weights.append(name)
+        elif not (name.endswith(".scale") and name.removesuffix(".scale") in state):
+            continue  # a constant
+        names[tensor.name] = name
+        shape, kind = list(tensor.dims), tensor.data_type
+        tensor.CopyFrom(onnx.TensorProto(name=name, dims=shape, data_type=kind))
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=WEIGHTS)
+    for node in graph.node:
+        node.input[:] = [names.get(used, used) for used in node.input]
+    data = proto.SerializeToString(deterministic=True)
+    known = {
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "weights": sorted(weights + layers),
+        "integers": sorted(layers),
+    }
+    return data, known
+
+
+def _with_integers(model: Any, layers: Iterable[str]) -> Any:
+    """Return a copy whose `layers` multiply in 8 bits (step 4)."""
+    import onnx_ir
+    from onnx_ir.passes.common import RemoveUnusedNodesPass
+
+    model = onnx_ir.from_proto(onnx_ir.to_proto(model))
+    graph = model.graph
+    for layer in layers:
+        weight = graph.initializers.get(MODEL + layer)
+        if weight is None:
+            continue
+        size = [int(each) for each in weight.shape]
+        rounded = _placeholder(f"{MODEL}{layer}.int8", size[::-1], onnx_ir.DataType.INT8)
+        scale = _placeholder(f"{MODEL}{layer}.scale", size[:1], onnx_ir.DataType.FLOAT)
+        graph.initializers.update({rounded.name: rounded, scale.name: scale})
+        for node, index in list(weight.uses()):
+            if node.op_type == "Gemm" and index == 1:
+                _replace(graph, node, node.inputs[0], rounded, scale, node.inputs[2] if len(node.inputs) > 2 else None)
+            elif node.op_type == "Transpose":
+                for product, _ in list(node.outputs[0].uses()):
+                    last, bias = _biased(graph, product)
+                    _replace(graph, last, product.inputs[0], rounded, scale, bias)
+            else:
+                raise ModelError(f"{layer}: used by {node.op_type}, which has no product in 8 bits")
+    RemoveUnusedNodesPass()(model)
+    for name in [name for name, value in graph.initializers.items() if not value.uses()]:
+        del graph.initializers[name]
+    model.opset_imports["com.microsoft"] = 1
+    return model
+
+
+def _placeholder(name: str, shape: list[int], kind: Any) -> Any:
+    """Return an initialiser that gets its content when the graph is loaded."""
+    import onnx_ir
+
+    value = onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
+    value.const_value = onnx_ir.ExternalTensor(WEIGHTS, None, None, kind, shape=onnx_ir.Shape(shape), name=name)
+    return value
+
+
+def _biased(graph: Any, product: Any) -> tuple[Any, Any]:
+    """Return the node that adds a bias to a product, and the bias; the product and None where there is none."""
+    uses = list(product.outputs[0].uses())
+    if len(uses) == 1 and uses[0][0].op_type == "Add":
+        node, index = uses[0]
+        bias = node.inputs[1 - index]
+        if bias.name in graph.initializers and len(bias.shape) == 1:
+            return node, bias
+    return product, None
+
+
+def _replace(graph: Any, node: Any, x: Any, rounded: Any, scale: Any, bias: Any) -> None:
+    """Put a product in 8 bits in the place of `node`, under the name of its output."""
+    import onnx_ir
+
+    inputs = [x, rounded, scale] if bias is None else [x, rounded, scale, None, bias]  # None: zero point of 0
+    product = onnx_ir.Node("com.microsoft", "DynamicQuantizeMatMul", inputs)
+    product.outputs[0].name = node.outputs[0].name
+    graph.insert_before(node, product)
+    for user, index in list(node.outputs[0].uses()):
+        user.replace_input_with(index, product.outputs[0])
+    for index, output in enumerate(graph.outputs):
+        if output is node.outputs[0]:
+            graph.outputs[index] = product.outputs[0]
+    graph.remove(node, safe=True)

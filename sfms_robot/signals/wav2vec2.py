@@ -1,13 +1,14 @@
 """wav2vec2 of each 40 ms frame, from a model folder on disk; one path offline and streaming.
 
-The transformer sees a whole recording at once, future and all. A listener hears a stream, so each frame gets a window
-of its own: the last 50 frames (2 s) and 80 samples, which makes the last two latents end with the frame; their mean is
-the frame's feature. That is a pass over 2 s a frame: on a GPU it streams, on a processor it does not.
+The transformer sees a whole recording at once, the future included. A listener takes a stream, so each frame gets a
+separate window: the last 50 frames (2 s) and 80 samples, so that the last two latents end with the frame; their mean is
+the frame's feature. That is a pass over 2 s a frame: a GPU keeps up with a stream, a processor does not.
 
 With a hop of h frames one pass gives h rows, when the last of them is complete, for an h-th of the cost: a listener
-that plans every h frames loses nothing by it. Its windows are h - 1 frames longer, so that every row has its 2 s.
+that plans every h frames loses nothing. Its windows are h - 1 frames longer, so that every row has its 2 s.
 
-Deviation: REACT's baselines run whole recordings and stretch 50 latents a second to 25; those rows know the future.
+Ours, because rows of a whole recording know the future: REACT's baselines run whole recordings and stretch 50 latents a
+second to 25.
 """
 
 from __future__ import annotations
@@ -71,8 +72,8 @@ class Wav2Vec2:
             past: from the last call, or `start()`; not changed.
 
         Returns:
-            (frames, dim), a multiple of `hop_frames`, and the samples to hand in next time: 31440 and those of a hop
-            that is not complete.
+            (frames, dim), a multiple of `hop_frames`, and the samples to pass next time: 31440 and those of an
+            incomplete hop.
         """
         seen = np.concatenate([past, samples]).astype(np.float32)
         hops = max(0, (len(seen) - self._window) // self._hop + 1)

@@ -22,7 +22,6 @@ import orjson
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.processes import LIMITS, Child, Ended, Supervised
-from sfms_robot.viewer.visitor_commands import Command
 
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
 CLOSE_LIMIT_S: Final = 1.0
@@ -186,8 +185,7 @@ class PageProcess:
         elif "left" in content:
             self._pass_on(visitor, lambda asked: asked.left(visitor))
         else:
-            command = Command(content["command"], content["values"])
-            self._pass_on(visitor, lambda asked: asked.command(visitor, command))
+            self._pass_on(visitor, lambda asked: asked.command(visitor, content["command"], content["values"]))
 
     def _pass_on(self, visitor: int, do: Callable[[Asked], None]) -> None:
         asked = self._asked

@@ -12,8 +12,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, stored_tensors
-from sfms_robot.listeners.graph_folder import digest, read_graphs
-from sfms_robot.listeners.onnx_engine import HALF, OnnxEngine, integers
+from sfms_robot.listeners.engine import HALF, OnnxEngine, digest, integers, read_graphs
 from sfms_robot.listeners.registry import at_hop, engine_name, load_listener
 
 LISTENERS = data_dir("configs") / "listeners"

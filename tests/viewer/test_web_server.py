@@ -108,7 +108,7 @@ def test_a_port_that_is_in_use_is_refused_in_one_line_before_a_listener_is_loade
     def load(*_):
         raise AssertionError("a listener was loaded")
 
-    monkeypatch.setattr("sfms_robot.app.listen.preflight.begin_listening", load)
+    monkeypatch.setattr("sfms_robot.app.options.begin_listening", load)
     with closing(status_server("0")) as server, pytest.raises(SystemExit) as ended:
         main(["run", "--duration", "1", "--status", str(server.port)])
     assert ended.value.code == PortError.exit_code

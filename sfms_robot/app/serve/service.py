@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.serve.batch_process import Served
-from sfms_robot.endpoint import HIGHEST_PORT, port_number
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
 from sfms_robot.listeners.capacity import Capacity
 from sfms_robot.listeners.remote import ROOT, down_key, join_key

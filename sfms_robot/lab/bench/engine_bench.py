@@ -21,8 +21,7 @@ from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.lab.bench.listener_process import listener_process
 from sfms_robot.lab.bench.measure import Row, row
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.graph_folder import FOLDER, has_graphs, read_graphs
+from sfms_robot.listeners.engine import FOLDER, EngineName, has_graphs, read_graphs
 from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.ports import Listener
 
@@ -97,7 +96,7 @@ def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]
     found: dict[str, tuple[Path, EngineName]] = {EAGER: (exact, "torch"), "torch": (folder, "torch")}
     if has_graphs(folder):
         found["onnx"] = (exact, "onnx")
-        if any(graph.integers for graph in read_graphs(folder, settings, integers=True).graphs.values()):
+        if read_graphs(folder, settings, integers=True).in_integers:
             found["onnx int8"] = (_of_precision(folder, settings, "int8", scratch), "onnx")
     return found
 

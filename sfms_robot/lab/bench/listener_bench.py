@@ -122,12 +122,12 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
 
 def _in_bf16(where: Path, settings: config.Arig) -> Listener:
     """An ARIG on torch with its large layers in bf16, which no configuration asks for: its row says why."""
-    from sfms_robot.listeners.arig import fast, torch_engine
+    from sfms_robot.listeners.arig import networks, torch_engine
 
     found = load(where, "torch", eager=True)
     how = _how(found)
     how.engine = torch_engine(
-        settings.model_copy(update={"precision": "fp32"}), fast.with_layers(how.model, fast.Bf16Linear)
+        settings.model_copy(update={"precision": "fp32"}), networks.with_layers(how.model, networks.Bf16Linear)
     )
     how.build_graphs()
     return found
@@ -157,7 +157,7 @@ def _seeded(shipped: Path, settings: config.Arig, folder: Path) -> Path:
 
     from sfms_robot.listeners import checkpoint
     from sfms_robot.listeners.arig.model import ArigModel
-    from sfms_robot.listeners.graph_folder import FOLDER, has_graphs
+    from sfms_robot.listeners.engine import FOLDER, has_graphs
 
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -23,7 +23,7 @@ from sfms_robot.lab.evaluation.whole_recordings import Ints, hazards_in, heard_i
 from sfms_robot.lab.learning.events.event_trainer import scene_of
 from sfms_robot.listeners.events.evidence import Sensed
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, STEP_FRAMES, DecideMemory, EventModel
-from sfms_robot.listeners.lots import Use, uniforms_of
+from sfms_robot.listeners.stream_rng import Use, uniforms_of
 
 
 def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> tuple[Doubles, Doubles]:

@@ -14,7 +14,7 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.evaluation.phrase_timing import near
-from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners import audio_frontend
 
 LAGS: Final = 12  # frames either way in which the jaw is looked for
 JAW: Final = CHANNEL_INDEX["jawOpen"]

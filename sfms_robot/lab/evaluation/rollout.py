@@ -24,11 +24,10 @@ from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Flo
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.learning.sfms.features import frames_of
-from sfms_robot.listeners.arig.stream import Memory as ArigMemory
+from sfms_robot.listeners.arig.stream import ArigMemory
 from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
-from sfms_robot.listeners.sfms.draw import Seen
-from sfms_robot.listeners.sfms.keyframes import later, passed, revoked
+from sfms_robot.listeners.sfms.draw import PlanInputs, later, passed, revoked
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
 from sfms_robot.signals.control import control_track
@@ -194,7 +193,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             control, before = listener.told([asked]), later(control, frames_passed)
             tokens, settled = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
-        seen = Seen(
+        seen = PlanInputs(
             face=face[None, window],
             face_known=known[None, window],
             voice=voice[None, window],

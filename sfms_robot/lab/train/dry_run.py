@@ -35,7 +35,7 @@ from sfms_robot.lab.learning.sfms import features as sfms
 from sfms_robot.lab.learning.sfms.predictor_trainer import listener_job
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_job
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace
 

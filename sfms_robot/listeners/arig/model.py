@@ -1,38 +1,16 @@
 """ARIG put together: sounds and motions of two people up to now -> the agent's motion of the next frame, eq. (1).
 
 Frame T of the agent's motion is made from both people's sound and motion of frames 0..T-1 and the agent's own sound of
-frame T. Offline everything is parallel over T. For training:
+frame T. Offline everything is parallel over T (teacher forcing):
 
-    dyad = Dyad(...)                                    # N aligned frames of both people, in plain units
-    losses = model.losses(dyad, states)                 # teacher forcing: frames 1..N-1 are predicted
-    (losses.motion.mean() + 0.1 * losses.state.mean()).backward()
+    dyad = Dyad(...)                          # N aligned frames of both people, in plain units
+    found = model.condition(dyad, states)     # of frames 1..N-1: z, logits of the states, coarse motion
+    motion = model.sample_loss(found.z.flatten(0, 1), model.moved(...).flatten(0, 1))
 
-`condition` is the part before the sampler, `model.head.sample` the sampler, `generate` both with a given past (what
-`stream.ArigListener` computes frame by frame, the law its tests hold). Buffers that training sets from its data:
-`motion_mean`, `motion_std`, `sound_mean`, `sound_std`, and of the diffusion head `low`, `high`, the range of what it
-draws. Where that is steps (`draws: step`, ours), `step_std` and the range `motion_low`, `motion_high` that motion keeps
-to join them; `moved` is what the sampler learns and `drawn` its inverse. Everything that goes in and out here is in
-plain units: motion of the listener's motion space, sound features of `sound.track`.
-
-Beyond the paper, too:
- - `draws: innovation`: x_t = rho x_(t-1) + step_std * sinh(spread * drawn), standardised, with the lag-1
-   autocorrelation `rho` < 1 of the data. Whatever is drawn wrongly is forgotten at that rate, so a head stays as near
-   its mean as in the data however long a stream runs: its place is that of a first-order autoregression, not a sum of
-   steps. A face mostly hardly moves and at times moves a hundred times as fast: companded by asinh above `step_std`,
-   what moves fast leaves precision to what hardly moves. What was drawn last is told to the sampler beside z: how fast
-   the face moves is too fine for the few numbers of z. The mean of what is to be drawn is predicted, and the sampler
-   draws what is left: an event that is told shows after few steps of training, whatever the sampler's temperature.
- - `sway: true`: slow motion of the head is made apart (`listeners.idle`) and is in no motion here: what is left of the
-   head is what it does, and soon over, so `rho` forgets it within frames. Carried on as slowly as a head sways, what
-   was drawn beside a nod left it some degrees off when the nod was over. Of what is left neither its past nor what was
-   drawn last is told: told of its own head, a network learned to swing it from one end of its range to the other.
- - `events`: the control rows of the frame and the one before it (`signals.control`) are a token of the fine prediction
-   and told to the sampler beside z. Where the eyes look is not drawn: they rest. Innovations are of what is left beside
-   the motion b to be expected of the events (`told`): x_t = b_t + rho f_t (x_(t-1) - b_(t-1)) + ..., with f_t < 1 while
-   an event moves the channel, so that by its end nothing is left of what was drawn beside it (`told.remains`). A face
-   that nothing moves, no event and no word of its own, is held to `rest_range`, how far such faces of the data are off
-   b, and beyond that comes back by rho a frame, whatever is drawn: told of its own past, a network holds a raised brow
-   up for good.
+`condition` is the part before the sampler, `sample` the sampler; `stream.ArigListener` computes both frame by frame,
+the same by a law of the tests. Buffers that training sets from its data: `motion_mean`, `motion_std`, `sound_mean`,
+`sound_std`, and of the diffusion head `low`, `high`, the range of what it draws. Everything that goes in and out here
+is in plain units: motion of the listener's motion space, sound features of `audio_frontend.track`.
 
 B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
@@ -46,33 +24,64 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.arig import told
-from sfms_robot.listeners.arig.audio_frontend import WIDTHS
+from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, ShortRange, StateUnderstanding
-from sfms_robot.listeners.arig.parts import Linear, weighted_mean, windows
 from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
-from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST
+from sfms_robot.listeners.arig.stream import CONTROL_ROWS, FIRST
+from sfms_robot.listeners.audio_frontend import WIDTHS
 from sfms_robot.listeners.idle import BANDS, head_channels
+from sfms_robot.listeners.layers import Linear, weighted_mean, windows
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 MEAN_WIDTH = 256
 UNBOUNDED = 1e3  # deviations
-MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly: above, hardly any event is told
+MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly: hardly any event reaches further
+
+# --- What the sampler draws -------------------------------------------------------------------------------------------
+#
+# In the paper the sampler draws the motion of a frame, equation (4), and that is all (`draws: motion`). Ours, because a
+# stream that draws motion on its own past grows restless or drifts. x_t is standardised motion, s the draw of a frame:
+#
+#     draws        x_t =                                          s = `moved`
+#     motion       s                                              x_t
+#     step         x_(t-1) + step_std s                           (x_t - x_(t-1)) / step_std
+#     innovation   rho x_(t-1) + step_std sinh(spread s)          asinh((x_t - rho x_(t-1)) / step_std) / spread
+#
+# - `step` is small where a face is still, and so is what the sampler gets wrong; but errors add up.
+# - `innovation` is a first-order autoregression, rho < 1 the lag-1 autocorrelation of the data: errors are forgotten at
+#   that rate, so a head stays as near its mean as in the data, however long a stream runs. A face mostly hardly moves
+#   and at times moves a hundred times as fast: asinh above `step_std` compresses what moves fast and leaves precision
+#   to what hardly moves. The last draw is an input of the sampler beside z, because how fast the face moves is too
+#   fine for the few numbers of z. The mean of s is predicted (`mean`), and the sampler draws the rest: an event shows
+#   after few steps of training, whatever the sampler's temperature.
+# - `events`: control rows of the frame and of the one before it (`signals.control`) are a token of the fine prediction
+#   and an input of the sampler. The direction of the eyes is not drawn: it rests. Innovations are around the motion b
+#   expected of the events (`event_curves`),
+#
+#         x_t = b_t + rho f_t (x_(t-1) - b_(t-1)) + step_std sinh(spread s),
+#
+#   with f_t < 1 while an event moves the channel (`event_curves.remains`), so that by its end nothing is left of other
+#   motion. A face that nothing moves, no event and no word of its own, is held within `rest_range` of b, the distance
+#   of such faces in the data, and beyond that comes back by rho a frame, whatever is drawn: a network that sees its
+#   own past holds a raised brow up for good.
+# - `sway`: slow motion of the head is made apart (`listeners.sway`) and is in no motion here. The rest of the head's
+#   motion is soon over, so `rho` forgets it within frames. Its past and its last draw are not inputs of the network
+#   (`is_recalled`): with them, it learned to swing the head from one end of its range to the other.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dyad:
     """N aligned frames of a conversation; frame t of every array is the same 40 ms.
 
     Attributes:
-        user_sound, agent_sound: (B, N, A) features of `sound.track`; anything where not heard.
+        user_sound, agent_sound: (B, N, A) features of `audio_frontend.track`; arbitrary where not heard.
         user_heard, agent_heard: (B, N) bool.
-        user_motion: (B, N, C) motion of the listener's space; anything where not seen.
+        user_motion: (B, N, C) motion of the listener's space; arbitrary where not seen.
         user_seen: (B, N) bool.
         agent_motion: (B, N, C), without its sway where that is apart.
         voiced: (B, N, 2) bool: speech of agent, user.
-        control: (B, N, K) of the agent's events; any for a model without.
+        control: (B, N, K) of the agent's events; arbitrary for a model without.
     """
 
     user_sound: Tensor
@@ -88,11 +97,10 @@ class Dyad:
     def check(self, sound: int, channels: int, events: bool = False) -> None:
         """Raise ValueError, naming the array, when one has another shape or there are fewer than two frames."""
         b, n = self.agent_motion.shape[:2]
-        wanted = {
-            "user_sound": (b, n, sound), "agent_sound": (b, n, sound), "user_heard": (b, n), "agent_heard": (b, n),
-            "user_motion": (b, n, channels), "agent_motion": (b, n, channels), "user_seen": (b, n), "voiced": (b, n, 2),
-        }  # fmt: skip
-        for name, shape in wanted.items():
+        wanted = {"user_motion": (b, n, channels), "agent_motion": (b, n, channels), "voiced": (b, n, 2)}
+        wanted |= {"user_sound": (b, n, sound), "agent_sound": (b, n, sound)}
+        flags: dict[str, tuple[int, ...]] = dict.fromkeys(("user_heard", "agent_heard", "user_seen"), (b, n))
+        for name, shape in (wanted | flags).items():
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"{name} is {found}, not {shape}")
@@ -104,11 +112,11 @@ class Dyad:
 
 
 @dataclass(frozen=True)
-class Condition:
-    """What the sampler is told of frames 1..N-1.
+class SamplerCondition:
+    """Inputs of the sampler for frames 1..N-1.
 
     Attributes:
-        z: (B, N-1, D), and beside it what the sampler is told besides.
+        z: (B, N-1, D) with the further inputs of `ArigModel.beside`.
         states: the states' logits (B, N-1, S) or None.
         outline: (B, N-1, D) coarse motion.
         moved: (B, N-1, C) `ArigModel.moved` of the frame before.
@@ -120,166 +128,138 @@ class Condition:
     moved: Tensor
 
 
-@dataclass(frozen=True)
-class Losses:
-    """Of frames 1..N-1, (B, N-1) each: equation (3), or the codes' loss; cross-entropy of the states or None."""
-
-    motion: Tensor
-    state: Tensor | None
-
-
 class ArigModel(nn.Module):
     """Weights of one listener, with the scales of its motion and sound."""
 
-    motion_mean: Tensor
-    motion_std: Tensor
-    motion_low: Tensor
-    motion_high: Tensor
-    step_std: Tensor
-    rho: Tensor
-    spread: Tensor
-    told: Tensor
-    moves: Tensor
-    rest_range: Tensor
-    sway_mixture: Tensor
-    sway_spread: Tensor
-    is_drawn: Tensor
-    is_recalled: Tensor
-    sound_mean: Tensor
-    sound_std: Tensor
-
     def __init__(self, settings: config.Arig) -> None:
         super().__init__()
-        d, hidden, heads = settings.width, settings.feedforward, settings.heads
+        d, innovation, events = settings.width, settings.draws == "innovation", settings.events
         self.settings = settings
         self.channels, self.sound_width = len(settings.channels), WIDTHS[settings.sound]
-        self.register_buffer("motion_mean", torch.zeros(self.channels))
-        self.register_buffer("motion_std", torch.ones(self.channels))
-        self.register_buffer("motion_low", torch.full((self.channels,), -8.0))
-        self.register_buffer("motion_high", torch.full((self.channels,), 8.0))
-        self.register_buffer("step_std", torch.ones(self.channels))
-        self.is_told = settings.events and settings.draws == "innovation"
-        if settings.draws == "innovation":
-            self.register_buffer("rho", torch.zeros(self.channels))
-            self.register_buffer("spread", torch.ones(self.channels))
-            if self.is_told:
-                self.register_buffer("told", torch.zeros(told.FEATURES, self.channels))
-                self.register_buffer("moves", told.moves(settings.channels), persistent=False)
-                self.register_buffer("rest_range", torch.full((self.channels,), UNBOUNDED))
-        is_drawn = torch.tensor([name in settings.drawn_channels for name in settings.channels])
-        self.register_buffer("is_drawn", is_drawn, persistent=False)
-        is_recalled = torch.ones(self.channels, dtype=torch.bool)
-        if settings.sway:
-            head = head_channels(settings.channels)
-            is_recalled[head] = False
-            self.register_buffer("sway_mixture", torch.zeros(BANDS, len(head), len(head)))
-            self.register_buffer("sway_spread", torch.zeros(()))
-        self.register_buffer("is_recalled", is_recalled, persistent=False)
-        self.register_buffer("sound_mean", torch.zeros(self.sound_width))
-        self.register_buffer("sound_std", torch.ones(self.sound_width))
+        self._register_scales()
         self.sounds_read = self.sound_width - (0 if settings.phase else phase.FEATURES)  # the place in a phrase is last
-        self.sound_in = nn.Sequential(Linear(self.sounds_read, d), nn.GELU(), Linear(d, d))
+        self.sound_in = _mlp(self.sounds_read, d, d)
         self.motion_in = Linear(self.channels, d)
         self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_face = nn.Parameter(torch.randn(d) * 0.02) if settings.visual else None
         self.merge_agent = Merge(d, settings.visual)
         self.merge_user = Merge(d, settings.visual)
-        depths = (settings.bidirectional_layers, settings.integrated_layers)
-        linear = settings.interaction == "linear"
-        self.short = ShortRange(d, hidden, heads, settings.chunk_frames, depths, linear)
-        self.long = LongRange(d, hidden, heads, settings.context_layers, settings.chunk_frames, settings.context_chunks)
-        guided, events = settings.state_guidance, settings.events
-        self.states = StateUnderstanding(d, hidden, heads, events) if guided else None
-        self.progress = Progressive(d, hidden, heads, settings.sound_frames, settings.motion_frames, guided, events)
-        self.events_in = (
-            nn.Sequential(Linear(CONTROL_ROWS * len(COLUMNS), d), nn.GELU(), Linear(d, d)) if events else None
-        )
-        condition = d + d * events + self.channels * (settings.draws == "innovation")
+        self.short = ShortRange(settings)
+        self.long = LongRange(settings)
+        self.states = StateUnderstanding(settings) if settings.state_guidance else None
+        self.progress = Progressive(settings)
+        self.events_in = _mlp(CONTROL_ROWS * len(COLUMNS), d, d) if events else None
+        condition = d + d * events + self.channels * innovation
         self.head: Denoiser | CodeHead = (
             CodeHead(self.channels, d, condition, settings.code_levels)
             if settings.discrete
             else Denoiser(settings.channels, condition, settings.diffusion)
         )
-        self.mean = (
-            nn.Sequential(Linear(condition, MEAN_WIDTH), nn.GELU(), Linear(MEAN_WIDTH, self.channels))
-            if settings.draws == "innovation"
-            else None
-        )
+        self.mean = _mlp(condition, MEAN_WIDTH, self.channels) if innovation else None
+
+    def _register_scales(self) -> None:
+        """Register the buffers that training sets from its data, and which channels are drawn and recalled."""
+        settings, c = self.settings, self.channels
+        self.motion_mean = nn.Buffer(torch.zeros(c))
+        self.motion_std = nn.Buffer(torch.ones(c))
+        self.motion_low = nn.Buffer(torch.full((c,), -8.0))
+        self.motion_high = nn.Buffer(torch.full((c,), 8.0))
+        self.step_std = nn.Buffer(torch.ones(c))
+        self.is_told = settings.events and settings.draws == "innovation"  # knows the motion expected of events
+        if settings.draws == "innovation":
+            self.rho = nn.Buffer(torch.zeros(c))
+            self.spread = nn.Buffer(torch.ones(c))
+            if self.is_told:
+                self.told = nn.Buffer(torch.zeros(event_curves.FEATURES, c))
+                self.moves = nn.Buffer(event_curves.moves(settings.channels), persistent=False)
+                self.rest_range = nn.Buffer(torch.full((c,), UNBOUNDED))
+        drawn = [name in settings.drawn_channels for name in settings.channels]
+        self.is_drawn = nn.Buffer(torch.tensor(drawn), persistent=False)
+        is_recalled = torch.ones(c, dtype=torch.bool)
+        if settings.sway:
+            head = head_channels(settings.channels)
+            is_recalled[head] = False
+            self.sway_mixture = nn.Buffer(torch.zeros(BANDS, len(head), len(head)))
+            self.sway_spread = nn.Buffer(torch.zeros(()))
+        self.is_recalled = nn.Buffer(is_recalled, persistent=False)
+        self.sound_mean = nn.Buffer(torch.zeros(self.sound_width))
+        self.sound_std = nn.Buffer(torch.ones(self.sound_width))
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Standard normal numbers that one frame takes: (steps, channels)."""
+        """Return the shape of the standard normal numbers that one frame takes: (steps, channels)."""
         return (1, 1) if self.settings.discrete else (self.settings.diffusion.steps, self.channels)
 
     def standardise(self, motion: Tensor) -> Tensor:
-        """Motion (..., C) of the motion space -> the units the model works in."""
+        """Return motion (..., C) of the motion space in the units the model works in."""
         return (motion - self.motion_mean) / self.motion_std
 
     def restore(self, motion: Tensor) -> Tensor:
-        """The inverse of `standardise`."""
+        """Return standardised motion (..., C) in the motion space."""
         return motion * self.motion_std + self.motion_mean
 
+    # --- Motion and draws: the table above ----------------------------------------------------------------------------
+
+    def expected(self, last: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Return the standardised motion (..., C) that a draw of 0 gives after `last` (..., C); `rows` (..., 2K)."""
+        if self.settings.draws != "innovation":
+            return last  # ours (`step`), because a still face stays still
+        if not self.is_told or rows is None:
+            return self.rho * last  # ours, because errors are forgotten at the rate of the data
+        before, now = rows.chunk(2, dim=-1)
+        off = last - event_curves.features(before) @ self.told  # x_(t-1) - b_(t-1)
+        kept = self.rho * event_curves.remains(before, now, self.moves)  # rho f_t
+        return event_curves.features(now) @ self.told + kept * off
+
     def moved(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
-        """The step to motion (..., C) after `last` (..., C), both standardised, as the sampler draws steps: (..., C).
+        """Return the draw (..., C) that leads to motion (..., C) after `last` (..., C), both standardised.
 
         `rows` (..., 2K): control of both frames.
         """
         if self.settings.draws == "motion":
-            return motion
+            return motion  # the paper's M_T, equation (3)
         step = (motion - self.expected(last, rows)) / self.step_std
         return self.companded(step) if self.settings.draws == "innovation" else step
 
-    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, speaks: Tensor | None = None) -> Tensor:
-        """The inverse of `moved`; a step never leads out of the range of the motion, and what is not drawn rests.
+    def companded(self, step: Tensor) -> Tensor:
+        """Return steps (..., C), in `step_std`, as they are drawn: fast motion is compressed."""
+        return step.asinh() / self.spread
 
-        `speaks` (...) bool, the agent in this frame; None: it may.
+    def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, speaks: Tensor | None = None) -> Tensor:
+        """Return the standardised motion (..., C) that a draw leads to, the inverse of `moved`.
+
+        `speaks` (...) bool: the agent, in this frame; None: it may.
         """
         if self.settings.draws == "motion":
-            return self._at_rest(sample)
-        step = self.expanded(sample) if self.settings.draws == "innovation" else sample
-        begins = self.expected(last, rows)
-        made = torch.addcmul(begins, step, self.step_std)
-        if self.is_told and rows is not None and speaks is not None:
-            made = self._held(made, begins, rows.chunk(2, dim=-1)[1], speaks)
-        return self._at_rest(made.clamp(self.motion_low, self.motion_high))
+            made = sample  # the paper's, equation (4)
+        else:
+            step = (sample * self.spread).sinh() if self.settings.draws == "innovation" else sample
+            begins = self.expected(last, rows)
+            made = torch.addcmul(begins, step, self.step_std)
+            if self.is_told and rows is not None and speaks is not None:
+                made = self._held(made, begins, rows.chunk(2, dim=-1)[1], speaks)
+            made = made.clamp(self.motion_low, self.motion_high)  # ours, because steps could leave the data's range
+        # Ours: channels that are not drawn (gaze) rest at their mean, which is 0.
+        return made.where(self.is_drawn, 0.0) if self.settings.events else made
 
     def _held(self, made: Tensor, begins: Tensor, row: Tensor, speaks: Tensor) -> Tensor:
-        """Motion (..., C) that would begin at `begins`, where nothing moves the face not beyond where faces rest."""
-        course = told.features(row) @ self.told
-        free = speaks[..., None] | told.moved_channels(row, self.moves)
+        """Return motion (..., C), near rest where neither an event of control `row` (..., K) nor a word moves the face.
+
+        There |x - b| <= max(rest_range, |begins - b|): a draw may not lead further from the expected motion b than
+        faces at rest are, and what already is further away comes back at least as fast as without a draw.
+        """
+        course = event_curves.features(row) @ self.told  # b_t
+        free = speaks[..., None] | event_curves.moved_channels(row, self.moves)
         most = torch.where(free, UNBOUNDED, torch.maximum(self.rest_range, (begins - course).abs()))
         return course + torch.minimum(torch.maximum(made - course, -most), most)
 
-    def companded(self, step: Tensor) -> Tensor:
-        """Steps (..., C), in `step_std`, as they are drawn."""
-        return step.asinh() / self.spread
-
-    def expanded(self, drawn: Tensor) -> Tensor:
-        """The inverse of `companded`."""
-        return (drawn * self.spread).sinh()
-
-    def _at_rest(self, motion: Tensor) -> Tensor:
-        """Standardised motion (..., C) with what is not drawn at its mean, which is 0."""
-        return motion.where(self.is_drawn, 0.0) if self.settings.events else motion
-
-    def expected(self, last: Tensor, rows: Tensor | None = None) -> Tensor:
-        """Where a step after `last` (..., C), standardised, begins: there, or a little on its way back to the mean.
-
-        With events, to what is told of the frame, from what was told of the last: `rows` (..., 2K).
-        """
-        if self.settings.draws != "innovation":
-            return last
-        if not self.is_told or rows is None:
-            return self.rho * last
-        before, now = rows.chunk(2, dim=-1)
-        off = last - told.features(before) @ self.told
-        return told.features(now) @ self.told + self.rho * told.remains(before, now, self.moves) * off
+    # --- Sampler (3.4) ------------------------------------------------------------------------------------------------
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
-        """Of the sampler (N, C), the mean included: z (N, D and beside it), noise and levels of `Denoiser.sample`.
+        """Return a draw (N, C), the mean included; z of `beside`, noise and levels of `Denoiser.sample`.
 
-        What is left beside the mean has the sampler's range, and so has the sum: nothing moves faster than in the data.
+        What is drawn around the mean has the sampler's range, and so has the sum: no step is larger than in the data.
         """
         if not isinstance(self.head, Denoiser):
             return self.head.sample(z, noise)
@@ -294,55 +274,53 @@ class ArigModel(nn.Module):
         generator: torch.Generator | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """Equation (3) at `draws` noise levels, or the loss of codes, and that of the mean, (N,).
+        """Return equation (3) at `draws` noise levels, or the loss of codes, plus that of the mean, (N,).
 
         `wanted` (N, C): `moved` of the frame.
         """
         mean = torch.zeros_like(wanted) if self.mean is None else self.mean(z)
         left, z = (each.repeat(draws, 1) for each in (wanted - mean.detach(), z))
         drawn = self.head.loss(z, left, generator, weights).view(draws, -1).mean(0)
-        return (
-            drawn
-            if self.mean is None
-            else drawn + weighted_mean(F.huber_loss(mean, wanted, reduction="none", delta=MEAN_DELTA), weights)
-        )
+        if self.mean is None:
+            return drawn
+        return drawn + weighted_mean(F.huber_loss(mean, wanted, reduction="none", delta=MEAN_DELTA), weights)
 
     def beside(self, z: Tensor, events: Tensor | None, moved: Tensor) -> Tensor:
-        """z (..., D) and what the sampler is told besides: embedded events (..., D), the last step (..., C)."""
+        """Return z (..., D) with further inputs of the sampler: embedded events (..., D), the last draw (..., C)."""
         told = [z] if events is None else [z, events]
         if self.settings.draws == "innovation":
             told.append(moved.where(self.is_recalled, 0.0))
         return torch.cat(told, dim=-1) if len(told) > 1 else z
 
+    # --- Embeddings (A.2) ---------------------------------------------------------------------------------------------
+
     def embed_events(self, rows: Tensor) -> Tensor | None:
-        """Control rows of the frame before and the frame (..., 2K) -> (..., D), or None without events."""
+        """Return (..., D) of control rows of the frame before and the frame (..., 2K), or None without events."""
         return None if self.events_in is None else self.events_in(rows)
 
     def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
-        """Features (..., A), heard (...) bool, embedding (D,) or (..., D) of what is not heard -> (..., D)."""
+        """Return (..., D) of features (..., A), and `absent` (D,) or (..., D) where not heard (...)."""
         standard = (sound - self.sound_mean) / self.sound_std
         out: Tensor = self.sound_in(standard[..., : self.sounds_read])
         return torch.where(heard[..., None], out, absent)
 
-    def embed_motion(self, motion: Tensor) -> Tensor:
-        """Standardised motion (..., C) -> (..., D)."""
-        out: Tensor = self.motion_in(motion)
+    def embed_own(self, motion: Tensor) -> Tensor:
+        """Return (..., D) of the agent's standardised motion (..., C), without channels that are not recalled."""
+        out: Tensor = self.motion_in(motion.where(self.is_recalled, 0.0))
         return out
 
-    def embed_own(self, motion: Tensor) -> Tensor:
-        """`embed_motion` of the agent, of whose past the head may be none of the network's business."""
-        return self.embed_motion(motion.where(self.is_recalled, 0.0))
-
     def embed_face(self, motion: Tensor, seen: Tensor) -> Tensor:
-        """Standardised motion (..., C) of the user, seen (...) bool -> (..., D)."""
-        embedded = self.embed_motion(motion)
+        """Return (..., D) of the user's standardised motion (..., C), seen (...) bool."""
+        embedded: Tensor = self.motion_in(motion)
         return embedded if self.no_face is None else torch.where(seen[..., None], embedded, self.no_face)
 
-    def condition(self, dyad: Dyad, states: Tensor | None = None) -> Condition:
-        """Everything before the sampler, for frames 1..N-1 at once.
+    # --- All frames at once -------------------------------------------------------------------------------------------
 
-        `states` (B, N): the state of every frame, of which each frame is told the one before. Without, each frame goes
-        on from the model's own answer, as a stream does. Raises ValueError for shapes that do not fit.
+    def condition(self, dyad: Dyad, states: Tensor | None = None) -> SamplerCondition:
+        """Return the inputs of the sampler for frames 1..N-1 at once.
+
+        `states` (B, N): the state of every frame; each frame is given the one before. Without, each frame continues
+        from the model's own answer, as a stream does. Raises ValueError for shapes that do not fit.
         """
         dyad.check(self.sound_width, self.channels, self.settings.events)
         user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
@@ -378,16 +356,16 @@ class ArigModel(nn.Module):
         )
         moved = self.moved(standard[:, 1:], standard[:, :-1], None if rows is None else rows[:, :-1])
         moved = torch.cat([torch.zeros_like(standard[:, :1]), moved], dim=1)
-        return Condition(self.beside(z.view(b, t, d), events, moved), logits, outline.view(b, t, d), moved)
+        return SamplerCondition(self.beside(z.view(b, t, d), events, moved), logits, outline.view(b, t, d), moved)
 
     def rows(self, dyad: Dyad) -> Tensor | None:
-        """Control (B, N - 1, 2K) of the frames before and of frames 1..N-1, or None without events."""
+        """Return control (B, N - 1, 2K) of the frames before and of frames 1..N-1, or None without events."""
         if dyad.control is None or not self.settings.events:
             return None
         return torch.cat([dyad.control[:, :-1], dyad.control[:, 1:]], dim=-1)
 
     def _states(self, cis: Tensor, voiced: Tensor, states: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """cis (B * T, D), voiced (B, T, 2) -> features (B * T, D), logits (B, T, S)."""
+        """Return features (B * T, D) and logits (B, T, S) of cis (B * T, D) and voiced (B, T, 2)."""
         if self.states is None:
             return None, None
         b, t = voiced.shape[:2]
@@ -399,26 +377,6 @@ class ArigModel(nn.Module):
         feature, scores = self.states(keys, states[:, :-1].reshape(b * t))
         return feature, scores.view(b, t, -1)
 
-    def losses(self, dyad: Dyad, states: Tensor | None = None, generator: torch.Generator | None = None) -> Losses:
-        """Losses of frames 1..N-1, every one told the true past.
 
-        `states` (B, N) int64, -1 where not labelled: such a frame has no state loss (0) and, as the previous state,
-        counts as `waiting`.
-        """
-        known = None if states is None else torch.where(states < 0, FIRST, states)
-        found = self.condition(dyad, known)
-        standard = self.standardise(dyad.agent_motion)
-        wanted = self.moved(standard[:, 1:], standard[:, :-1], self.rows(dyad))
-        motion = self.sample_loss(found.z.flatten(0, 1), wanted.flatten(0, 1), generator=generator)
-        motion = motion.view(wanted.shape[:2])
-        if found.states is None or states is None:
-            return Losses(motion, None)
-        wrong = F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], ignore_index=-1, reduction="none")
-        return Losses(motion, wrong)
-
-    def generate(self, dyad: Dyad, noise: Tensor, states: Tensor | None = None) -> Tensor:
-        """Motion (B, N-1, C) of frames 1..N-1 from the given past, noise (B, N-1, *noise_shape); states: above."""
-        found = self.condition(dyad, states)
-        made = self.sample(found.z.flatten(0, 1), noise.flatten(0, 1)).view(found.moved.shape)
-        last = self.standardise(dyad.agent_motion[:, :-1])
-        return self.restore(self.drawn(made, last, self.rows(dyad), dyad.voiced[:, 1:, 0]))
+def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(Linear(inputs, hidden), nn.GELU(), Linear(hidden, outputs))

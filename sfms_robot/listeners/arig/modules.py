@@ -17,26 +17,28 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.config.listener import EVENT_STATES, STATES
-from sfms_robot.listeners.arig.parts import (
+from sfms_robot import config
+from sfms_robot.config.listener import STATES
+from sfms_robot.listeners.arig.stream import QUANTILES, rotary
+from sfms_robot.listeners.layers import (
     CrossAttention,
     FeedForward,
     LayerNorm,
     Linear,
     Modulation,
-    Part,
+    PlainModule,
     attend,
+    exported_attention,
     join_heads,
     modulated,
     split_heads,
 )
-from sfms_robot.listeners.arig.rotary import rotary
-from sfms_robot.listeners.arig.sojourns import QUANTILES
-from sfms_robot.listeners.layers import exported_attention
+
+# --- Short range (3.2, A.1) -------------------------------------------------------------------------------------------
 
 
-class Merge(Part):
-    """Sound and motion of one frame of one track -> its behaviour; sound alone without the visual modality."""
+class Merge(PlainModule):
+    """Sound and motion of one frame of one track -> its behaviour I_t; sound alone without the visual modality."""
 
     def __init__(self, width: int, visual: bool) -> None:
         super().__init__()
@@ -44,12 +46,12 @@ class Merge(Part):
         self.mlp = nn.Sequential(Linear((1 + visual) * width, width), nn.GELU(), Linear(width, width))
 
     def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
-        """(..., D) and (..., D) -> (..., D)."""
+        """Return (..., D) of (..., D) and (..., D)."""
         out: Tensor = self.mlp(torch.cat([sound, motion], dim=-1) if self.visual else sound)
         return out
 
 
-class Track(nn.Module):
+class TrackSide(nn.Module):
     """One track's side of a block of bidirectional learning (figure 7): own weights, attention with the other."""
 
     def __init__(self, width: int, hidden: int) -> None:
@@ -60,27 +62,28 @@ class Track(nn.Module):
         self.ffn = FeedForward(width, hidden)
 
     def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """x (N, c, D), condition (N, D) -> queries, keys and values (N, c, 3D), and the modulation."""
+        """Return queries, keys and values (N, c, 3D) of x (N, c, D), and the modulation by a condition (N, D)."""
         parts = self.modulation.of_tokens(condition)
         return self.qkv(modulated(x, parts[0], parts[1])), parts
 
     def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
-        """x (N, c, D) and what its queries saw (N, c, D) -> (N, c, D)."""
+        """Return (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
         x = torch.addcmul(x, parts[2], self.out(seen))
         return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
 
 
-class Bidirectional(Part):
-    """Each track reads itself, and both see each other through one attention, as in MMDiT."""
+class Bidirectional(PlainModule):
+    """Each track reads itself, and both see each other through one attention, as in MMDiT (figure 7)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.agent = Track(width, hidden)
-        self.user = Track(width, hidden)
+        self.agent = TrackSide(width, hidden)
+        self.user = TrackSide(width, hidden)
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> tuple[Tensor, Tensor]:
-        """Tracks (N, c, D), newest sounds (N, D), SiLU applied -> tracks (N, c, D)."""
+        """Return both tracks (N, c, D); newest sounds (N, D) with SiLU applied."""
+        # One attention over the 2c tokens of both: each track's queries see both tracks' keys.
         agent_qkv, agent_parts = self.agent.ask(agent, agent_sound)
         user_qkv, user_parts = self.user.ask(user, user_sound)
         seen = _attend(torch.cat([agent_qkv, user_qkv], dim=1), self.heads)
@@ -88,7 +91,7 @@ class Bidirectional(Part):
         return self.agent.answer(agent, of_agent, agent_parts), self.user.answer(user, of_user, user_parts)
 
 
-class Integrated(Part):
+class Integrated(PlainModule):
     """Both tracks as one sequence; attention and feed-forward side by side (figure 8, Dehghani et al. 2023)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -100,7 +103,8 @@ class Integrated(Part):
         self.narrow = Linear(width + hidden, width)
 
     def forward(self, x: Tensor, condition: Tensor, wanted: int) -> Tensor:
-        """x (N, 2c, D), condition (N, D), SiLU applied -> the first so many tokens (N, wanted, D)."""
+        """Return the first `wanted` tokens (N, wanted, D) of x (N, 2c, D); condition (N, D) with SiLU applied."""
+        # One product makes queries, keys, values and the hidden layer; one brings attention and hidden layer back.
         shift, scale, gate = self.modulation.of_tokens(condition)
         wide = self.wide(modulated(x, shift, scale))
         qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)[:, :wanted]
@@ -109,7 +113,7 @@ class Integrated(Part):
 
 
 def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
-    """Full self-attention of (N, S, 3D) -> the first `wanted` of S tokens, or all (N, wanted, D)."""
+    """Return full self-attention of (N, S, 3D) for the first `wanted` of S tokens, or all (N, wanted, D)."""
     if torch.compiler.is_exporting():
         q, k, v = qkv.chunk(3, dim=-1)
         return exported_attention(q[:, :wanted], k, v, heads)
@@ -117,42 +121,46 @@ def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
     return join_heads(attend(q[:, :, :wanted], k, v))
 
 
-class ShortRange(Part):
+class ShortRange(PlainModule):
     """The last c behaviours of both tracks -> one summary, of the agent's part (A.1)."""
 
-    def __init__(self, width: int, hidden: int, heads: int, chunk: int, depths: tuple[int, int], linear: bool) -> None:
-        """`depths` of bidirectional and integrated learning; `linear`: plain layers in their place (table 4)."""
+    def __init__(self, settings: config.Arig) -> None:
         super().__init__()
+        width, hidden, heads, chunk = settings.width, settings.feedforward, settings.heads, settings.chunk_frames
+        linear = settings.interaction == "linear"  # ablation of table 4: plain layers in place of the blocks
+        depths = (0, 0) if linear else (settings.bidirectional_layers, settings.integrated_layers)
         self.places = nn.Parameter(torch.randn(2, chunk, width) * 0.02)
         self.plain = nn.ModuleList(Linear(width, width) for _ in range(2)) if linear else None
         self.plain_both = Linear(4 * width, width) if linear else None
-        counts = (0, 0) if linear else depths
-        self.bidirectional = nn.ModuleList(Bidirectional(width, hidden, heads) for _ in range(counts[0]))
-        self.integrated = nn.ModuleList(Integrated(width, hidden, heads) for _ in range(counts[1]))
+        self.bidirectional = nn.ModuleList(Bidirectional(width, hidden, heads) for _ in range(depths[0]))
+        self.integrated = nn.ModuleList(Integrated(width, hidden, heads) for _ in range(depths[1]))
         self.norm = LayerNorm(width)
         self.compress = Linear(chunk * width, width)
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> Tensor:
-        """Behaviours (N, c, D), oldest first, and the newest sounds (N, D) -> summary (N, D)."""
+        """Return the summary (N, D) of behaviours (N, c, D), oldest first, and the newest sounds (N, D)."""
         c = agent.shape[1]
-        agent, user = agent + self.places[0], user + self.places[1]
+        agent, user = agent + self.places[0], user + self.places[1]  # ours: learned places in the chunk
         if self.plain is not None and self.plain_both is not None:
             sounds = [sound[:, None].expand(-1, c, -1) for sound in (agent_sound, user_sound)]
             both = torch.cat([self.plain[0](agent), self.plain[1](user), *sounds], dim=-1)
             summed: Tensor = self.compress(self.norm(self.plain_both(both)).flatten(1))
             return summed
-        of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)
+        of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)  # the updated audio modulates each track (A.1)
         for block in self.bidirectional:
             agent, user = block(agent, user, of_agent, of_user)
-        # Which sound modulates the two tracks as one is left open: both do.
+        # The paper does not say which sound modulates the two tracks as one sequence. Ours: both do.
         x, condition = torch.cat([agent, user], dim=1), F.silu(agent_sound + user_sound)
         for left, block in enumerate(self.integrated, 1 - len(self.integrated)):
             x = block(x, condition, 2 * c if left else c)
-        out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))
+        out: Tensor = self.compress(self.norm(x[:, :c]).flatten(1))  # the agent's part (A.1), c frames -> one vector
         return out
 
 
-class ContextLayer(Part):
+# --- Long range (3.2) -------------------------------------------------------------------------------------------------
+
+
+class ContextLayer(PlainModule):
     """One layer of the causal decoder: a summary looks at itself and at whole chunks before it."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -165,23 +173,32 @@ class ContextLayer(Part):
         self.ffn = FeedForward(width, hidden)
 
     def project(self, x: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """x (B, T, D), rotary (2, T, D/h) or (2, B, 1, 1, D/h) -> queries, keys, values (B, h, T, D/h), turned."""
+        """Return queries, keys, values (B, h, T, D/h) of x (B, T, D), turned.
+
+        `rotary`: (2, T, D/h) or (2, B, 1, 1, D/h).
+        """
         qkv = split_heads(self.qkv(self.norm(x)), 3 * self.heads)
-        q, k = _rotated(qkv.narrow(1, 0, 2 * self.heads), rotary).chunk(2, dim=1)
+        both, (cosine, sine) = qkv.narrow(1, 0, 2 * self.heads), rotary.unbind(0)
+        first, second = both.chunk(2, dim=-1)  # the two coordinates of each plane
+        q, k = torch.addcmul(both * cosine, torch.cat([second, first], dim=-1), sine).chunk(2, dim=1)
         return q, k, qkv.narrow(1, 2 * self.heads, self.heads)
 
     def forward(
         self, x: Tensor, own: tuple[Tensor, Tensor, Tensor], past: tuple[Tensor, Tensor], seen: Tensor
     ) -> Tensor:
-        """x (B, T, D), `own` of `project`, past (B, h, S, D/h) twice: keys and values of whole chunks -> (B, T, D).
+        """Return (B, T, D) of x (B, T, D).
 
-        `seen` (T, S) or (B, 1, 1, S): which of them each token may look at.
+        Args:
+            x: summaries.
+            own: `project` of them.
+            past: keys and values (B, h, S, D/h) of whole chunks.
+            seen: (T, S) or (B, 1, 1, S), which of those each token may look at.
         """
         q, k, v = own
         q = q * q.shape[-1] ** -0.5
         scores = q @ past[0].transpose(-1, -2)  # (B, h, T, S)
         scores = torch.where(seen, scores, -torch.inf)
-        self_score = (q * k).sum(-1, keepdim=True)  # the token itself stands beside the cache: nothing is copied
+        self_score = (q * k).sum(-1, keepdim=True)  # the token itself is scored apart: the cache is not copied
         weights = torch.cat([scores, self_score], dim=-1).softmax(dim=-1)
         y = weights[..., :-1] @ past[1] + weights[..., -1:] * v
         x = x + self.out(join_heads(y))
@@ -190,27 +207,30 @@ class ContextLayer(Part):
 
 
 class LongRange(nn.Module):
-    """Causal decoder over the context cache -> cis-token."""
+    """Causal decoder over the context cache of capacity w -> cis-token."""
 
-    def __init__(self, width: int, hidden: int, heads: int, layers: int, chunk: int, capacity: int) -> None:
+    def __init__(self, settings: config.Arig) -> None:
         super().__init__()
-        self.chunk, self.capacity, self.head_width = chunk, capacity, width // heads
-        self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(layers))
+        width, hidden, heads = settings.width, settings.feedforward, settings.heads
+        self.chunk, self.capacity, self.head_width = settings.chunk_frames, settings.context_chunks, width // heads
+        self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(settings.context_layers))
         self.norm = LayerNorm(width)
 
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
 
     def forward(self, summaries: Tensor) -> Tensor:
-        """Summaries (B, T, D) of every frame from the start of a stream -> cis-tokens (B, T, D).
+        """Return cis-tokens (B, T, D) of the summaries (B, T, D) of every frame from the start of a stream.
 
         Frame t belongs to chunk t // c, and the last of its frames makes the summary that stays.
         """
+        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each of its frames makes a new
+        # summary, as a stream refreshes it; later chunks see only that of its last frame.
         t = summaries.shape[1]
         frame = torch.arange(t, device=summaries.device)
         of = frame // self.chunk
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
-        behind = of[:, None] - of[whole]
+        behind = of[:, None] - of[whole]  # chunks from a kept summary to that of each frame, (T, S)
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
         x, turned = summaries, torch.from_numpy(rotary(of.numpy(force=True), self.head_width))
         turned = turned.transpose(0, 1).to(x.device)
@@ -221,7 +241,7 @@ class LongRange(nn.Module):
         return out
 
     def step(self, summary: Tensor, past: Sequence[Tensor], seen: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
-        """One frame of N streams.
+        """Take one frame of N streams.
 
         Args:
             summary: (N, D) of the chunk in progress.
@@ -230,7 +250,7 @@ class LongRange(nn.Module):
             rotary: (N, 2, D/h) of this chunk.
 
         Returns:
-            cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, should it be the last of its chunk.
+            cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, in case it is the last of its chunk.
         """
         x, made = summary[:, None], []
         turned, view = rotary.transpose(0, 1)[:, :, None, None], seen[:, None, None]
@@ -239,13 +259,6 @@ class LongRange(nn.Module):
             x = layer(x, own, (keys, values), view)
             made += [part[:, :, 0] for part in own[1:]]
         return self.norm(x)[:, 0], torch.stack(made, dim=1)
-
-
-def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
-    """x (B, h, T, D/h) turned by (2, T, D/h) or (2, B, 1, 1, D/h): its halves are the two coordinates of each plane."""
-    first, second = x.chunk(2, dim=-1)
-    cosine, sine = rotary.unbind(0)
-    return torch.addcmul(x * cosine, torch.cat([second, first], dim=-1), sine)
 
 
 # --- Conversation states understanding (3.3) --------------------------------------------------------------------------
@@ -260,47 +273,44 @@ def _rotated(x: Tensor, rotary: Tensor) -> Tensor:
 #     silent   silent   thinking (its own pause), waiting (the other's)
 #
 # The figure itself is not in the text at hand; giving feedback, where it is a word and not a nod, is speech of both.
-# The paper's stream continues from its most probable state. A listener with events departs from it twice, see
-# `sojourns`.
+# The paper's stream continues from its most probable state. Ours, with events: it draws states and their durations
+# (`stream.draw_sojourn`), and feedback that is seen (a nod, a smile) is a state of its own.
 
 
-class StateUnderstanding(Part):
-    """The previous state asks voice activity and cis-token what the state is now.
+class StateUnderstanding(PlainModule):
+    """Cross attention of the previous state over voice activity and cis-token -> the state feature and the state.
 
-    With events its states are `EVENT_STATES`, and it also has what is known of them from the data: `durations` (7, 33),
-    quantiles of how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for those that there are while
-    agent and user are silent or speak.
+    With events its states are `EVENT_STATES`, and it also has statistics of the data: `durations` (7, 33), quantiles of
+    how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for the states that occur while agent and user
+    are silent or speak.
     """
 
-    durations: Tensor
-    possible: Tensor
-
-    def __init__(self, width: int, hidden: int, heads: int, events: bool = False) -> None:
+    def __init__(self, settings: config.Arig) -> None:
         super().__init__()
-        states = len(EVENT_STATES if events else STATES)
-        if events:
-            self.register_buffer("durations", torch.ones(len(STATES), QUANTILES))
-            self.register_buffer("possible", torch.ones(2, 2, len(STATES)))
+        width, states = settings.width, len(settings.states)
+        if settings.events:
+            self.durations = nn.Buffer(torch.ones(len(STATES), QUANTILES))
+            self.possible = nn.Buffer(torch.ones(2, 2, len(STATES)))
         self.previous = nn.Embedding(states, width)
         self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
-        self.look = CrossAttention(width, hidden, heads, slots=3)
+        self.look = CrossAttention(width, settings.feedforward, settings.heads, slots=3)
         self.norm = LayerNorm(width)
         self.classify = Linear(width, states)
 
     def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
-        """cis (N, D), voiced (N, 2) bool: agent now, user one frame before -> keys (N, 3, 2D)."""
+        """Return the state condition (N, 3, 2D) of cis (N, D) and voiced (N, 2): agent now, user one frame before."""
         told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
         return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
 
     def forward(self, keys: Tensor, previous: Tensor) -> tuple[Tensor, Tensor]:
-        """`condition` (N, 3, 2D) and previous states (N,) -> state feature (N, D) and logits (N, S) of S states."""
-        feature = self.norm(self.look(self.previous(previous), keys))
+        """Return state feature (N, D) and logits (N, S) of `condition` (N, 3, 2D) and previous states (N,)."""
+        feature = self.norm(self.look(self.previous(previous), keys))  # s_(T-1) is the query, its condition the keys
         return feature, self.classify(feature)
 
     def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-        """Every frame's own answer becomes the next one's question: as a stream runs.
+        """Return features (B, T, D) and logits (B, T, S) where every frame continues from the most probable state.
 
-        keys (B, T, 3, 2D), first (B,) -> features (B, T, D), logits (B, T, S).
+        `keys`: (B, T, 3, 2D) `condition` of each frame; `first`: (B,) states before them.
         """
         features, logits, state = [], [], first
         for frame in keys.unbind(dim=1):
@@ -313,41 +323,23 @@ class StateUnderstanding(Part):
 
 # --- Progressive motion prediction (3.4) ------------------------------------------------------------------------------
 #
-# Coarse motion from sound, fine motion from context and state, continuity. The outcome z conditions the sampler of
+# Coarse motion from sound, fine motion from context and state, continuity. The result z conditions the sampler of
 # the final motion (`sampler`).
 
 
-class Progressive(Part):
+class Progressive(PlainModule):
     """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
 
-    What happens (`events`, beyond the paper) is one token more of the second.
+    Ours: events are one token more of the second.
     """
 
-    def __init__(
-        self, width: int, hidden: int, heads: int, sounds: int, motions: int, states: bool, events: bool = False
-    ) -> None:
+    def __init__(self, settings: config.Arig) -> None:
         super().__init__()
-        self.coarse = CrossAttention(width, hidden, heads, sounds)
-        self.fine = CrossAttention(width, hidden, heads, 2 + states + events)
-        self.temporal = CrossAttention(width, hidden, heads, motions)
-        self.norm = LayerNorm(width)
-
-    def forward(
-        self,
-        last: Tensor,
-        sound_keys: Tensor,
-        motion_keys: Tensor,
-        sound: Tensor,
-        cis: Tensor,
-        state: Tensor | None,
-        events: Tensor | None = None,
-    ) -> Tensor:
-        """`coarse` motion, then `refine`: everything of the frame to be made, N of them.
-
-        `last` (N, D) is the embedded motion of the frame before: the query of the coarse motion. `sound_keys`
-        (N, 3, 2D) are `coarse.keys` of the agent's sounds, the newest that of the frame itself. The rest: `refine`.
-        """
-        return self.refine(self.coarse(last, sound_keys), motion_keys, sound, cis, state, events)
+        sizes = settings.width, settings.feedforward, settings.heads
+        self.coarse = CrossAttention(*sizes, settings.sound_frames)
+        self.fine = CrossAttention(*sizes, 2 + settings.state_guidance + settings.events)
+        self.temporal = CrossAttention(*sizes, settings.motion_frames)
+        self.norm = LayerNorm(settings.width)
 
     def refine(
         self,
@@ -358,19 +350,18 @@ class Progressive(Part):
         state: Tensor | None,
         events: Tensor | None = None,
     ) -> Tensor:
-        """Fine motion.
+        """Return z (N, D) of a coarse motion.
 
         Args:
-            outline: (N, D) coarse motion.
+            outline: (N, D) coarse motion: `coarse` of the embedded motion of the frame before, over the keys of the
+                agent's sounds, the newest that of the frame itself.
             motion_keys: (N, 5, 2D) `temporal.keys` of the agent's motions before the frame.
             sound: (N, D) embedded sound of the agent in the frame itself.
             cis: (N, D).
             state: (N, D) feature, or None without state guidance.
             events: (N, D) embedded control rows, or None without events.
-
-        Returns:
-            z (N, D).
         """
+        # A.1: cis-token, state feature and A^a_T condition the fine motion; then five motions, for continuity.
         tokens = [token for token in (cis, state, sound, events) if token is not None]
         x = self.fine(outline, self.fine.keys(torch.stack(tokens, dim=1)))
         out: Tensor = self.norm(self.temporal(x, motion_keys))

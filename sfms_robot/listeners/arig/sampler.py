@@ -4,8 +4,10 @@ Training: noise prediction, equation (3). Sampling: equation (4) over evenly spr
 Nichol and Dhariwal 2021, as the paper trains and samples with different step counts), or DDIM (Song et al. 2021).
 The sampler draws nothing itself: noise is an argument, so one seed gives one motion wherever it is drawn.
 
-The schedule is a cosine that ends at a signal amplitude of 0.03 instead of 0: predicting noise says nothing
-about motion where there is none, and with 15 steps the first of them would be wasted on that.
+Ours: the schedule is a cosine that ends at a signal amplitude of 0.03 instead of 0, because predicting noise says
+nothing about motion where there is none, and with 15 steps the first of them would be wasted on that.
+
+N samples, C channels, D width of the condition, W width of the blocks, K steps.
 """
 
 from __future__ import annotations
@@ -19,42 +21,33 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.parts import Linear, Modulation, modulated, weighted_mean
-from sfms_robot.listeners.layers import sinusoidal
+from sfms_robot.listeners.layers import Linear, Modulation, modulated, sinusoidal, weighted_mean
 from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
 BEYOND_ALL = 1e4  # deviations: an estimate that is not clamped is clamped to this, which 16 bits hold
-COSINE_END = 0.98  # part of the quarter circle that the schedule goes
+COSINE_END = 0.98  # share of the quarter circle that the schedule covers
 
 
 def cosine_alpha_bar(levels: int) -> Tensor:
-    """alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
+    """Return alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
     angle = torch.arange(1, levels + 1, dtype=torch.float64) / levels
     return torch.cos(angle * COSINE_END * math.pi / 2) ** 2
 
 
 class Denoiser(nn.Module):
-    """epsilon_theta(M_t | t, z): MLP blocks modulated by noise level and condition. C channels, W width, K steps."""
-
-    low: Tensor
-    high: Tensor
-    alpha_bar: Tensor
-    spreads: Tensor
-    places: Tensor
+    """epsilon_theta(M_t | t, z): MLP blocks modulated by noise level and condition (figure 9)."""
 
     def __init__(self, names: Sequence[str], condition: int, settings: config.Diffusion) -> None:
         super().__init__()
         channels, width = len(names), settings.width
         self.settings = settings
         most = 8.0 if settings.clamp else BEYOND_ALL
-        self.register_buffer("low", torch.full((channels,), -most))  # standardised motion that is possible at all
-        self.register_buffer("high", torch.full((channels,), most))
-        self.register_buffer("alpha_bar", cosine_alpha_bar(settings.train_steps).float(), persistent=False)
-        first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
-        late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
-        temperature = first + late * (last - first)  # (K - 1, C)
-        self.register_buffer("places", sinusoidal(settings.train_steps, width), persistent=False)
+        self.low = nn.Buffer(torch.full((channels,), -most))  # range of standardised motion in the data
+        self.high = nn.Buffer(torch.full((channels,), most))
+        self.alpha_bar = nn.Buffer(cosine_alpha_bar(settings.train_steps).float(), persistent=False)
+        self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)
+        # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
         self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
         self.condition = Linear(condition, width)
         self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
@@ -64,26 +57,31 @@ class Denoiser(nn.Module):
         self.leave = Linear(width, channels)
         self.levels = torch.linspace(0, settings.train_steps - 1, settings.steps).round().long().tolist()
         self.table = steps_of(self.levels, settings)
+        # sigma of each step times the temperature of each channel, (K, C); the first row is the initial noise. Ours:
+        # early noise decides what happens, late noise is jitter, so the temperature may change from first to last step.
+        first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
+        late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
+        temperature = first + late * (last - first)  # (K - 1, C)
         spread = torch.tensor([step.spread for step in self.table[:-1]])[:, None]
-        spreads = torch.cat([torch.ones(1, channels), spread * temperature[: len(spread)]])  # (K, C)
-        self.register_buffer("spreads", spreads, persistent=False)
+        spreads = torch.cat([torch.ones(1, channels), spread * temperature[: len(spread)]])
+        self.spreads = nn.Buffer(spreads, persistent=False)
 
     def level(self, t: Tensor) -> Tensor:
-        """Noise levels (K,) -> embeddings (K, W): fixed once the weights are."""
+        """Return embeddings (K, W) of noise levels (K,): constant once the weights are."""
         out: Tensor = self.time(self.places[t])
         return out
 
     def modulate(self, z: Tensor, level: Tensor) -> tuple[Tensor, ...]:
-        """Condition (N, D) and level embeddings (N, W) -> shift, scale and gate of every block, (N, W) each."""
+        """Return shift, scale and gate of every block, (N, W) each, of z (N, D) and level embeddings (N, W)."""
         parts: tuple[Tensor, ...] = self.modulation(F.silu(self.condition(z) + level))
         return parts
 
     def forward(self, noisy: Tensor, parts: Parts) -> Tensor:
-        """noisy (N, C), `modulate` of its level and condition -> the noise in it (N, C)."""
+        """Return the noise (N, C) in noisy (N, C); `parts`: `modulate` of its level and condition."""
         return _denoise(noisy, parts, self._weights())
 
     def _weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Weight and bias of each layer in order, looked up once for all steps: a module call outweighs its product."""
+        """Return weight and bias of each layer in order, looked up once for all steps: a call outweighs its product."""
         blocks = [layer for pair in zip(self.up, self.down, strict=True) for layer in pair]
         layers = [self.enter, *blocks, self.leave]
         return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
@@ -91,32 +89,38 @@ class Denoiser(nn.Module):
     def loss(
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
     ) -> Tensor:
-        """Equation (3) for z (N, D) and standardised motion (N, C): squared error of the noise, per sample (N,).
+        """Return equation (3), the squared error of the noise, per sample (N,).
 
-        `weights` (C,) of the channels, which add up to 1, are ours: by number most channels are of the mouth.
+        Args:
+            z: (N, D) conditions.
+            motion: (N, C) standardised.
+            generator: draws levels and noise, on the CPU.
+            weights: (C,) of the channels, which add up to 1. Ours: by number most channels are of the mouth.
         """
         n = len(motion)
         t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
         noise = torch.randn(motion.shape, generator=generator).to(motion.device)
         alpha_bar = self.alpha_bar[t][:, None]
+        # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
         found = self(noisy, self.modulate(z, self.level(t)))
         return weighted_mean((noise - found).square(), weights)
 
     def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
-        """Motion (N, C), standardised, of conditions (N, D).
+        """Return standardised motion (N, C) of conditions, equation (4).
 
         Args:
-            z: conditions.
-            noise: (N, K, C) standard normal: the start, then what is added after each step but the last.
-            levels: `level` of `self.levels` (K, W), if it is at hand.
+            z: (N, D) conditions.
+            noise: (N, K, C) standard normal: the start, then the noise added after each step but the last.
+            levels: `level` of `self.levels` (K, W), for a caller that has them.
         """
         n, k = noise.shape[:2]
         if k != len(self.levels):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
         if levels is None:
             levels = self.level(torch.tensor(self.levels, device=z.device))
-        # The modulation of every step in one product, the noisiest last; a single sample's are vectors.
+        # Ours, for speed: the modulation of every step in one product, the noisiest last; of a single sample as
+        # vectors.
         told = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
         kinds = self.modulation.parts
         parts = (told if n > 1 else told[0]).chunk(k * kinds, dim=-1)
@@ -125,15 +129,16 @@ class Denoiser(nn.Module):
         for index, step in enumerate(self.table):
             level = kinds * (k - 1 - index)
             found = _denoise(x, parts[level : level + kinds], weights)
+            # Ours: the clean motion is clamped to the range of the data; (4) does not do that (`clamp: false`).
             clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)
-            x = clean.mul_(step.motion).add_(x, alpha=step.stay)
-            if step.spread:
+            x = clean.mul_(step.motion).add_(x, alpha=step.stay)  # the mean of M_s, `steps_of`
+            if step.spread:  # sigma_t eps
                 x.add_(added[index])
         return x
 
 
 def _denoise(noisy: Tensor, parts: Parts, weights: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """noisy (N, C), modulation (N, W) or (W,) each, `Denoiser._weights` -> (N, C)."""
+    """Return the noise (N, C) of noisy (N, C), with modulation (N, W) or (W,) each and `Denoiser._weights`."""
     x = F.linear(noisy, *weights[0])
     for block in range(len(weights) // 2 - 1):
         shift, scale, gate = parts[3 * block : 3 * block + 3]
@@ -148,8 +153,8 @@ class Step:
 
     Attributes:
         denoise: M_0 = denoise[0] M_t + denoise[1] eps.
-        motion, stay: M_s = motion M_0 + stay M_t, which is ddim as well.
-        spread: sigma_t, times the noise that is added (and the temperature); 0 of the last.
+        motion, stay: M_s = motion M_0 + stay M_t; for DDIM that is all.
+        spread: sigma_t, the factor of the added noise (beside the temperature); 0 for the last step.
     """
 
     denoise: tuple[float, float]
@@ -159,12 +164,12 @@ class Step:
 
 
 def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
-    """The steps over ascending `levels`, noisiest first.
+    """Return the steps over ascending `levels`, noisiest first.
 
     Equation (4) written through the clean motion M_0 = (M_t - sqrt(1 - ab_t) eps) / sqrt(ab_t): its mean is
     sqrt(ab_s) (1 - alpha) / (1 - ab_t) M_0 + sqrt(alpha) (1 - ab_s) / (1 - ab_t) M_t, alpha = ab_t / ab_s, and where
     M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
-    DDIM keeps what is not motion: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
+    DDIM keeps the noise: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
     """
     alpha_bars = cosine_alpha_bar(settings.train_steps)[list(levels)].tolist()
     out = []
@@ -182,21 +187,19 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
     return out
 
 
-# --- Codes of motion (table 4) ----------------------------------------------------------------------------------------
+# --- Codes of motion (B.1, table 4) -----------------------------------------------------------------------------------
 #
 # The discrete ablation: motion as one of N codes, drawn from a softmax, in place of diffusion. The codebook is that
-# of finite scalar quantization (`listeners.sfms.quantizer`), one for the whole face. It is learned beside the model:
-# its own loss is how well motion survives it, and no gradient of the softmax reaches it.
+# of finite scalar quantization (`listeners.sfms.quantizer`), one for the whole face. It is learned together with the
+# model, by its own loss, the error of motion that went through it; no gradient of the softmax reaches it.
 
 
 class CodeHead(nn.Module):
     """A sampler with the interface of `Denoiser`: a loss, and a sample from given noise."""
 
-    levels: Tensor
-
     def __init__(self, channels: int, width: int, condition: int, levels: tuple[int, ...]) -> None:
         super().__init__()
-        self.register_buffer("levels", as_levels([levels]), persistent=False)
+        self.levels = nn.Buffer(as_levels([levels]), persistent=False)
         self.encode = nn.Sequential(Linear(channels, width), nn.GELU(), Linear(width, len(levels)))
         self.decode = nn.Sequential(Linear(len(levels), width), nn.GELU(), Linear(width, channels))
         self.classify = Linear(condition, math.prod(levels))
@@ -204,7 +207,7 @@ class CodeHead(nn.Module):
     def loss(
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
     ) -> Tensor:
-        """z (N, D), motion (N, C), weights (C,) -> cross-entropy of its code plus squared error of the code, (N,)."""
+        """Return cross-entropy of the code plus squared error of the code, (N,); arguments as `Denoiser.loss`."""
         code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
         index = codes_to_indices(code.detach(), self.levels)[:, 0]
@@ -212,7 +215,7 @@ class CodeHead(nn.Module):
         return rebuilt + wrong
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
-        """Conditions z (N, D), noise (N, 1, 1) standard normal -> motion (N, C) of a code drawn by the softmax."""
+        """Return the motion (N, C) of a code drawn by the softmax; z (N, D), noise (N, 1, 1) standard normal."""
         share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
         mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
         index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)

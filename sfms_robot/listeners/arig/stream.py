@@ -1,11 +1,11 @@
-"""ARIG as it runs: one speaker frame in, our face of the next frame out, and a memory of fixed size.
+"""ARIG as it runs: one speaker frame in, our face of the next frame out, and a memory of fixed size. numpy only.
 
-What has not changed is not computed again: behaviours of old frames, keys and values of old sounds, motions and whole
-chunks are kept. Only the chunk in progress is read anew, since
-the newest sounds modulate all of it.
+Nothing is computed twice: behaviours of old frames, keys and values of old sounds, motions and whole chunks are kept.
+Only the chunk in progress is read again, since the newest sounds modulate all of it.
 
-A listener with events (`config.Listener.events`) takes two control rows a frame, of the frame heard and of the frame to
-be made. Its conversational state is drawn (`sojourns`); a stream of the paper's goes on from its most probable one.
+Ours: a listener with events (`config.Listener.events`) takes two control rows a frame, of the frame taken and of the
+frame to be made. Its conversational state is drawn (`draw_sojourn`); a stream of the paper's continues from its most
+probable one.
 
 The robot's own voice belongs to the frame that is made, so `SpeakerFrame.agent_audio` is best given one frame early:
 its samples are those the robot says in the 40 ms after `time_s`. Given on time, lips follow one frame late.
@@ -15,44 +15,129 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
+from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
-from sfms_robot.listeners.arig import audio_frontend
-from sfms_robot.listeners.arig.audio_frontend import AudioState
-from sfms_robot.listeners.arig.rotary import rotary
-from sfms_robot.listeners.arig.sojourns import CONTROL_ROWS, FIRST, Sojourn, draw_sojourn, with_feedback
+from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
-from sfms_robot.listeners.lots import Use, normals, uniforms
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.stream_rng import Use, normals, uniforms
 from sfms_robot.signals.control import COLUMNS
 
-BEYOND = 1e3  # rad, m or of a blendshape: no face
+BEYOND = 1e3  # rad, m or of a blendshape: not a face
+CONTROL_ROWS: Final = 2  # of events: of the frame before and of the frame
+ROTARY_BASE: Final = 10_000.0
+
+# --- Conversational states (3.3) --------------------------------------------------------------------------------------
+#
+# `modules` has the table of states. Ours, with events: a semi-Markov process in place of the most probable state, which
+# flickers. How long a state lasts is drawn from durations of the data, which comes next from the model's answer.
+# Feedback that is seen, a nod or a smile in the other's turn, is not drawn: events decide it.
+
+FIRST: Final = STATES.index("waiting")  # state of a stream before its first frame
+LISTENING: Final = STATES.index("listening")
+FEEDBACK: Final = STATES.index("giving_feedback")
+NODDING: Final = EVENT_STATES.index("giving_feedback_nod")
+SMILING: Final = EVENT_STATES.index("giving_feedback_smile")
+QUANTILES: Final = 33  # of a state's durations that are kept
+_ACTIVE: Final = {kind: COLUMNS.index(f"{kind}.active") for kind in ("nod", "smile", "laugh")}
 
 
 @dataclass(frozen=True)
-class Memory:
-    """What one stream remembers. Values only, all of fixed size: a step makes a new one.
+class Sojourn:
+    """One of `STATES`, and how many frames more it lasts."""
+
+    state: int
+    left: int
+
+
+def with_feedback(states: NDArray[Any], rows: Floats) -> NDArray[Any]:
+    """Return states (...) of `EVENT_STATES`, of `STATES` and the control rows (..., K) of their frames.
+
+    A nod, laugh or smile while listening is feedback; other states, and unknown ones, stay unchanged.
+    """
+    nods = rows[..., _ACTIVE["nod"]] > 0
+    smiles = (rows[..., _ACTIVE["smile"]] > 0) | (rows[..., _ACTIVE["laugh"]] > 0)
+    seen = np.where(nods, NODDING, np.where(smiles, SMILING, states))
+    return np.where((states == LISTENING) | (states == FEEDBACK), seen, states)
+
+
+def draw_sojourn(
+    durations: Floats, possible: Floats, logits: Floats, voiced: tuple[bool, bool], before: Sojourn, uniforms: Doubles
+) -> Sojourn:
+    """Draw the state of a frame.
+
+    A state lasts as long as was drawn when it began, but ends at once where the voices rule it out. Then another one
+    follows, drawn by the model's logits among those that the voices allow; the same again where they allow no other.
+
+    Args:
+        durations, possible: of `modules.StateUnderstanding`.
+        logits: (S,) of the frame.
+        voiced: speech of agent and user, as the model takes it.
+        before: that of the frame before.
+        uniforms: (2,) in 0..1: which state, and for how long.
+    """
+    may = possible[int(voiced[0]), int(voiced[1])] > 0  # (7,), a new array
+    if before.left > 0 and may[before.state]:
+        return Sojourn(before.state, before.left - 1)
+    may[before.state] &= not may.sum() > 1  # another one, if there is any
+    scores = np.where(may, logits[: len(STATES)].astype(np.float64), -np.inf)
+    chances = np.exp(scores - scores.max()).cumsum()  # inverse transform of the softmax
+    state = min(int((chances <= uniforms[0] * chances[-1]).sum()), len(STATES) - 1)
+    place = float(uniforms[1]) * (QUANTILES - 1)  # inverse transform of the durations, linear between quantiles
+    low, high = durations[state, int(place)], durations[state, min(int(place) + 1, QUANTILES - 1)]
+    return Sojourn(state, max(0, round(float(low + (place % 1) * (high - low))) - 1))
+
+
+# --- Rotary places (Su et al. 2021) -----------------------------------------------------------------------------------
+
+
+def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
+    """Return cosines and sines (N, 2, size) of chunk numbers (N,), sines of the first half negative.
+
+    They turn keys and queries of the long range; the halves of `size` are the two coordinates of each plane. Computed
+    in double precision: after days of running the angles of two chunks still differ.
+    """
+    turns, signs = _planes(size)
+    angles = chunks[:, None] * turns
+    return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _planes(size: int) -> tuple[Doubles, Doubles]:
+    """Return radians per chunk (size,), and signs of the sines, read-only."""
+    half = size // 2
+    return np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2), np.where(np.arange(size) < half, -1.0, 1.0)
+
+
+# --- Stream -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArigMemory:
+    """Memory of one stream. Values only, all of fixed size: a step makes a new one.
 
     Attributes:
-        seed: what it draws hangs on it (`lots`).
-        frames: how many have been heard.
+        seed: of all its random numbers (`stream_rng`).
+        frames: how many it has taken.
         user_voice, agent_voice: samples and phrase of both tracks.
         agent_sound: (D,) embedded, of the agent's last frame.
         agent_behaviour, user_behaviour: (c, D) of the last c frames, the newest last.
         sound_keys: (3, 2D) of the agent's last sounds; motion_keys: (5, 2D) of its last motions.
         context: (2L, h, w - 1, D/h) keys and values of whole chunks, layer by layer, the newest last.
         motion: (D,) embedded motion of the agent's last frame; standard: (C,) the same, standardised; sample: (C,) the
-            step to it, as the sampler draws steps; all without sway.
-        state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, of a
-            listener with events.
-        sway: this stream's own (`HeadSway.start`).
+            draw that led to it; all without sway.
+        state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, with
+            events.
+        sway: of this stream (`HeadSway.start`).
     """
 
     seed: int
@@ -73,10 +158,26 @@ class Memory:
     sway: Doubles
 
 
-@dataclass(frozen=True)
-class Heard:
-    """One frame of both people: features of user and agent (2, A), which of them are there (2,), the user's face (C,)
-    standardised, whether it is seen, and the audio of the next frame.
+# Fields that the network `frame` takes; it returns the first four.
+REMEMBERED: Final = (
+    "agent_sound",
+    "agent_behaviour",
+    "user_behaviour",
+    "sound_keys",
+    "motion",
+    "motion_keys",
+    "sample",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BothPeople:
+    """One frame of both people.
+
+    Attributes:
+        sounds: (2, A) features of user and agent; present: (2,) which of them there are.
+        face: (C,) the user's, standardised; seen: whether there is one.
+        user_voice, agent_voice: audio states after the frame.
     """
 
     sounds: Floats
@@ -88,17 +189,17 @@ class Heard:
 
     @property
     def voiced(self) -> tuple[bool, bool]:
-        """Speech of agent, user."""
+        """Return whether agent and user speak."""
         return self.agent_voice.voiced, self.user_voice.voiced
 
 
 class ArigListener(RunsOnEngine):
-    """`ports.BatchListener`. Holds weights only: its engine does, which runs the networks of `frame`."""
+    """A `ports.BatchListener`. It has no state but the weights, which its engine holds (`networks`)."""
 
     hop = horizon = 1
 
     def __init__(self, settings: config.Arig, engine: Engine, space: MotionSpace | None = None) -> None:
-        """Raises ModelError for a model that hears with features nothing here computes (sound: wav2vec2)."""
+        """Raise ModelError for a model of features that are not computed here (sound: wav2vec2)."""
         if settings.sound != "mel":
             raise ModelError(f"sound = {settings.sound!r}: such a model can be trained and evaluated, not run (mel)")
         self.settings = settings
@@ -109,21 +210,23 @@ class ArigListener(RunsOnEngine):
 
     @property
     def control_frames(self) -> tuple[int, int]:
-        """Control rows that a step takes: up to the newest frame heard, and after it."""
+        """Return how many control rows a step takes: up to the newest frame, and after it."""
         return (1, CONTROL_ROWS - 1) if self.settings.events else (0, 0)
 
-    def start(self, seed: int) -> Memory:
-        """Memory of a stream that has heard nothing and looked neutral so far (A.2)."""
+    def start(self, seed: int) -> ArigMemory:
+        """Return the memory of a stream without sound so far and with a neutral face (A.2)."""
         settings = self.settings
         d, c, heads = settings.width, settings.chunk_frames, settings.heads
         still = self.standardise(self.space.neutral.astype(np.float32))
         motion, silence, motion_key, sound_key = (part[0] for part in self.engine.run("rest", still[None]))
         room = settings.context_chunks - 1
-        return Memory(
+        # A.2: caches begin with the reference motion and the first sound repeated; ours: silence, and a neutral face.
+        # Chunks begin with the first behaviour repeated, which the network `frame` does where `first`.
+        return ArigMemory(
             seed=seed,
             frames=0,
-            user_voice=audio_frontend.start(),
-            agent_voice=audio_frontend.start(),
+            user_voice=TRACKS.start(),
+            agent_voice=TRACKS.start(),
             agent_sound=silence,
             agent_behaviour=np.zeros((c, d), np.float32),
             user_behaviour=np.zeros((c, d), np.float32),
@@ -138,110 +241,93 @@ class ArigListener(RunsOnEngine):
             sway=self.sway.start(seed),
         )
 
-    def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan, Memory]:
+    def step(self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None) -> tuple[Plan, ArigMemory]:
         """Take one frame, plan the next. Never changes `memory` in place.
 
-        `control` (2, K): rows of `signals.control` of the frame heard and of the next; None: nothing happens. Raises
+        `control` (2, K): rows of `signals.control` of the frame taken and of the next; None: no events. Raises
         ValueError when the frame holds another number of samples than 640 or none, for control of another shape, and
         for any where the listener has no events.
         """
         return self._stepped([speaker], [memory], None if control is None else [control])[0]
 
     def step_each(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Memory], controls: Sequence[Floats] | None = None
-    ) -> list[tuple[Plan | None, Memory]]:
-        """See `ports.BatchListener`; controls as of `step`."""
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats] | None = None
+    ) -> list[tuple[Plan | None, ArigMemory]]:
+        """Step several streams, see `ports.BatchListener`; controls as of `step`."""
         return [*self._stepped(speakers, memories, controls)]
 
     def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats] | None = None
-    ) -> tuple[list[Plan], list[Memory]]:
-        """`step` of streams that began together and heard the same speaker ever since, each with its own control.
+        self, speaker: SpeakerFrame, memories: Sequence[ArigMemory], controls: Sequence[Floats] | None = None
+    ) -> tuple[list[Plan], list[ArigMemory]]:
+        """Step streams that began together with the same speaker, each with its own control.
 
-        As `step_each`, and the speaker is listened to once.
+        As `step_each`, but features of the speaker are computed once.
         """
-        found = self._stepped([speaker] * len(memories), memories, controls, self._hear([speaker], memories[:1]))
+        found = self._stepped([speaker], memories, controls)
         return [plan for plan, _ in found], [memory for _, memory in found]
 
-    def condition(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Floats, Memory]:
-        """What the sampler is told of the next frame, (1, its width), and the memory but for what is to be drawn."""
+    def condition(
+        self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None
+    ) -> tuple[Floats, ArigMemory]:
+        """Return the inputs of the sampler for the next frame, (1, its width), and the memory without what it draws."""
         rows = self._rows(None if control is None else [control], 1)
         z, _, (now,) = self._conditions(self._hear([speaker], [memory]), [memory], rows)
         return z, now
 
     def _stepped(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        memories: Sequence[Memory],
-        controls: Sequence[Floats] | None,
-        heard: Sequence[Heard] | None = None,
-    ) -> list[tuple[Plan, Memory]]:
-        """Every stream one frame on. `heard`: what all of them heard, if that was worked out already."""
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats] | None
+    ) -> list[tuple[Plan, ArigMemory]]:
+        """Move every stream one frame on; a single speaker of several streams is theirs from the start."""
         rows = self._rows(controls, len(memories))
-        if heard is None:
-            heard = self._hear(speakers, memories)
-        elif len(heard) < len(memories):
-            heard = [*heard] * len(memories)
+        heard = self._hear(speakers, memories[: len(speakers)])
+        if len(heard) < len(memories):
+            heard = heard * len(memories)
+        # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         z, logits, now = self._conditions(heard, memories, rows)
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
         told = [rows, np.array([one.voiced[0] for one in heard])] if self.settings.events else []
-        made, standard, sample, motion, keys = self.engine.run("draw", *inputs, *told)
+        made, *drawn = self.engine.run("draw", *inputs, *told)
         newest = np.array([memory.frames for memory in now])
         shown = self.sway.added(made[:, None].copy(), _stacked(now, "sway"), newest)
         sojourns, states = self._states(logits, now, rows, heard)
         out = []
-        for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):
+        for index, memory in enumerate(now):
+            time_s = speakers[min(index, len(speakers) - 1)].time_s
             frames, jaw_rad = self.space.decode(shown[index])
-            plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad)
-            after = changed(
-                memory,
-                motion=motion[index],
-                standard=standard[index],
-                sample=sample[index],
-                motion_keys=keys[index],
-                state=states[index],
-                sojourn=sojourns[index],
+            plan = Plan(time_s, np.array([time_s + FRAME_S]), frames, jaw_rad)
+            own = dict(
+                zip(("standard", "sample", "motion", "motion_keys"), (part[index] for part in drawn), strict=True)
             )
-            out.append((plan, after))
+            out.append((plan, changed(memory, **own, state=states[index], sojourn=sojourns[index])))
         return out
 
     def _conditions(
-        self, heard: Sequence[Heard], memories: Sequence[Memory], rows: Floats
-    ) -> tuple[Floats, Floats, list[Memory]]:
-        """What the sampler is told (N, its width), logits of the states (N, S), and memories but for what is drawn."""
+        self, heard: Sequence[BothPeople], memories: Sequence[ArigMemory], rows: Floats
+    ) -> tuple[Floats, Floats, list[ArigMemory]]:
+        """Return the sampler's inputs (N, its width), logits of the states (N, S), and memories without its draws."""
         z, logits, made, *rest = self.engine.run("frame", *self._frame_inputs(heard, memories, rows))
-        agent_sound, agent_behaviour, user_behaviour, sound_keys = rest
         after = []
         for index, (one, memory) in enumerate(zip(heard, memories, strict=True)):
             frames, context = memory.frames + 1, memory.context
-            if frames % self.settings.chunk_frames == 0:
+            if frames % self.settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
                 context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
-            after.append(
-                changed(
-                    memory,
-                    frames=frames,
-                    user_voice=one.user_voice,
-                    agent_voice=one.agent_voice,
-                    agent_sound=agent_sound[index],
-                    agent_behaviour=agent_behaviour[index],
-                    user_behaviour=user_behaviour[index],
-                    sound_keys=sound_keys[index],
-                    context=context,
-                )
-            )
+            own = dict(zip(REMEMBERED[:4], (part[index] for part in rest), strict=True))
+            voices = {"user_voice": one.user_voice, "agent_voice": one.agent_voice}
+            after.append(changed(memory, **own, **voices, frames=frames, context=context))
         return z, logits, after
 
     def _states(
-        self, logits: Floats, now: Sequence[Memory], rows: Floats, heard: Sequence[Heard]
+        self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, heard: Sequence[BothPeople]
     ) -> tuple[list[Sojourn], list[int]]:
-        """States of the frame that is made: the most probable, or drawn where the model has events."""
+        """Return states of the frame that is made: the most probable, or drawn where the model has events."""
         before = [memory.sojourn for memory in now]
         if not self.settings.state_guidance:
             return before, [memory.state for memory in now]
         if not self.settings.events:
             return before, logits.argmax(-1).tolist()
         durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
+        # Ours: a state lasts as long as in the data, and feedback that is seen comes from the events.
         sojourns = [
             draw_sojourn(durations, possible, scores, one.voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, one, last, own in zip(logits, heard, before, now, strict=True)
@@ -250,47 +336,46 @@ class ArigListener(RunsOnEngine):
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
     def _rows(self, controls: Sequence[Floats] | None, streams: int) -> Floats:
-        """(streams, 2K); of a listener without events (streams, 0)."""
+        """Return control as (streams, 2K); (streams, 0) without events."""
         if not self.settings.events:
             if controls is not None:
                 raise ValueError("control is for a listener with events: true")
             return np.zeros((streams, 0), np.float32)
+        wanted = (CONTROL_ROWS, len(COLUMNS))
         if controls is None:
             return np.zeros((streams, CONTROL_ROWS * len(COLUMNS)), np.float32)
         rows = np.stack([np.asarray(control, np.float32) for control in controls])
-        if rows.shape != (streams, CONTROL_ROWS, len(COLUMNS)):
-            raise ValueError(
-                f"control is {rows.shape[1:]} of {len(rows)}, not {(CONTROL_ROWS, len(COLUMNS))} of {streams}"
-            )
+        if rows.shape != (streams, *wanted):
+            raise ValueError(f"control is {rows.shape[1:]} of {len(rows)}, not {wanted} of {streams}")
         return rows.reshape(streams, -1)
 
-    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[Memory]) -> list[Heard]:
-        """Both people in the newest frame of each stream."""
+    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> list[BothPeople]:
+        """Return both people in the newest frame of each stream."""
         samples, voices = [], []
         for speaker, memory in zip(speakers, memories, strict=True):
-            samples += [speaker.audio, audio_frontend.fit_frame(speaker.agent_audio)]
+            samples += [speaker.audio, fit_frame(speaker.agent_audio)]
             voices += [memory.user_voice, memory.agent_voice]
-        sounds, present, voices = audio_frontend.hear_each(samples, voices)
-        here = np.array(present)
-        return [
-            Heard(sounds[at : at + 2], here[at : at + 2], *self._face(speaker), voices[at], voices[at + 1])
-            for at, speaker in zip(range(0, len(samples), 2), speakers, strict=True)
-        ]
+        sounds, present, voices = hear_each(samples, voices)
+        found = []
+        for at, speaker in zip(range(0, len(samples), 2), speakers, strict=True):
+            # A face that is not finite or beyond all faces is not seen: the memory would keep it.
+            motion = None if speaker.face is None else speaker.face.motion
+            seen = motion is not None and bool(np.abs(motion).max() < BEYOND)  # false for NaN too
+            face = np.zeros(len(self.settings.channels), np.float32)
+            if motion is not None and seen:
+                face = self.standardise(self.space.encode(motion[None]))[0]
+            here = np.array(present[at : at + 2])
+            both = {"user_voice": voices[at], "agent_voice": voices[at + 1]}
+            found.append(BothPeople(sounds=sounds[at : at + 2], present=here, face=face, seen=seen, **both))
+        return found
 
-    def _frame_inputs(self, heard: Sequence[Heard], memories: Sequence[Memory], rows: Floats) -> list[NDArray[Any]]:
-        """What the network `frame` takes."""
+    def _frame_inputs(
+        self, heard: Sequence[BothPeople], memories: Sequence[ArigMemory], rows: Floats
+    ) -> list[NDArray[Any]]:
+        """Return the inputs of the network `frame`."""
         settings = self.settings
         frames = np.array([memory.frames for memory in memories])
         chunks, room = frames // settings.chunk_frames, settings.context_chunks - 1
-        remembered = (
-            "agent_sound",
-            "agent_behaviour",
-            "user_behaviour",
-            "sound_keys",
-            "motion",
-            "motion_keys",
-            "sample",
-        )
         return [
             _stacked(heard, "sounds"),
             _stacked(heard, "present"),
@@ -300,20 +385,11 @@ class ArigListener(RunsOnEngine):
             frames == 0,
             np.array([memory.state for memory in memories]),
             rotary(chunks, settings.width // settings.heads),
-            np.arange(room) >= room - np.minimum(chunks, room)[:, None],
-            *(_stacked(memories, name) for name in remembered),
+            np.arange(room) >= room - np.minimum(chunks, room)[:, None],  # the newest chunks are last
+            *(_stacked(memories, name) for name in REMEMBERED),
             rows,
             *(stacked([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
         ]
-
-    def _face(self, speaker: SpeakerFrame) -> tuple[Floats, bool]:
-        """(C,) standardised, and whether it is seen; what is not finite or beyond all faces is not: memory would keep
-        it.
-        """
-        motion = None if speaker.face is None else speaker.face.motion
-        if motion is None or not np.abs(motion).max() < BEYOND:  # false for NaN too
-            return np.zeros(len(self.settings.channels), np.float32), False
-        return self.standardise(self.space.encode(motion[None]))[0], True
 
 
 def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:

@@ -43,7 +43,7 @@ from sfms_robot.listeners.events.evidence import (
     remembered,
     sense,
 )
-from sfms_robot.listeners.lots import Use, uniforms
+from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 from sfms_robot.signals.phase import log_time
 

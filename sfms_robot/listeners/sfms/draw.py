@@ -1,11 +1,16 @@
-"""Tokens out of probabilities: frame by frame, every group at once, many streams at a time."""
+"""Tokens of a stream: its window of past and future, and how the undecided ones are drawn. numpy only. Ours.
+
+The paper predicts 8 frames and stops there. A robot does not: plans overlap, keyframes that were drawn stay, and an
+event that is decided meanwhile may call some of them off. A token is 0 at a transition, 1 + i at a keyframe of code i,
+UNDECIDED where it is not drawn yet. B streams, P past and H future frames, T = P + H, G groups, V codes, K columns.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,29 +19,157 @@ from sfms_robot import config
 from sfms_robot.config import NodCourse, SmileCourse
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.listeners.engine import Engine
-from sfms_robot.listeners.lots import Use, uniforms
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, LastKeyframes, Tokens, anchored, last_keyframes
+from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.control import COLUMNS, FULL_SIZE, since_s
 
-LIKELIEST = 128  # classes that are looked at: what is behind them weighs next to nothing
+Tokens = NDArray[np.int64]
+A = TypeVar("A")  # an array or a tensor
+
+UNDECIDED: Final = -1
+KEPT_FRAMES: Final = 1  # of the future, whatever is decided: servos are already moving there
+SAME: Final = 1e-5  # control rows that differ by less are the same
+KEYS_STEP: Final = 8
+NEUTRAL_STRIDE: Final = 8  # frames between the keyframes of the neutral face a stream begins with
+LIKELIEST: Final = 128  # classes that may be drawn: all others together weigh next to nothing
+
+# --- The window of a stream -------------------------------------------------------------------------------------------
+#
+# H = 8, hop 4, the plan made when frame 100 has been heard. k: keyframe, .: transition, U: undecided.
+#
+#     frame          61       ...        98   99  100 | 101  102  103  104 | 105  106  107  108
+#                    past (P = 40), shown             | kept of the plan   | free
+#                                                     | before             |
+#     before         .   k   .   .   k   .    .    .  |  .    .    k    .  |  U    U    U    U
+#     after `draw`   .   k   .   .   k   .    .    .  |  .    .    k    .  |  .    k    .    .
+#                                                  ^
+#                                                  settled: the last frame whose motion is fixed
+#
+# - `passed`: four frames later the same tokens stand four places further left, and four undecided ones follow. With
+#   penalised placement, where a keyframe holds until the next one, one that leaves the window stays at its first frame.
+# - `revoked`: an event is decided that changes the control row of frame 103. Tokens of 103 to 108 become undecided and
+#   are drawn again, whatever the hop; settled is 102. Frame 101 (KEPT_FRAMES) is never called off.
+# - `anchored`: the keyframe just drawn at 106 has a ramp of 5 frames, which would begin at 101; but settled is 102,
+#   and motion up to there did not know of the keyframe. So the last keyframe of the group is repeated at 102, and the
+#   ramp begins there. Without it, a nod would begin before the time that it was decided for.
+#
+# Motion behind the last keyframe is an extrapolation, which the next plan may correct (`stream.join`).
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What a plan may look at: the parts of `predictor.Context`, those of the speaker of 1 or B streams.
+class LastKeyframes(NamedTuple, Generic[A]):
+    """The last two keyframes of every group, the newer first: tokens (..., G, 2), 0 for none yet, and their frames."""
 
-    Attributes:
-        settled: (B,) the last frame of each window whose motion stays as it is: no new ramp begins before it.
+    tokens: A
+    at: A
+
+
+def last_keyframes(tokens: Tokens) -> LastKeyframes[Tokens]:
+    """Return the last keyframes at every frame of tokens (B, T, G), that frame included; frame -1 for none."""
+    windows, frames, groups = tokens.shape
+    window, group = np.arange(windows)[:, None, None], np.arange(groups)
+    # One frame is put before all others, without a keyframe: the index of those that have none yet.
+    known = np.zeros((windows, frames + 1, groups), tokens.dtype)
+    np.maximum(tokens, 0, out=known[:, 1:])
+    last = np.maximum.accumulate(np.where(known > 0, np.arange(frames + 1)[:, None], 0), axis=1)
+    before = np.concatenate([last[:, :1], last[:, :-1]], axis=1)[window, last, group]  # as of the frame before
+    at = np.stack([last, before], axis=-1)[:, 1:]
+    return LastKeyframes(known[window[..., None], at, group[:, None]], at - 1)
+
+
+def with_drawn(recent: LastKeyframes[Tokens], drawn: Tokens, frame: int) -> LastKeyframes[Tokens]:
+    """Return the last keyframes (..., G, 2) after the tokens (..., G) `drawn` for `frame`."""
+    key, tokens, at = drawn > 0, recent.tokens.copy(), recent.at.copy()
+    for part in (tokens, at):
+        np.copyto(part[..., 1], part[..., 0], where=key)
+    np.copyto(tokens[..., 0], drawn, where=key)
+    np.copyto(at[..., 0], frame, where=key)
+    return LastKeyframes(tokens, at)
+
+
+def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
+    """Return the parts of `piecewise_linear.Around` of tokens (B, T, G): the keyframes around each frame.
+
+    A window without keyframes looks at all of its frames. K is as large as the fullest window needs, rounded up to
+    whole `KEYS_STEP`s, because engines prepare themselves for every K that they meet.
     """
+    windows, frames, _ = tokens.shape
+    key, frame = tokens > 0, np.arange(frames)[:, None]
+    before = np.maximum.accumulate(np.where(key, frame, -1), axis=1)
+    after = np.ascontiguousarray(np.minimum.accumulate(np.where(key, frame, frames)[:, ::-1], axis=1)[:, ::-1])
+    seen: NDArray[np.bool_] = np.asarray(key.any(-1))
+    seen[~seen.any(-1)] = True
+    counts, window = seen.sum(-1, keepdims=True), np.arange(windows)[:, None]
+    most = min(-(-int(counts.max()) // KEYS_STEP) * KEYS_STEP, frames)
+    rows = np.argsort(~seen, axis=1, kind="stable")[:, :most] + window * frames
+    places = np.maximum(seen.cumsum(-1) - 1, 0) + window * most
+    return before, after, rows, np.arange(most) < counts, places
 
-    face: Floats
-    face_known: NDArray[np.bool_]
-    voice: Floats
-    heard: NDArray[np.bool_]
-    phase: Floats
-    tokens: Tokens
-    control: Floats
-    settled: Tokens
+
+def neutral_mask(frames: int, groups: int) -> Floats:
+    """Return the keyframes (frames, groups) of a still, neutral face, the last of them at the newest frame."""
+    mask = np.zeros((frames, groups), np.float32)
+    mask[(frames - 1) % NEUTRAL_STRIDE :: NEUTRAL_STRIDE] = 1.0
+    return mask
+
+
+def passed(tokens: Tokens, path: Floats, frames: int = 1, holds: bool = False) -> tuple[Tokens, Floats]:
+    """Return tokens (B, P + H, G) and path (B, 2 + H, C) of `frames` later.
+
+    What passed undecided, before the first plan, was the neutral face: transitions. `holds`: the last keyframe that has
+    left the window is put at its first frame.
+    """
+    horizon = path.shape[1] - 2
+    moved = np.concatenate([tokens[:, frames:], np.full_like(tokens[:, :frames], UNDECIDED)], axis=1)
+    np.maximum(moved[:, :-horizon], 0, out=moved[:, :-horizon])
+    if holds:
+        moved[:, 0] = _newest(tokens[:, : frames + 1])
+    return moved, np.concatenate([path[:, frames:], np.repeat(path[:, -1:], frames, axis=1)], axis=1)
+
+
+def _newest(tokens: Tokens) -> Tokens:
+    """Return the last keyframe of each group (B, G) of tokens (B, T, G), 0 where there is none."""
+    out: Tokens = np.maximum(tokens[:, 0], 0)
+    for frame in range(1, tokens.shape[1]):
+        out = np.where(tokens[:, frame] > 0, tokens[:, frame], out)
+    return out
+
+
+def later(control: Floats, frames: int = 1) -> Floats:
+    """Return control (B, P + H, K) of `frames` later; 0 for frames that no row has been given for yet."""
+    return np.concatenate([control[:, frames:], np.zeros_like(control[:, :frames])], axis=1)
+
+
+def revoked(tokens: Tokens, drawn_under: Floats, control: Floats, horizon: int) -> tuple[Tokens, Tokens]:
+    """Return tokens (B, P + H, G) without the future ones that new control rows have overtaken, and `settled` (B,).
+
+    Args:
+        tokens: of the window.
+        drawn_under: (B, P + H, K) control rows that the tokens were drawn under.
+        control: (B, P + H, K) control rows of now.
+        horizon: H.
+    """
+    changed = (np.abs(control - drawn_under)[:, -horizon:] > SAME).any(-1)
+    stale: NDArray[Any] = np.logical_or.accumulate(changed, axis=1)
+    stale[:, :KEPT_FRAMES] = False
+    future = np.where(stale[..., None], UNDECIDED, tokens[:, -horizon:])
+    overtaken = stale & (tokens[:, -horizon:, 0] != UNDECIDED)
+    settled = tokens.shape[1] - horizon - 1 + np.where(overtaken.any(1), overtaken.argmax(1), 0)
+    return np.concatenate([tokens[:, :-horizon], future], axis=1), settled
+
+
+def anchored(tokens: Tokens, drawn: NDArray[np.bool_], settled: Tokens, ramp: int) -> Tokens:
+    """Return tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before frame `settled`.
+
+    `settled`: (B,). There the keyframe that a group held until then is repeated.
+    """
+    stream, frame = np.arange(len(tokens)), np.arange(tokens.shape[1])
+    new, out = drawn & (tokens > 0), tokens.copy()
+    behind = frame > settled[:, None]
+    ahead = (tokens > 0) & (behind & (frame < settled[:, None] + ramp))[..., None]
+    first = ahead.argmax(1)  # the next keyframe of each group, if there is any
+    is_new = np.take_along_axis(new, first[:, None], axis=1)[:, 0]
+    held = _newest(np.where(behind[..., None], 0, tokens))
+    out[stream, settled] = np.where(ahead.any(1) & is_new, held, tokens[stream, settled])
+    return out
 
 
 # --- Reach ------------------------------------------------------------------------------------------------------------
@@ -49,14 +182,15 @@ NEVER = 255  # frames, more than any window has
 TINY = 1e-9  # for a channel that never moved
 
 
-class Reach:
-    """Frames needed from each token to each other one, per group. A row is worked out when it is first asked for.
+class CodeReach:
+    """Frames needed from each token to each other one, per group. A row is computed when it is first asked for.
 
     Args:
         motion: (V, C) motion of every code, V of the largest group; the codes of a smaller one are its first.
-        channels: of each group; codes: how many it has.
+        channels: of each group.
+        codes: how many each group has.
         speed: (C,) fastest natural change of each channel from one frame to the next.
-        bounded: else every code may follow every other at once; but a group never gets a code that it lacks.
+        bounded: False lets every code follow every other at once; a group still never gets a code that it lacks.
     """
 
     def __init__(
@@ -74,15 +208,16 @@ class Reach:
         self._rows: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     def too_soon(self, last: Tokens, gap: Tokens) -> NDArray[np.bool_]:
-        """Tokens (B, G) of the last keyframes (0: none), frames since (B, G) -> classes (B, G, V + 1) out of reach."""
-        needed = np.concatenate([self.needed(*each) for row in last.tolist() for each in enumerate(row)])
+        """Return the classes (B, G, V + 1) out of reach `gap` (B, G) frames after the last keyframes (B, G)."""
+        needed = np.concatenate([self._needed(*each) for row in last.tolist() for each in enumerate(row)])
         passed = np.minimum(gap, NEVER - 1).astype(np.uint8)  # as wide as what it is compared with
         too_soon: NDArray[np.bool_] = needed.reshape(*last.shape, self._classes) > passed[..., None]
         return too_soon
 
-    def needed(self, group: int, token: int) -> NDArray[np.uint8]:
-        """(V + 1,) whole frames, at least, from a token to every class; class 0 may always follow, and anything may
-        follow class 0, which is no keyframe yet.
+    def _needed(self, group: int, token: int) -> NDArray[np.uint8]:
+        """Return the whole frames needed, at least, from a token to every class (V + 1,).
+
+        Class 0 may always follow, and any class may follow class 0 (no keyframe yet).
         """
         row = self._rows.get((group, token))
         if row is None:
@@ -120,25 +255,22 @@ _TURN: Final = 2 * math.pi
 _LEAST_RAD: Final = 1e-6
 
 
-@dataclass(frozen=True)
-class Course:
-    """Where one channel should be in every row told.
-
-    Attributes:
-        wanted: (...,) NaN where that is not known. spread: (...,) how far from it is left to the predictor.
-    """
+class Course(NamedTuple):
+    """The course of one channel in control rows (...): the value wanted, NaN for any, and the spread around it."""
 
     wanted: Doubles
     spread: Doubles
 
 
 @dataclass(frozen=True)
-class ToldCourse:
-    """What is told does to the odds of one group.
+class EventCourse:
+    """A course that one group keeps to.
 
     Attributes:
-        how: the course. group: its place among the groups. values: (V,) of each of its codes, in the unit of the
-            course: radians nose down of a nod, 0 to 1 of a smile.
+        how: its shape.
+        group: place among the groups.
+        values: (V,) of each of the group's codes, in the unit of the course: radians nose down of a nod, 0 to 1 of a
+            smile.
     """
 
     how: SmileCourse | NodCourse
@@ -146,44 +278,44 @@ class ToldCourse:
     values: Doubles
 
     def course(self, control: Floats) -> Course | None:
-        """Of rows (..., T, K) of control, in their order: (..., T); None where none of them tells of one."""
-        kind = "smile" if isinstance(self.how, SmileCourse) else "nod"
-        if not control[..., _AT[f"{kind}.active"]].any():
-            return None
+        """Return the course (..., T) in rows (..., T, K) of control, in their order; None without such an event."""
         if isinstance(self.how, SmileCourse):
-            return smile_course(self.how, control)
-        return nod_course(self.how, control)
+            return smile_course(self.how, control) if control[..., _AT["smile.active"]].any() else None
+        return nod_course(self.how, control) if control[..., _AT["nod.active"]].any() else None
 
     def penalties(self, wanted: Doubles, spread: Doubles, last: Tokens) -> tuple[NDArray[np.intp], Floats]:
-        """A row of the `course` of streams (B,), and their last keyframes (B,), 0 for none -> for which of them there
-        is one (S,), and what classes 0, 1, ... lose in log-odds (S, V + 1).
+        """Return which streams (S,) have a course in this frame, and the log-odds (S, V + 1) that each class loses.
+
+        Args:
+            wanted, spread: (B,) a row of `course`.
+            last: (B,) last keyframes of the group, 0 for none.
         """
-        told = np.flatnonzero(np.isfinite(wanted))
-        token = last[told]
+        streams = np.flatnonzero(np.isfinite(wanted))
+        token = last[streams]
         held = np.where(token > 0, self.values[np.maximum(token - 1, 0)], 0.0)
         every = np.concatenate([held[:, None], np.broadcast_to(self.values, (len(token), len(self.values)))], axis=1)
-        off = (every - wanted[told, None]) / spread[told, None]
-        return told, (off**2 / 2).astype(np.float32)
+        off = (every - wanted[streams, None]) / spread[streams, None]
+        return streams, (off**2 / 2).astype(np.float32)
 
 
 def smile_course(smile: SmileCourse, control: Floats) -> Course:
-    """Of the corners of the mouth, 0 to 1."""
+    """Return the course of the corners of the mouth, 0 to 1."""
     told = (control[..., _AT["smile.active"]] > 0) & (control[..., _AT["laugh.active"]] == 0)
     since = since_s(control[..., _AT["smile.since"]])
-    over = control[..., _AT["smile.over"]].astype(np.float64)
+    over = control[..., _AT["smile.over"]].astype(np.float64)  # the share of its duration that has passed
     left = np.where(over > 0, since * (1 / np.maximum(over, 1e-6) - 1), np.inf)
     wanted = np.where(told, control[..., _AT["smile.size"]] * smile_share(smile, since, left), np.nan)
     return Course(wanted, np.full_like(wanted, smile.spread))
 
 
 def smile_share(smile: SmileCourse, since: Doubles, left: Doubles) -> Doubles:
-    """Share of its size that a smile has `since` its beginning, with so much `left` of it, both in seconds."""
+    """Return the share of its size that a smile has `since` its beginning, with `left` to its end, both in seconds."""
     rise = np.interp(since, smile.RISE_S, smile.rise)
     return np.asarray(np.minimum(rise, np.interp(left, smile.FALL_S, smile.fall)))
 
 
 def nod_course(nod: NodCourse, control: Floats) -> Course:
-    """Of the pitch, radians, in the two rows about the middle of each swing, and in that nearest to its end."""
+    """Return the course of the pitch, radians: in the two rows about the middle of each swing and next to its end."""
     told = control[..., _AT["nod.active"]] > 0
     size = control[..., _AT["nod.size"]].astype(np.float64) * FULL_SIZE["nod"]
     turned, step = _turned(control, told)
@@ -196,14 +328,16 @@ def nod_course(nod: NodCourse, control: Floats) -> Course:
     back = (told | ended) & (np.minimum(angle, _TURN - angle) <= step / 2) & (turned > math.pi)
     off = angle - math.pi
     nearest = off - step * np.round(off / np.maximum(step, _LEAST_RAD))  # of the rows, to the middle
+    # A swing is size (1 - cos angle) / 2, scaled so that the row nearest to its middle reaches all of it.
     there = size * nod.fall**swing * (1 + np.cos(off)) / np.maximum(1 + np.cos(nearest), _LEAST_RAD)
     wanted = np.where(low, there, np.where(back, 0.0, np.nan))
     return Course(wanted, nod.spread * np.maximum(size, _LEAST_RAD))
 
 
 def _turned(control: Floats, told: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-    """How far the swings of a nod have turned since its beginning, radians, and by how much they do from row to row;
-    0 where only one row of it is known.
+    """Return how far the swings of a nod have turned since its beginning, and the step from row to row, in radians.
+
+    The step is 0 where only one row of the nod is known.
     """
     angle = np.arctan2(control[..., _AT["nod.sine"]], control[..., _AT["nod.cosine"]]).astype(np.float64) % _TURN
     since = since_s(control[..., _AT["nod.since"]])
@@ -212,14 +346,37 @@ def _turned(control: Floats, told: NDArray[np.bool_]) -> tuple[Doubles, Doubles]
     step = np.zeros_like(angle)
     step[..., 1:] = ahead
     step[..., :-1] = np.where(same, ahead, step[..., :-1])
-    whole = np.round((since / FRAME_S * step - angle) / _TURN)
+    whole = np.round((since / FRAME_S * step - angle) / _TURN)  # turns before this one
     return angle + _TURN * whole, step
 
 
-class Sampler:
-    """How the tokens of one listener are drawn: its predictor, and what its settings say of every group."""
+# --- Drawing ----------------------------------------------------------------------------------------------------------
 
-    def __init__(self, settings: config.Sfms, engine: Engine, reach: Reach, courses: Sequence[ToldCourse] = ()) -> None:
+
+@dataclass(frozen=True, kw_only=True)
+class PlanInputs:
+    """Inputs of a plan: the parts of `predictor.Context`, those of the speaker for 1 or B streams.
+
+    Attributes:
+        settled: (B,) the last frame of each window whose motion is fixed: no new ramp begins before it.
+    """
+
+    face: Floats
+    face_known: NDArray[np.bool_]
+    voice: Floats
+    heard: NDArray[np.bool_]
+    phase: Floats
+    tokens: Tokens
+    control: Floats
+    settled: Tokens
+
+
+class Sampler:
+    """Draws the tokens of one listener: frame by frame, every group at once, many streams at a time."""
+
+    def __init__(
+        self, settings: config.Sfms, engine: Engine, reach: CodeReach, courses: Sequence[EventCourse] = ()
+    ) -> None:
         groups, common = list(settings.groups.values()), settings.sampling
         self._engine, self._reach, self._courses = engine, reach, courses
         self._temperature, self._nucleus = np.float32(common.temperature), np.float32(common.nucleus)
@@ -227,70 +384,47 @@ class Sampler:
         self._classes = [group.codes + 1 for group in groups]
         self._ramp = settings.ramp_frames or 0
 
-    def draw(self, seen: Seen, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
-        """`seen.tokens` (B, P + H, G) with its undecided frames drawn; stream b has `seeds[b]` and draws for frames up
-        to `frames[b]` of its life.
+    def draw(self, seen: PlanInputs, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
+        """Return `seen.tokens` (B, P + H, G) with its undecided frames drawn.
 
-        A stream's undecided frames are its last ones; how many may differ from stream to stream.
+        Args:
+            seen: undecided frames are the last ones of a stream; how many may differ from stream to stream.
+            seeds: of each stream.
+            frames: the number, in the life of each stream, of the last frame of its window.
         """
         tokens = seen.tokens.copy()
         window = tokens.shape[1]
-        left = (tokens[..., 0] == UNDECIDED).sum(1)  # frames of each stream
-        first = window - int(left.max())
+        first = window - int((tokens[..., 0] == UNDECIDED).sum(1).max())
         recent = last_keyframes(tokens)
         parts = (seen.face, seen.face_known, seen.voice, seen.heard, seen.phase, tokens, seen.control)
         (slots,) = self._engine.run("ahead", *parts, *recent)
         last = LastKeyframes(recent.tokens[:, first - 1], recent.at[:, first - 1])
-        chances = self._chances(seeds, frames, window - first)
         before = min(first, 2)  # rows that say how fast a swing is, and that it has just ended
         rows = seen.control[:, first - before :]
         courses = [(told, one) for told in self._courses if (one := told.course(rows)) is not None]
         for frame in range(first, window):
             (flat,) = self._engine.run("next", slots[:, frame - window], *last, np.array([frame - 1]))
-            at = frame - first + before
-            now = [(told, one.wanted[:, at], one.spread[:, at]) for told, one in courses]
+            logits = by_group(flat, self._classes)  # (B, G, V)
             since = frame - np.maximum(last.at[..., 0], seen.settled[:, None] if self._ramp else -1)
-            drawn = self._drawn(flat, last, since, chances[:, frame - window], now)
+            np.copyto(logits, np.float32(-np.inf), where=self._reach.too_soon(last.tokens[..., 0], since))
+            logits /= self._temperature
+            for told, course in courses:
+                wanted, spread = (part[:, frame - first + before] for part in course)
+                streams, lost = told.penalties(wanted, spread, last.tokens[:, told.group, 0])
+                logits[streams, told.group, : lost.shape[1]] -= lost
+            chances = [
+                uniforms(seed, newest - window + 1 + frame, Use.TOKENS, len(self._bias))
+                for seed, newest in zip(seeds, frames, strict=True)
+            ]
+            drawn = sample(logits, self._bias, self._nucleus, np.array(chances))
             known = tokens[:, frame]
             tokens[:, frame] = np.where(known == UNDECIDED, drawn, known)
-            last = last.then(tokens[:, frame], frame)
+            last = with_drawn(last, tokens[:, frame], frame)
         return anchored(tokens, seen.tokens == UNDECIDED, seen.settled, self._ramp) if self._ramp else tokens
-
-    def _chances(self, seeds: Sequence[int], frames: Sequence[int], count: int) -> Doubles:
-        """(B, count, G) in 0..1 for each stream's last `count` frames."""
-        groups = len(self._bias)
-        drawn = [
-            [uniforms(seed, frame - count + 1 + at, Use.TOKENS, groups) for at in range(count)]
-            for seed, frame in zip(seeds, frames, strict=True)
-        ]
-        return np.array(drawn)
-
-    def _drawn(
-        self,
-        flat: Floats,
-        last: LastKeyframes,
-        since: Tokens,
-        chance: Doubles,
-        courses: Sequence[tuple[ToldCourse, Doubles, Doubles]],
-    ) -> Tokens:
-        """Tokens (B, G) of a frame from the logits (B, classes of all groups) of the network `next`.
-
-        `since` (B, G): frames in which each group may have got there from its last keyframe.
-
-        `courses`: those that are told, each with the row (B,) of what is wanted, and its spread.
-        """
-        possible = by_group(flat, self._classes)  # (B, G, V)
-        too_soon = self._reach.too_soon(last.tokens[..., 0], since)
-        np.copyto(possible, np.float32(-np.inf), where=too_soon)
-        possible /= self._temperature
-        for told, wanted, spread in courses:
-            streams, lost = told.penalties(wanted, spread, last.tokens[:, told.group, 0])
-            possible[streams, told.group, : lost.shape[1]] -= lost
-        return sample(possible, self._bias, self._nucleus, chance)
 
 
 def by_group(flat: Floats, classes: Sequence[int]) -> Floats:
-    """Logits (..., all classes of all groups), `classes` of each -> (..., G, V); -inf for those that a group lacks."""
+    """Return logits (..., G, V) of (..., all classes of all groups), `classes` of each; -inf for those it lacks."""
     out = np.full((*flat.shape[:-1], len(classes), max(classes)), -np.inf, np.float32)
     first = 0
     for group, count in enumerate(classes):
@@ -300,9 +434,9 @@ def by_group(flat: Floats, classes: Sequence[int]) -> Floats:
 
 
 def sample(logits: Floats, bias: Floats, nucleus: np.float32, chance: Doubles) -> Tokens:
-    """One class (..., G) of each logits (..., G, V): bias (G,) on class 0, then the likeliest that hold `nucleus`.
+    """Draw one class (..., G) from logits (..., G, V): bias (G,) on class 0, then the likeliest that hold `nucleus`.
 
-    `chance` (..., G) in 0..1 says where in that mass: a class is drawn as often as it is likely.
+    `chance` (..., G) in 0..1 is the place in that mass.
     """
     biased = logits.copy()
     biased[..., 0] += bias

@@ -1,68 +1,66 @@
-"""Both phases of SFMS put together: the tokenizer (scores, codes, inpainter) and the predictor of its tokens."""
+"""Both phases of SFMS as one model: the tokenizer (IV-B), the predictor of its tokens (IV-C), and what a stream calls.
+
+    Inpainter    sparse to dense (IV-B5): keyframes -> every frame
+    Tokenizer    motion <-> tokens (IV-B): placement, codes, inpainter
+    SfmsModel    tokenizer and predictor, with the scales of motion and sound: the weights of one listener
+    networks     functions of tensors alone that `stream.SfmsListener` calls; they run as modules, traced, or as ONNX
+
+B batch or streams, T frames, P past and H future frames, C channels, G groups, D digits of a code, W width.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.listeners.layers import Block, sinusoidal
-from sfms_robot.listeners.sfms.audio_frontend import SHAPES
-from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
-from sfms_robot.listeners.sfms.placement import Strategy, place
-from sfms_robot.listeners.sfms.predictor import Predictor, SpeakerEncoder
+from sfms_robot.listeners.sfms.draw import KEYS_STEP, UNDECIDED, LastKeyframes, around, neutral_mask
+from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
+from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place
+from sfms_robot.listeners.sfms.predictor import Context, Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
+from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 
-
-def membership(groups: Sequence[config.ChannelGroup], channels: Sequence[str]) -> Tensor:
-    """(G, C): 1 where a channel belongs to a group."""
-    return torch.tensor([[float(name in group.channels) for name in channels] for group in groups])
-
+UNMEASURED = 1e6  # deviations a frame: a speed that does not bound anything
 
 # --- Sparse to dense (IV-B5) ------------------------------------------------------------------------------------------
 #
-# Keyframe codes and their places -> every frame. A keyframe encoder reads the keyframes, a transition encoder queries
-# them from each frame's place between its neighbours, a decoder joins both (equations 9 and 10). Unlike the paper,
-# the result is added to plain linear interpolation of the decoded keyframes: the network only has to learn how faces
-# deviate from straight lines. `residual=False` is the paper's, which has to learn the lines as well: after 300 steps
-# on recorded faces (k = 7, one set of keyframes per channel, exact masks, unseen takes) its error was 4.3 times as
-# large. With `ramp` a line begins at most so many frames before its end.
+# Keyframe codes and their places -> every frame, equations (9) and (10). A keyframe encoder reads the keyframes
+# (z^kf), a transition encoder queries them from each frame's place between its neighbours (z^tf), a decoder joins both.
+# Ours: the result is added to plain linear interpolation of the decoded keyframes, because then the network only has
+# to learn how faces deviate from straight lines. The paper's (`inpainter: paper`) has to learn the lines as well: after
+# 300 steps on recorded faces (k = 7, one set of keyframes per channel, exact masks, unseen takes) its error was 4.3
+# times as large.
 
 
 class Inpainter(nn.Module):
-    """phi of equation (9)."""
+    """phi of equation (9), for the channels and groups of a quantizer."""
 
-    def __init__(
-        self,
-        quantizer: Quantizer,
-        width: int,
-        heads: int,
-        layers: int = 1,
-        residual: bool = True,
-        ramp: int | None = None,
-    ) -> None:
+    def __init__(self, quantizer: Quantizer, settings: config.Sfms) -> None:
         super().__init__()
         groups, channels = quantizer.member.shape
-        dims = quantizer.dims
+        width, heads, layers = settings.tokenizer_width, settings.heads, settings.tokenizer_layers
         self.width = width
-        self.residual = residual
-        self.ramp = ramp
-        self.keyframe_in = nn.Linear(groups * (dims + 1), width)
+        self.residual = settings.inpainter == "residual"
+        self.ramp = settings.ramp_frames
+        self.keyframe_in = nn.Linear(groups * (quantizer.dims + 1), width)
         self.keyframe_encoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
-        self.transition_in = nn.Linear(groups * (dims + 2 * POSITION_BITS + 3), width)
+        self.transition_in = nn.Linear(groups * (quantizer.dims + 2 * POSITION_BITS + 3), width)
         self.transition_encoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
         self.join = nn.Linear(2 * width, width)
         self.decoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, channels)
-        if residual:  # training begins at the straight lines
+        if self.residual:  # training begins at the straight lines
             nn.init.zeros_(self.out.weight)
             nn.init.zeros_(self.out.bias)
 
@@ -74,47 +72,47 @@ class Inpainter(nn.Module):
         last: int | None = None,
         around: Around | None = None,
     ) -> Tensor:
-        """codes (B, T, G, D), read where mask (B, T, G) is 1 -> motion (B, T, C), standardised.
+        """Return standardised motion (B, T, C) of codes (B, T, G, D), which count where mask (B, T, G) is 1.
 
-        `last`: only so many frames at the end are wanted, (B, last, C). `around`: where the mask is 1, for who knows.
+        `last`: return only this many frames at the end, (B, last, C). `around`: the places of keyframes in the mask,
+        for a caller that has them.
         """
         if around is None:
             neighbours = Neighbours.in_mask(mask, self.ramp)
+            rows, seen, found = _every(mask)
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
-        places = sinusoidal(mask.shape[1], self.width).to(codes)
-        # Multiplying by the mask is where learned placement gets its gradient: forward it changes nothing.
+            rows, seen, found = around.rows, around.seen, around.places
+        places = sinusoidal(mask.shape[1], self.width).to(codes)  # (T, W)
+        # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
-        z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places
-        # Other frames are neither looked at nor kept; but a gradient, which learned placement needs, passes there.
-        rows, seen, found = _every(mask) if around is None else around[2:]
-        z_keys = F.embedding(rows, z_kf.flatten(0, 1))
+        z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
+        # Other frames are not looked at and not kept; but the gradient that learned placement needs passes there.
+        z_keys = F.embedding(rows, z_kf.flatten(0, 1))  # (B, K, W): the keyframes of each window, in a row
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
         z_kf = F.embedding(found, z_keys.flatten(0, 1)) * mask.amax(-1, keepdim=True)
-        between = neighbours.interpolate(keyed)
+        between = neighbours.interpolate(keyed)  # codes on straight lines, (B, T, G, D)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
-        z_tf = self.transition_in(query) + places
+        z_tf = self.transition_in(query) + places  # Phi^tf of equation (10): T^tf queries z^kf
         for block in self.transition_encoder:
             z_tf = block(z_tf, memory=z_keys, memory_seen=seen)
-        joined = self.join(torch.cat([z_kf, z_tf], dim=-1))
+        joined = self.join(torch.cat([z_kf, z_tf], dim=-1))  # Phi^full of equation (10)
         *inner, outer = self.decoder
         for block in inner:
             joined = block(joined)
         out: Tensor = quantizer.drawn * self.out(self.norm(outer(joined, last=last)))
         if not self.residual:
             return out
-        return out + self._straight(keyed, neighbours if last is None else neighbours.last(last), quantizer)
-
-    @staticmethod
-    def _straight(codes: Tensor, neighbours: Neighbours, quantizer: Quantizer) -> Tensor:
-        """Lines between the decoded keyframes (B, T, C), each channel between those of its own group."""
-        return quantizer.by_channel(neighbours.interpolate(quantizer.decoder(codes)))
+        # Ours: lines between the decoded keyframes (B, T, C), each channel between those of its own group.
+        lines = neighbours if last is None else neighbours.last(last)
+        return out + quantizer.by_channel(lines.interpolate(quantizer.decoder(keyed)))
 
 
 def _every(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`Around.rows`, `seen` and `places` of a mask (B, T, G) with every frame among the keyframes of its window; where
-    no gradient is asked for, those alone that are one in any window.
+    """Return `Around.rows`, `seen` and `places` of a mask (B, T, G) with every frame among the keyframes of its window.
+
+    Where no gradient is needed, only frames that are a keyframe in any window.
     """
     seen = (mask > 0.5).any(-1)
     seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
@@ -129,128 +127,233 @@ def _every(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class Tokenizer(nn.Module):
     """Motion <-> tokens (B, T, G): 0 at a transition frame, 1 + code index at a keyframe. Motion is standardised."""
 
-    member: Tensor
-
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
         groups = list(settings.groups.values())
+        self.settings = settings
         self.strategy: Strategy = settings.placement
         self.max_gap = settings.max_gap_frames
-        self.sweeps = settings.scores.sweeps
         self.window = settings.window_frames
-        self.ramp = settings.ramp_frames
-        self.keyframes = [group.keyframes or 0 for group in groups]  # none where each has its cost instead
+        self.keyframes = [group.keyframes or 0 for group in groups]  # 0 where a keyframe has a cost instead
         self.costs = [group.keyframe_cost or 0.0 for group in groups]
-        self.register_buffer("member", membership(groups, settings.channels), persistent=False)
+        member = [[float(name in group.channels) for name in settings.channels] for group in groups]
+        self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
         levels = [group.levels for group in groups]
         self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims)
-        self.inpainter = Inpainter(
-            self.quantizer,
-            settings.tokenizer_width,
-            settings.heads,
-            settings.tokenizer_layers,
-            residual=settings.inpainter == "residual",
-            ramp=settings.ramp_frames,
-        )
-        self.score = _score_network(settings)
-
-    def counts(self, frames: int) -> list[int]:
-        """Keyframes per group for a stretch of `frames`, at the configured rate per window."""
-        return [max(1, round(k * frames / self.window)) for k in self.keyframes]
+        self.inpainter = Inpainter(self.quantizer, settings)
+        # Only learned placement has scores to learn; the others carry no dead weights.
+        scores = settings.scores
+        self.score: ScoreNetwork | ConditionalScore | None = None
+        if settings.placement == "learned_paper":
+            channels = len(settings.channels)
+            self.score = ScoreNetwork(channels, len(groups), scores.width, scores.heads, scores.layers)
+        elif settings.placement == "learned":
+            largest = max(len(group.channels) for group in groups)
+            self.score = ConditionalScore(largest, scores.width, scores.heads, scores.layers)
 
     def place(self, motion: Tensor, keyframes: Sequence[int] | None = None, strategy: Strategy | None = None) -> Tensor:
-        """Mask (B, T, G) of motion (B, T, C); `keyframes` (per group), `strategy`: others than the configured ones."""
-        gap = self.max_gap if motion.shape[1] >= self.window and keyframes is None else None
+        """Return the mask (B, T, G) of motion (B, T, C).
+
+        `keyframes` (per group) and `strategy` replace the configured ones; those are scaled to the length of the
+        motion.
+        """
+        frames = motion.shape[1]
+        scaled = [max(1, round(count * frames / self.window)) for count in self.keyframes]
         return place(
             motion,
-            keyframes or self.counts(motion.shape[1]),
+            keyframes or scaled,
             strategy or self.strategy,
             member=self.member,
             score=self.score,
-            max_gap=gap,
-            sweeps=self.sweeps,
+            # A bound on gaps is made for the configured rate; fewer keyframes could not keep it.
+            max_gap=self.max_gap if frames >= self.window and keyframes is None else None,
+            sweeps=self.settings.scores.sweeps,
             costs=self.costs,
-            ramp=self.ramp,
+            ramp=self.settings.ramp_frames,
         )
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
-        """Tokens (B, T, G) of motion (B, T, C) whose keyframes are given."""
-        indices = self.quantizer.indices(self.quantizer.encode(motion))
+        """Return the tokens (B, T, G) of motion (B, T, C) with keyframes at a mask (B, T, G)."""
+        indices = self.quantizer.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
         return torch.where(mask > 0.5, indices + 1, 0)
 
     def decode(self, tokens: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
-        """Motion (B, T, C) of tokens (B, T, G), or of the `last` frames alone; a token below 0 counts as transition.
+        """Return the motion (B, T, C) of tokens (B, T, G); tokens below 0 count as transitions.
 
-        `around`: what there is around every frame, for who knows.
+        `last`, `around`: see `Inpainter`.
         """
-        codes = self.quantizer.codes((tokens - 1).clamp(min=0))
-        return self.inpaint(codes, (tokens > 0).float(), last, around)
-
-    def inpaint(self, codes: Tensor, mask: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
-        """Motion (B, T, C) of codes (B, T, G, D) at a mask (B, T, G), or of the `last` frames alone."""
-        out: Tensor = self.inpainter(codes, mask, self.quantizer, last, around)
+        codes = self.quantizer.codes((tokens - 1).clamp(min=0))  # of transitions arbitrary: the mask hides them
+        out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 
-
-def _score_network(settings: config.Sfms) -> ScoreNetwork | ConditionalScore | None:
-    """Only learned placement has scores to learn; the others carry no dead weights."""
-    scores = settings.scores
-    if settings.placement == "learned_paper":
-        channels, groups = len(settings.channels), len(settings.groups)
-        return ScoreNetwork(channels, groups, scores.width, scores.heads, scores.layers)
-    if settings.placement == "learned":
-        largest = max(len(group.channels) for group in settings.groups.values())
-        return ConditionalScore(largest, scores.width, scores.heads, scores.layers)
-    return None
+    def inpaint(self, codes: Tensor, mask: Tensor) -> Tensor:
+        """Return the motion (B, T, C) of codes (B, T, G, D) at a mask (B, T, G)."""
+        out: Tensor = self.inpainter(codes, mask, self.quantizer)
+        return out
 
 
 class SfmsModel(nn.Module):
     """Weights of one listener, with the scales of its motion and sound."""
 
-    motion_mean: Tensor
-    motion_std: Tensor
-    motion_speed: Tensor
-    sound_mean: Tensor
-    sound_std: Tensor
-    sway_mixture: Tensor
-    sway_spread: Tensor
-
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
-        width, (rows, bins) = len(settings.channels), SHAPES[settings.audio]
-        phases = FEATURES if settings.phase else 0
-        self.register_buffer("motion_mean", torch.zeros(width))
-        self.register_buffer("motion_std", torch.ones(width))
+        width, bins = len(settings.channels), SHAPES[settings.audio][1]
+        self.motion_mean = nn.Buffer(torch.zeros(width))
+        self.motion_std = nn.Buffer(torch.ones(width))
         # Fastest natural change of each channel from one frame to the next, standardised.
-        self.register_buffer("motion_speed", torch.full((width,), 1e6))
-        self.register_buffer("sound_mean", torch.zeros(bins))
-        self.register_buffer("sound_std", torch.ones(bins))
+        self.motion_speed = nn.Buffer(torch.full((width,), UNMEASURED))
+        self.sound_mean = nn.Buffer(torch.zeros(bins))
+        self.sound_std = nn.Buffer(torch.ones(bins))
         self.head = head_channels(settings.channels) if settings.sway else []
         if settings.sway:
-            self.register_buffer("sway_mixture", torch.zeros(BANDS, len(self.head), len(self.head)))
-            self.register_buffer("sway_spread", torch.zeros(()))
+            self.sway_mixture = nn.Buffer(torch.zeros(BANDS, len(self.head), len(self.head)))
+            self.sway_spread = nn.Buffer(torch.zeros(()))
         self.tokenizer = Tokenizer(settings)
-        inner, heads = settings.predictor_width, settings.heads
-        self.predictor = Predictor(
-            [group.levels for group in settings.groups.values()],
-            settings.quantizer,
-            SpeakerEncoder(width, rows, bins, phases, inner, heads, settings.speaker_layers),
-            settings.future_frames,
-            inner,
-            heads,
-            settings.predictor_layers,
-            settings.sequential,
-            len(COLUMNS) if settings.events else 0,
-        )
+        self.predictor = Predictor(settings)
 
     def standardise(self, motion: Tensor) -> Tensor:
-        """Motion (..., C) of the model's motion space -> the units it works in."""
+        """Return motion (..., C) of the model's motion space in the units it works in."""
         return (motion - self.motion_mean) / self.motion_std
 
     def restore(self, motion: Tensor) -> Tensor:
-        """The inverse of `standardise`."""
+        """Return standardised motion (..., C) in the model's motion space."""
         return motion * self.motion_std + self.motion_mean
 
     def standardise_sound(self, rows: Tensor) -> Tensor:
-        """Rows (..., bins) of sound features, likewise."""
+        """Return rows (..., bins) of sound features in the units the model works in."""
         return (rows - self.sound_mean) / self.sound_std
+
+
+# --- Networks of a stream ---------------------------------------------------------------------------------------------
+
+
+class Network(nn.Module):
+    """A function of tensors of one model, whose weights keep their names in model.safetensors, behind "model.".
+
+    Attributes:
+        free: inputs of (B, K, ...), K any number but the same for all of them.
+    """
+
+    free: tuple[str, ...] = ()
+
+    def __init__(self, model: SfmsModel, settings: config.Sfms) -> None:
+        super().__init__()
+        self.model = model
+        self.future = settings.future_frames
+        self.codes = [group.codes for group in settings.groups.values()]
+
+
+class Rest(Network):
+    """A still face as tokens, and every code as motion: called once, when a listener is loaded."""
+
+    def forward(self, still: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
+        quantizer = self.model.tokenizer.quantizer
+        indices = torch.arange(max(self.codes))[:, None] % torch.tensor(self.codes)
+        return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codes(indices)[None])
+
+
+class Hear(Network):
+    """Sound of a frame and of the one before it, for the predictor."""
+
+    def forward(self, rows: Tensor) -> tuple[Tensor]:
+        """Return the newer frame (B, W) of standardised rows (B, 2R, bins)."""
+        return (self.model.predictor.speaker.listen(rows)[:, 0],)
+
+
+class Ahead(Network):
+    """The predictor up to the point where the drawn keyframes matter."""
+
+    def forward(
+        self,
+        face: Tensor,
+        face_known: Tensor,
+        voice: Tensor,
+        heard: Tensor,
+        phase: Tensor,
+        tokens: Tensor,
+        control: Tensor,
+        last: Tensor,
+        at: Tensor,
+    ) -> tuple[Tensor]:
+        """Return slots (B, H, W) of the parts of a `Context` and its last keyframes (B, P + H, G, 2)."""
+        context = Context(
+            face=face,
+            face_known=face_known,
+            voice=voice,
+            heard=heard,
+            phase=phase,
+            tokens=tokens,
+            control=control,
+        )
+        return (self.model.predictor(context, LastKeyframes(last, at)),)
+
+
+class Next(Network):
+    """The classes of one future frame, given the keyframes before it."""
+
+    def forward(self, slots: Tensor, last: Tensor, at: Tensor, frame: Tensor) -> tuple[Tensor]:
+        """Return logits (B, all classes of all groups) of a frame.
+
+        slots (B, W) of the frame, last keyframes (B, G, 2) up to the frame before, and its number (B,).
+        """
+        return (self.model.predictor.flat_logits(slots, LastKeyframes(last, at), frame[:, None, None]),)
+
+
+class Decode(Network):
+    """Tokens as motion."""
+
+    free = ("rows", "seen")
+
+    def forward(
+        self, tokens: Tensor, before: Tensor, after: Tensor, rows: Tensor, seen: Tensor, places: Tensor
+    ) -> tuple[Tensor]:
+        """Return standardised motion (B, 2 + H, C), from the frame before now, of tokens (B, P + H, G) and `Around`."""
+        found = Around(before, after, rows, seen, places)
+        return (self.model.tokenizer.decode(tokens, last=self.future + 2, around=found),)
+
+
+@torch.no_grad()
+def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
+    """Return the tokens (frames, G) of a still, neutral face up to now."""
+    still = torch.tensor(space.neutral, dtype=torch.float32).expand(1, frames, -1)
+    mask = torch.from_numpy(neutral_mask(frames, len(model.tokenizer.member)))
+    return model.tokenizer.encode(model.standardise(still), mask[None])[0]
+
+
+def networks(model: SfmsModel, settings: config.Sfms) -> dict[str, Network]:
+    """Return all networks by name."""
+    kinds = {"rest": Rest, "hear": Hear, "ahead": Ahead, "next": Next, "decode": Decode}
+    return {name: kind(model, settings).eval() for name, kind in kinds.items()}
+
+
+def examples(settings: config.Sfms, streams: int) -> Mapping[str, dict[str, Tensor]]:
+    """Return inputs of every network for this many streams, by the names of network and input."""
+    b, p, window, width = streams, settings.past_frames, settings.window_frames, settings.predictor_width
+    channels, groups, (rows, bins) = len(settings.channels), len(settings.groups), SHAPES[settings.audio]
+    tokens = torch.zeros(b, window, groups, dtype=torch.long)
+    recent = torch.zeros(b, window, groups, 2, dtype=torch.long)
+    keyframes = np.ones((b, window, groups), np.int64)
+    keyframes[:, KEYS_STEP:] = 0
+    return {
+        "rest": {"still": torch.zeros(1, p, channels), "mask": torch.zeros(1, p, groups)},
+        "hear": {"rows": torch.zeros(b, 2 * rows, bins)},
+        "ahead": {
+            "face": torch.zeros(b, p, channels),
+            "face_known": torch.ones(b, p, dtype=torch.bool),
+            "voice": torch.zeros(b, p, width),
+            "heard": torch.ones(b, p, dtype=torch.bool),
+            "phase": torch.zeros(b, p, FEATURES * settings.phase),
+            "tokens": torch.cat([tokens[:, :p], torch.full((b, settings.future_frames, groups), UNDECIDED)], dim=1),
+            "control": torch.zeros(b, window, len(COLUMNS) * settings.events),
+            "last": recent,
+            "at": recent - 1,
+        },
+        "next": {
+            "slots": torch.zeros(b, width),
+            "last": recent[:, 0],
+            "at": recent[:, 0] - 1,
+            "frame": torch.full((b,), p - 1),
+        },
+        "decode": {"tokens": tokens} | dict(zip(Around._fields, map(torch.from_numpy, around(keyframes)), strict=True)),
+    }

@@ -1,30 +1,175 @@
-"""Where the keyframes go: one question, `place(motion, k, ...) -> mask`, and six answers.
+"""Keyframe discovery (IV-B2): where the keyframes go. One function, `place(motion, k, ...) -> mask`, six strategies.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
-    penalised      as many as pay: least error plus a cost per keyframe, by dynamic programming (`place_penalised`)
+    penalised      as many as pay for themselves: least error plus a cost per keyframe (`place_penalised`)
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
-    learned_paper  the paper's: one look of the score network, Gumbel top-k by Algorithm 1
-    learned        ours: conditional scores, asked again at each of the k steps, then swept over (`choose`, `sweep`)
+    learned_paper  the paper's: one pass of the score network, Gumbel top-k by Algorithm 1
+    learned        ours: conditional scores, computed again at each of the k steps, then swept over (`choose`, `sweep`)
 
-Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, but `penalised`.
+Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, except `penalised`.
+N = B * G tracks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
-from sfms_robot.frames import Doubles
-from sfms_robot.listeners.sfms.exact import best_frames, mask_cost, segments
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, Tracks, tracks
+from sfms_robot.listeners.layers import Block, sinusoidal
+from sfms_robot.listeners.sfms.piecewise_linear import (
+    Neighbours,
+    Segments,
+    best_frames,
+    mask_cost,
+    place_penalised,
+    segments,
+)
 
 Strategy = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
-EPSILON = 1e-20  # a chosen frame falls back by 46: more than any two scores differ
+EPSILON = 1e-20  # of Algorithm 1, line 9: a chosen frame falls by 46, more than any two scores differ
+MOST_CURVES = 3  # principal curves of a group that the network sees
+STILL = 1e-3  # root mean square, standardised, below which motion counts as noise
+STATE_FEATURES = 11  # beside three per curve
+TIME_SCALE_FRAMES = 48.0
+
+
+# --- Score networks ---------------------------------------------------------------------------------------------------
+#
+# How much each frame deserves to be a keyframe, per channel group. `ScoreNetwork` is the paper's: it looks at the
+# motion once, and the k highest scores are the keyframes. Scores of smooth motion are smooth, so the k highest are
+# neighbours. `ConditionalScore` is ours, because of that: the same network, called again at every one of the k steps
+# with the frames already chosen and the number still to come. Next to a chosen frame no error is left to explain, so
+# keyframes cannot cluster.
+
+
+class ScoreNetwork(nn.Module):
+    """Phi_score: 1-D convolution, linear, sinusoidal positions, transformer encoder -> logits s of equation (4)."""
+
+    def __init__(self, inputs: int, outputs: int, width: int, heads: int, layers: int = 2) -> None:
+        super().__init__()
+        self.width = width
+        self.conv = nn.Conv1d(inputs, width, kernel_size=5, padding=2)
+        self.linear = nn.Linear(width, width)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        self.out = nn.Linear(width, outputs)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Return logits (B, T, outputs) of (B, T, inputs): in the paper standardised motion, one output per group."""
+        x = self.linear(self.conv(seen.transpose(1, 2)).transpose(1, 2))
+        x = x + sinusoidal(x.shape[1], self.width).to(x)
+        for block in self.blocks:
+            x = block(x)
+        out: Tensor = self.out(self.norm(x))
+        return out
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """N windows of one group's channels, sample by sample, to choose keyframes for.
+
+    Attributes:
+        curves: (N, T, P) the first principal curves of the group in this window; all of it when P channels suffice.
+        cost: errors of its stretches over all channels. Both in units of the window's own deviation.
+    """
+
+    curves: Tensor
+    cost: Segments
+
+    def __getitem__(self, rows: Tensor) -> Tracks:
+        cost = Segments(self.cost.inside[rows], self.cost.before[rows], self.cost.after[rows])
+        return Tracks(self.curves[rows], cost)
+
+
+@torch.no_grad()
+def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
+    """Return the tracks of motion (B, T, C) with groups member (G, C), `most` principal curves each."""
+    centred = motion - motion.mean(1, keepdim=True)
+    curves, costs = [], []
+    for row in member:
+        own = centred[..., row > 0.5]  # (B, T, c)
+        own = own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None]
+        curves.append(_principal(own, most))
+        cost = segments(own.double() @ own.double().transpose(1, 2))
+        costs.append((cost.inside.float(), cost.before.float(), cost.after.float()))
+    parts = [torch.stack(part, 1).flatten(0, 1) for part in zip(*costs, strict=True)]
+    return Tracks(torch.stack(curves, 1).flatten(0, 1), Segments(*parts))
+
+
+def _principal(own: Tensor, most: int) -> Tensor:
+    """Return the first principal curves (B, T, most) of centred channels (B, T, c), zeros where c is smaller."""
+    channels = own.shape[-1]
+    if channels > 1:  # in double precision, which autocast leaves alone
+        wide = own.double()
+        axes = torch.linalg.eigh(wide.transpose(1, 2) @ wide).eigenvectors  # ascending
+        own = (wide @ axes.flip(-1)[..., :most]).to(own.dtype)
+    return F.pad(own, (0, most - own.shape[-1]))
+
+
+class ConditionalScore(nn.Module):
+    """Logits of the next keyframe of a track, given those already chosen; one network for all groups."""
+
+    def __init__(self, largest_group: int, width: int, heads: int, layers: int) -> None:
+        super().__init__()
+        self.curves = min(MOST_CURVES, largest_group)
+        self.network = ScoreNetwork(3 * self.curves + STATE_FEATURES, 1, width, heads, layers)
+
+    def forward(self, track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
+        """Return logits (N, T), minus infinity where a frame is already `chosen` (N, T).
+
+        `remaining` (N,): keyframes still to choose, this one included.
+        """
+        logits: Tensor = self.network(_features(track, chosen, remaining))[..., 0]
+        return logits.masked_fill(chosen > 0.5, -torch.inf)
+
+
+def _features(track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
+    """Return (N, T, 3 P + STATE_FEATURES): the motion, its interpolation between chosen frames, and the rest."""
+    curves = track.curves
+    near = Neighbours.in_mask(chosen[..., None])
+    drawn = near.interpolate((curves * chosen[..., None])[:, :, None])[:, :, 0]
+    missing = curves - drawn
+    left = missing.square().sum(-1)  # (N, T)
+    rms = left.mean(1).sqrt().clamp(min=STILL)[:, None]
+    place = (near.since / TIME_SCALE_FRAMES, near.until / TIME_SCALE_FRAMES, near.has_before, near.has_after)
+    now, then = stretch_errors(track.cost, chosen)
+    total = left.sum(1, keepdim=True).clamp(min=STILL)
+    gain = torch.where(now.isfinite(), now - then, then) / total  # error that this frame would remove
+    rest = torch.where(now.isfinite(), then / now.clamp(min=STILL), 0.0).clamp(max=2.0)  # and the share it would leave
+    count = remaining.float()
+    told = (torch.zeros_like(count), count.log() / 2, 1 / count)  # the first is always 0: weights have a row for it
+    frames = [chosen, rms.log().expand_as(chosen) / 3, *(one.float()[..., 0] for one in place)]
+    frames += [one[:, None].expand_as(chosen) for one in told]
+    frames += [torch.asinh(3 * gain), rest]
+    return torch.cat([curves, drawn, missing / rms[..., None], torch.stack(frames, dim=-1)], dim=-1)
+
+
+def stretch_errors(cost: Segments, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the error of the stretch around each frame, and of its two parts if the frame were chosen, both (N, T).
+
+    The first is infinite where no frame is chosen yet.
+    """
+    t = chosen.shape[1]
+    frame = torch.arange(t, device=chosen.device).expand(chosen.shape)
+    key = chosen > 0.5
+    last = F.pad(torch.where(key, frame, -1).cummax(1).values[:, :-1], (1, 0), value=-1)  # strictly before
+    following = torch.where(key, frame, t).flip(1).cummin(1).values.flip(1)
+    following = F.pad(following[:, 1:], (0, 1), value=t)  # strictly after
+    i, j = last.clamp(min=0), following.clamp(max=t - 1)
+    left = torch.where(last >= 0, cost.inside.gather(1, i[:, None])[:, 0], cost.before)
+    right = torch.where(following < t, cost.inside.gather(2, j[..., None])[..., 0], cost.after)
+    across = cost.inside.flatten(1).gather(1, i * t + j)
+    now = torch.where(last < 0, cost.before.gather(1, j), torch.where(following >= t, cost.after.gather(1, i), across))
+    return now.masked_fill((last < 0) & (following >= t), torch.inf), left + right
+
+
+# --- Placement --------------------------------------------------------------------------------------------------------
 
 
 def place(
@@ -39,11 +184,20 @@ def place(
     costs: Sequence[float] = (),
     ramp: int | None = None,
 ) -> Tensor:
-    """Keyframe mask (B, T, G) of motion (B, T, C), deterministic: what encoding uses.
+    """Return a keyframe mask (B, T, G) of motion (B, T, C), deterministic, as encoding uses it.
 
-    `score` is what the learned strategies ask; `max_gap` bounds `exact` and `penalised`, which asks the `costs` of a
-    keyframe per group and the `ramp` of interpolation in place of k; `sweeps` improve `learned`. Raises ValueError when
-    a strategy has no score network of its kind, or k does not fit the frames.
+    Args:
+        motion: standardised.
+        k: keyframes of each group; not used by `penalised`.
+        strategy: see the module.
+        member: (G, C), 1 where a channel belongs to a group.
+        score: network of the learned strategies.
+        max_gap: bounds `exact` and `penalised`.
+        sweeps: rounds of `sweep` that improve `learned`.
+        costs: of a keyframe per group, for `penalised`.
+        ramp: of the interpolation, for `penalised`.
+
+    Raises ValueError when a strategy has no score network of its kind, or k does not fit the frames.
     """
     if strategy == "penalised":
         return place_penalised(motion, costs, member, max_gap, ramp)
@@ -61,7 +215,7 @@ def place(
 
 
 def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> Tensor:
-    """Evenly placed keyframes, the same for every sample."""
+    """Return evenly placed keyframes, the same for every sample."""
     b, t, _ = motion.shape
     mask = motion.new_zeros(b, t, len(k))
     for group, count in enumerate(k):
@@ -74,58 +228,8 @@ def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> T
     return mask
 
 
-def place_learned(
-    scores: Tensor, k: Sequence[int], temperature: float = 0.0, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """Gumbel top-k by Algorithm 1: (mask, relaxed), both (B, T, G).
-
-    The mask is exactly k-hot going forward and carries the gradient of the relaxed one (line 18). Temperature 0 is
-    evaluation: the k largest scores, no noise, no gradient.
-    """
-    if temperature == 0.0:
-        hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
-        return hard, hard
-    source = scores.device if generator is None else generator.device
-    uniform = torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
-    noisy = scores - torch.log(-torch.log(uniform))  # lines 3 to 6
-    relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
-    hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
-    return hard - relaxed.detach() + relaxed, relaxed  # line 18
-
-
-def _relaxed_k_hot(noisy: Tensor, count: int, temperature: float) -> Tensor:
-    """Lines 7 to 13: k softmaxes, each taking out what the ones before have chosen."""
-    k_hot, one_hot = torch.zeros_like(noisy), torch.zeros_like(noisy)
-    for _ in range(count):
-        noisy = noisy + torch.log(torch.clamp(1.0 - one_hot, min=EPSILON))  # lines 9, 10
-        one_hot = torch.softmax(noisy / temperature, dim=-1)
-        k_hot = k_hot + one_hot
-    return k_hot
-
-
-def _top_k(scores: Tensor, count: int) -> Tensor:
-    _check(count, scores.shape[-1])
-    return torch.zeros_like(scores).scatter(-1, scores.topk(count, dim=-1).indices, 1.0)
-
-
-@torch.no_grad()
-def place_conditional(
-    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, sweeps: int = 0
-) -> Tensor:
-    """Mask of the highest conditional scores, one keyframe after another, then `sweeps` rounds of second thoughts."""
-    b, t, _ = motion.shape
-    for count in k:
-        _check(count, t)
-    track = tracks(motion, member, score.curves)
-    counts = torch.tensor(k, device=motion.device).repeat(b)
-    mask = choose(score, track, counts)
-    for number in range(sweeps):
-        mask = sweep(score, track, mask, together=1 + number % 2)
-    return mask.view(b, len(k), t).transpose(1, 2).contiguous()
-
-
 def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int | None = None) -> Tensor:
-    """The mask with the least squared error of linear interpolation between keyframes, held at both ends.
+    """Return the mask with the least squared error of linear interpolation between keyframes, held at both ends.
 
     Args:
         motion: (B, T, C); scale the channels by how much each matters.
@@ -151,16 +255,69 @@ def _check(count: int, frames: int, max_gap: int | None = None) -> None:
         raise ValueError(f"{count} keyframes at most {max_gap} frames apart do not span {frames} frames")
 
 
+# --- Algorithm 1 ------------------------------------------------------------------------------------------------------
+
+
+def place_learned(
+    scores: Tensor, k: Sequence[int], temperature: float = 0.0, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return (mask, relaxed mask), both (B, T, G), of scores (B, T, G): Gumbel top-k by Algorithm 1.
+
+    The mask is exactly k-hot going forward and carries the gradient of the relaxed one (line 18). Temperature 0 is
+    evaluation: the k largest scores, no noise, no gradient.
+    """
+    if temperature == 0.0:
+        hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
+        return hard, hard
+    source = scores.device if generator is None else generator.device
+    uniform = torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
+    noisy = scores - torch.log(-torch.log(uniform))  # lines 3 to 6: s_i + g_i, equation (6)
+    relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
+    hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
+    return hard - relaxed.detach() + relaxed, relaxed  # line 18
+
+
+def _relaxed_k_hot(noisy: Tensor, count: int, temperature: float) -> Tensor:
+    """Return the sum of k softmaxes, each without what the ones before have chosen (lines 7 to 13)."""
+    k_hot, one_hot = torch.zeros_like(noisy), torch.zeros_like(noisy)
+    for _ in range(count):
+        noisy = noisy + torch.log(torch.clamp(1.0 - one_hot, min=EPSILON))  # lines 9, 10
+        one_hot = torch.softmax(noisy / temperature, dim=-1)  # line 11
+        k_hot = k_hot + one_hot  # line 12
+    return k_hot
+
+
+def _top_k(scores: Tensor, count: int) -> Tensor:
+    _check(count, scores.shape[-1])
+    return torch.zeros_like(scores).scatter(-1, scores.topk(count, dim=-1).indices, 1.0)
+
+
 # --- One keyframe after another ---------------------------------------------------------------------------------------
 #
-# Keyframes chosen one by one by conditional scores, then each chosen again once all are there. This is Algorithm 1 of
-# the paper with one change: its lines 9 and 10 remove the frame just chosen from the same scores; here the scores are
-# computed again at each of the k steps, with the number of keyframes that are still to come.
+# Keyframes chosen one by one by conditional scores, then each chosen again once all are there. This is Algorithm 1 with
+# one change, ours: its lines 9 and 10 remove the frame just chosen from the same scores; here the scores are computed
+# again at each of the k steps.
+
+
+@torch.no_grad()
+def place_conditional(
+    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, sweeps: int = 0
+) -> Tensor:
+    """Return the mask of the highest conditional scores, one keyframe after another, improved by rounds of `sweep`."""
+    b, t, _ = motion.shape
+    for count in k:
+        _check(count, t)
+    track = tracks(motion, member, score.curves)
+    counts = torch.tensor(k, device=motion.device).repeat(b)
+    mask = choose(score, track, counts)
+    for number in range(sweeps):
+        mask = sweep(score, track, mask, together=1 + number % 2)
+    return mask.view(b, len(k), t).transpose(1, 2).contiguous()
 
 
 @torch.no_grad()
 def choose(score: ConditionalScore, track: Tracks, k: Tensor) -> Tensor:
-    """Mask (N, T) of k (N,) keyframes of each track, one at a time, the highest score each time."""
+    """Return the mask (N, T) of k (N,) keyframes of each track, one at a time, the highest score each time."""
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
     for step in range(int(k.max())):
@@ -172,7 +329,7 @@ def choose(score: ConditionalScore, track: Tracks, k: Tensor) -> Tensor:
 
 @torch.no_grad()
 def sweep(score: ConditionalScore, track: Tracks, mask: Tensor, together: int = 1) -> Tensor:
-    """Take out `together` neighbouring keyframes of a mask (N, T) at a time, left to right, and choose them anew.
+    """Take out `together` neighbouring keyframes of a mask (N, T) at a time, left to right, and choose them again.
 
     A change is kept where it makes the error of linear interpolation smaller, so a sweep never makes a mask worse.
     """
@@ -192,107 +349,3 @@ def sweep(score: ConditionalScore, track: Tracks, mask: Tensor, together: int = 
         mask = torch.where(better[:, None], redone, mask)
         cost = torch.where(better, new, cost)
     return mask
-
-
-# --- As many keyframes as pay -----------------------------------------------------------------------------------------
-#
-# The least squared error of interpolation plus a cost per keyframe, by dynamic programming.
-#
-# The paper gives every window its number of keyframes. Motion far away then decides what is placed here: a nod takes
-# keyframes from the stillness around it and from the next second's smile. With a cost (lambda) a keyframe stands
-# where it saves more than that, wherever the others stand: none in stillness except those that `max_gap` requires,
-# many in a nod, and the two sides of a keyframe that two motions share are placed alike.
-#
-#     best[j] = cost + min(before[j], min_i best[i] + stretch[i, j])
-#
-# `stretch[i, j]` is the error between keyframes i and j of `Neighbours.interpolate`: keyframe i is held until `ramp`
-# frames before j, then a straight line. A stream draws its keyframes a few frames ahead, so it cannot begin a line
-# earlier than that; if labels could, the motion shown would jump onto the line when its end is drawn.
-#
-# With b = j - r the frame where the line begins, r = min(ramp, j - i), and sums over the frames of the stretch
-#
-#     stretch[i, j] = sum |x_s|^2 - 2 x_i . (sum of x_s, each as far as i tells it) - 2 x_j . (likewise) + norms
-#
-# of which all but one product x_i . y_r[j] belongs to i or to j alone: a stretch costs one dot product.
-
-
-@torch.no_grad()
-def place_penalised(
-    motion: Tensor, costs: Sequence[float], member: Tensor, max_gap: int | None = None, ramp: int | None = None
-) -> Tensor:
-    """The mask with the least squared error and `costs` per keyframe of each group; at least one keyframe per group.
-
-    Args:
-        motion: (B, T, C); scale the channels by how much each matters.
-        costs: (G,) of a keyframe, above 0, in squared units of the motion summed over a group's channels.
-        member: (G, C), 1 where a channel belongs to a group.
-        max_gap: at most this many frames from one keyframe to the next and to both ends; None for no bound.
-        ramp: see the section's text; None for straight lines all the way.
-    """
-    t = motion.shape[1]
-    gap = t if max_gap is None else min(max_gap, t)
-    cost = np.array(costs, np.float64)
-    if not (cost > 0).all():
-        raise ValueError(f"keyframes cost {list(costs)}: not all above 0")
-    mask = torch.zeros(len(motion), t, len(cost), dtype=motion.dtype)
-    for row, one in enumerate(motion.detach().double().cpu().numpy()):
-        own = [one[:, channels > 0.5] for channels in member.cpu().numpy()]
-        parts = [_stretches(x, gap, ramp) for x in own]
-        before, inside, after = (np.stack(part) for part in zip(*parts, strict=True))
-        for group, frames in enumerate(_cheapest(cost, before, inside, after)):
-            mask[row, frames, group] = 1.0
-    return mask.to(motion.device)
-
-
-def _stretches(x: Doubles, gap: int, ramp: int | None) -> tuple[Doubles, Doubles, Doubles]:
-    """Errors of one track (T, c): held back from each frame to the start (T,); to each frame from the keyframe d frames
-    before it (T, gap), at gap - d; held from each frame to the end (T,). Infinite where the gap is too large.
-    """
-    t = len(x)
-    x = x - x.mean(axis=0)  # sums stay small
-    frame = np.arange(t)
-    norm = (x**2).sum(axis=1)
-    s0, p0, p1 = norm.cumsum(), x.cumsum(axis=0), (x * frame[:, None]).cumsum(axis=0)
-    own = -s0 + 2 * (x * p0).sum(axis=1)  # what belongs to keyframe i alone
-    inside = np.full((t, gap), np.inf)
-    for d in range(1, min(gap, t - 1) + 1):
-        r = d if ramp is None else min(ramp, d)
-        if d == r:  # from here on the same line for all d
-            u = np.arange(1, r + 1) / r
-            ww, mixed, vv = (u**2).sum(), (u * (1 - u)).sum(), ((1 - u) ** 2).sum()
-            begin = np.maximum(frame - r, 0)
-            rising = (p1 - p1[begin] - begin[:, None] * (p0 - p0[begin])) / r  # sum of u x_s
-            y = p0 - rising - mixed * x
-            ends = s0 - 2 * (x * rising).sum(axis=1) + ww * norm
-        i, j = slice(0, t - d), slice(d, t)
-        inside[j, gap - d] = ends[j] + own[i] + (d - r + vv) * norm[i] - 2 * np.einsum("tc,tc->t", x[i], y[j])
-    before = s0 - 2 * (x * p0).sum(axis=1) + (frame + 1) * norm
-    after = s0[-1] - s0 - 2 * (x * (p0[-1] - p0)).sum(axis=1) + (t - 1 - frame) * norm
-    before[frame > gap] = np.inf
-    after[t - 1 - frame > gap] = np.inf
-    return np.maximum(before, 0), np.maximum(inside, 0), np.maximum(after, 0)
-
-
-def _cheapest(cost: Doubles, before: Doubles, inside: Doubles, after: Doubles) -> list[list[int]]:
-    """Keyframes of every group: `cost` (G,), errors as `_stretches` gives them, (G, T), (G, T, gap), (G, T)."""
-    groups, t, gap = inside.shape
-    best = before + cost[:, None]
-    parent = np.full((groups, t), -1)
-    every = np.arange(groups)
-    for j in range(1, t):
-        first = max(0, j - gap)
-        options = best[:, first:j] + inside[:, j, gap - (j - first) :]
-        i = options.argmin(axis=1)
-        total = options[every, i] + cost
-        better = total < best[:, j]
-        best[better, j], parent[better, j] = total[better], first + i[better]
-    last = (best + after).argmin(axis=1)
-    return [_back(parent[group], int(at)) for group, at in enumerate(last)]
-
-
-def _back(parent: np.typing.NDArray[np.intp], at: int) -> list[int]:
-    frames = []
-    while at >= 0:
-        frames.append(at)
-        at = int(parent[at])
-    return frames

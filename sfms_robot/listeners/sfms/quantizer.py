@@ -1,9 +1,11 @@
 """Codes of keyframes (IV-B4): motion of one frame -> one code per channel group -> motion of that frame.
 
-Two kinds of codebook behind one interface. Finite scalar quantization (Mentzer et al. 2023, arXiv:2309.15505): a code
-is a point on a small fixed grid; dimension d of group g has L[g, d] levels, spread evenly over -1..1, and a code's
-index counts the levels in mixed radix, first dimension fastest. Vector quantization (van den Oord et al. 2017,
-arXiv:1711.00937): a code is the nearest of a list of learned vectors, which follow the mean of what they stand for.
+Two kinds of codebook with one interface. Finite scalar quantization (Mentzer et al. 2023, arXiv:2309.15505): a code is
+a point on a small fixed grid; dimension d of group g has L[g, d] levels, spread evenly over -1..1, and the index of a
+code counts the levels in mixed radix, first dimension fastest. Vector quantization (van den Oord et al. 2017,
+arXiv:1711.00937): a code is the nearest of a list of learned vectors, each the running mean of what it stands for.
+
+B batch, T frames, C channels, G groups, D dimensions of a code, V codes of the largest group.
 """
 
 from __future__ import annotations
@@ -17,30 +19,31 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 DECAY = 0.99  # of a vector's running mean, per step
-DEAD = 0.05  # a vector that stands for less than this share of what the average one does begins anew
+DEAD = 0.05  # a vector used less than this share of the average starts again at a keyframe
+HIDDEN = 48  # width of the network of one group
 
 
 def as_levels(levels: Sequence[Sequence[int]]) -> Tensor:
-    """(G, D) integer levels, float for the arithmetic."""
+    """Return integer levels as (G, D) float, for the arithmetic."""
     return torch.tensor(levels, dtype=torch.float32)
 
 
 def quantize(latent: Tensor, levels: Tensor) -> Tensor:
-    """Nearest grid point of tanh(latent), (..., G, D) in -1..1, gradient straight through the rounding."""
-    bounded = torch.tanh(latent)
-    position = (bounded + 1) / 2 * (levels - 1)
+    """Return the nearest grid point of tanh(latent), (..., G, D) in -1..1; the gradient skips the rounding."""
+    bounded = torch.tanh(latent)  # -1..1
+    position = (bounded + 1) / 2 * (levels - 1)  # 0..L - 1
     code = torch.round(position) / (levels - 1) * 2 - 1
-    return bounded + (code - bounded).detach()
+    return bounded + (code - bounded).detach()  # straight through: d code / d bounded = 1
 
 
 def codes_to_indices(codes: Tensor, levels: Tensor, radix: Tensor | None = None) -> Tensor:
-    """(..., G, D) on the grid -> (..., G) int64 in 0..prod(levels) - 1. `radix`: of the levels, if it is at hand."""
+    """Return indices (..., G), 0 to prod(levels) - 1, of codes (..., G, D) on the grid; `radix`: saves computing it."""
     digits = torch.round((codes + 1) / 2 * (levels - 1)).long()
     return (digits * (_radix(levels) if radix is None else radix)).sum(-1)
 
 
 def indices_to_codes(indices: Tensor, levels: Tensor) -> Tensor:
-    """The inverse: (..., G) -> (..., G, D)."""
+    """Return the codes (..., G, D) of indices (..., G)."""
     digits = indices[..., None] // _radix(levels) % levels.long()
     return digits / (levels - 1) * 2 - 1
 
@@ -51,62 +54,54 @@ def _radix(levels: Tensor) -> Tensor:
 
 
 class Grid(nn.Module):
-    """The fixed codebook of finite scalar quantization: nothing to learn."""
-
-    levels: Tensor
-    radix: Tensor
-    table: Tensor
-    first: Tensor
+    """The fixed codebook of finite scalar quantization, which has no parameters."""
 
     def __init__(self, levels: Sequence[Sequence[int]]) -> None:
         super().__init__()
-        self.register_buffer("levels", as_levels(levels), persistent=False)
-        self.register_buffer("radix", _radix(self.levels), persistent=False)
+        self.levels = nn.Buffer(as_levels(levels), persistent=False)
+        self.radix = nn.Buffer(_radix(self.levels), persistent=False)
         every = torch.arange(max(map(math.prod, levels)))[:, None].expand(-1, len(levels))
         table = indices_to_codes(every, self.levels).transpose(0, 1)  # (G, V, D)
-        self.register_buffer("table", table.flatten(0, 1), persistent=False)
-        self.register_buffer("first", torch.arange(len(levels)) * len(every), persistent=False)  # row of each group
+        self.table = nn.Buffer(table.flatten(0, 1), persistent=False)
+        self.first = nn.Buffer(torch.arange(len(levels)) * len(every), persistent=False)  # row of each group
         self.dims = len(levels[0])
 
     def nearest(self, latent: Tensor) -> Tensor:
-        """(..., G, D) -> codes (..., G, D), gradient straight through."""
+        """Return the codes (..., G, D) nearest to a latent; the gradient skips the rounding."""
         return quantize(latent, self.levels)
 
     def indices(self, codes: Tensor) -> Tensor:
-        """(..., G, D) -> (..., G)."""
+        """Return the indices (..., G) of codes (..., G, D)."""
         return codes_to_indices(codes, self.levels, self.radix)
 
     def codes(self, indices: Tensor) -> Tensor:
-        """(..., G) -> (..., G, D)."""
+        """Return the codes (..., G, D) of indices (..., G)."""
         return F.embedding(indices + self.first, self.table)
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
-        """The stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
+        """Return 0 for the stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
         return latent.new_zeros(())
 
 
 class Codebook(nn.Module):
-    """V learned vectors per group. They move only by `learn`, which training calls: encoding never changes them."""
-
-    vectors: Tensor
-    counts: Tensor
-    sizes: Tensor
+    """V learned vectors per group. Only `learn` moves them, which training calls: encoding never changes them."""
 
     def __init__(self, sizes: Sequence[int], dims: int) -> None:
         super().__init__()
         self.dims = dims
-        self.register_buffer("vectors", torch.randn(len(sizes), max(sizes), dims))
-        self.register_buffer("counts", torch.zeros(len(sizes), max(sizes)))  # keyframes a step, running mean
-        self.register_buffer("sizes", torch.tensor(sizes), persistent=False)
+        self.vectors = nn.Buffer(torch.randn(len(sizes), max(sizes), dims))
+        self.counts = nn.Buffer(torch.zeros(len(sizes), max(sizes)))  # keyframes a step, running mean
+        self.sizes = nn.Buffer(torch.tensor(sizes), persistent=False)
 
     def nearest(self, latent: Tensor) -> Tensor:
-        """(..., G, D) -> codes (..., G, D), gradient straight through."""
+        """Return the codes (..., G, D) nearest to a latent; the gradient passes to the latent alone."""
         code = self.codes(self.indices(latent))
         return latent + (code - latent).detach()
 
     @torch.no_grad()
     def indices(self, codes: Tensor) -> Tensor:
-        """(..., G, D), also off the list -> (..., G) of the nearest vectors."""
+        """Return the indices (..., G) of the vectors nearest to (..., G, D), which need not be codes."""
+        # argmin |z - c|^2 of equation (3) = argmin |c|^2 - 2 <z, c>
         flat = codes.detach().float().flatten(0, -3).transpose(0, 1)  # (G, N, D)
         with torch.autocast(codes.device.type, enabled=False):  # nearest is a matter of small differences
             distance = self.vectors.square().sum(-1)[:, None] - 2 * flat @ self.vectors.transpose(1, 2)
@@ -115,21 +110,22 @@ class Codebook(nn.Module):
         return found.transpose(0, 1).view(codes.shape[:-1])
 
     def codes(self, indices: Tensor) -> Tensor:
-        """(..., G) -> (..., G, D)."""
+        """Return the codes (..., G, D) of indices (..., G)."""
         return self.vectors[torch.arange(len(self.sizes), device=indices.device), indices]
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
-        """||sg[z_q] - E(z)||^2 of equation (13) at the keyframes; `learn` minimises ||sg[E(z)] - z_q||^2 by itself."""
+        """Return ||sg[z_q] - E(z)||^2 of equation (13) at keyframes; `learn` minimises ||sg[E(z)] - z_q||^2."""
         away = (latent - self.codes(self.indices(latent)).detach()).square().mean(-1)
         return (away * mask).sum() / mask.sum().clamp(min=1.0)
 
     @torch.no_grad()
     def learn(self, latent: Tensor, mask: Tensor, generator: torch.Generator) -> None:
-        """Move every vector toward the mean of the keyframes it stands for, and put idle ones where a keyframe is.
+        """Move every vector toward the mean of the keyframes it stands for, and idle ones to a keyframe.
 
         Args:
-            latent: (B, T, G, D) encoded motion; mask: (B, T, G), only keyframes are learned from (IV-B4).
-            generator: draws, on the CPU, the keyframes at which idle vectors begin anew.
+            latent: (B, T, G, D) encoded motion.
+            mask: (B, T, G); only keyframes are learned from (IV-B4).
+            generator: draws, on the CPU, the keyframes at which idle vectors start again.
         """
         groups, most = self.counts.shape
         key = (mask > 0.5).flatten(0, 1)  # (N, G)
@@ -138,6 +134,7 @@ class Codebook(nn.Module):
         now = chosen.sum(0)
         with torch.autocast(latent.device.type, enabled=False):
             mean = torch.einsum("ngv,ngd->gvd", chosen, flat) / now.clamp(min=1.0)[..., None]
+        # Running sums of keyframes and of their vectors, as in VQ-VAE-2: c = sums / counts.
         counts = DECAY * self.counts + (1 - DECAY) * now
         share = ((1 - DECAY) * now / counts.clamp(min=1e-9))[..., None]  # weight of this step in the running mean
         self.vectors.lerp_(mean, share.clamp(max=1.0))
@@ -149,22 +146,22 @@ class Codebook(nn.Module):
                 continue
             drawn = torch.randint(len(seen), (len(idle),), generator=generator).to(seen.device)
             self.vectors[group, idle] = seen[drawn]
-            counts[group, idle] = average  # time to prove itself
+            counts[group, idle] = average  # as if it had been used, so that it is not idle again at once
         self.counts.copy_(counts)
 
 
 class GroupMLP(nn.Module):
-    """One two-layer network per group, all groups at once: no group sees another's input."""
+    """One two-layer network per group, all groups at once; a group does not see the input of another."""
 
-    def __init__(self, groups: int, inputs: int, hidden: int, outputs: int) -> None:
+    def __init__(self, groups: int, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.w1 = nn.Parameter(torch.randn(groups, inputs, hidden) / math.sqrt(inputs))
-        self.b1 = nn.Parameter(torch.zeros(groups, hidden))
-        self.w2 = nn.Parameter(torch.randn(groups, hidden, outputs) / math.sqrt(hidden))
+        self.w1 = nn.Parameter(torch.randn(groups, inputs, HIDDEN) / math.sqrt(inputs))
+        self.b1 = nn.Parameter(torch.zeros(groups, HIDDEN))
+        self.w2 = nn.Parameter(torch.randn(groups, HIDDEN, outputs) / math.sqrt(HIDDEN))
         self.b2 = nn.Parameter(torch.zeros(groups, outputs))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, T, G, inputs) -> (B, T, G, outputs)."""
+        """Return (B, T, G, outputs) of (B, T, G, inputs)."""
         b, t, g, _ = x.shape
         rows = x.permute(2, 0, 1, 3).flatten(1, 2)  # (G, B * T, inputs): a product of matrices for each group
         y = F.gelu(rows @ self.w1 + self.b1[:, None]) @ self.w2 + self.b2[:, None]
@@ -172,68 +169,59 @@ class GroupMLP(nn.Module):
 
 
 class Quantizer(nn.Module):
-    """Encoder, codebook and decoder of single frames. Frames do not see each other, groups do not either."""
+    """Encoder, codebook and decoder of single frames: E, D and VQ of equation (3). Frames and groups are independent.
 
-    member: Tensor
-    drawn: Tensor
-    slots: Tensor
-    filled: Tensor
-    owner: Tensor
-    place: Tensor
-    levels: Tensor
+    Ours: channels are cut into groups, each with separate keyframes and codes; the paper has one code per frame.
+    """
 
     def __init__(
-        self,
-        member: Tensor,
-        levels: Sequence[Sequence[int]],
-        kind: Literal["fsq", "vq"] = "fsq",
-        dims: int = 4,
-        hidden: int = 48,
+        self, member: Tensor, levels: Sequence[Sequence[int]], kind: Literal["fsq", "vq"] = "fsq", dims: int = 4
     ) -> None:
-        """`member` (G, C): 1 where channel c belongs to group g; `levels` of a group multiply to its codes.
+        """Make one for groups `member` (G, C), 1 where a channel belongs to a group, with prod(levels) codes each.
 
-        A channel of no group is not drawn: it stays 0.
+        A channel of no group is not drawn: it stays 0. `dims` are those of a learned codebook.
         """
         super().__init__()
         groups, _ = member.shape
         own = [row.nonzero()[:, 0] for row in member]
         most = max(map(len, own))
-        self.register_buffer("member", member, persistent=False)
-        self.register_buffer("drawn", member.amax(0), persistent=False)
-        self.register_buffer("levels", as_levels(levels), persistent=False)
+        self.member = nn.Buffer(member, persistent=False)
+        self.drawn = nn.Buffer(member.amax(0), persistent=False)
+        self.levels = nn.Buffer(as_levels(levels), persistent=False)
         # Each group's channels in slots 0..: with a group per channel a full (G, C) matrix would be zeros but for 1/C.
-        self.register_buffer("slots", torch.stack([F.pad(c, (0, most - len(c))) for c in own]), persistent=False)
-        self.register_buffer("filled", torch.stack([(torch.arange(most) < len(c)).float() for c in own]), False)
-        self.register_buffer("owner", member.argmax(0), persistent=False)
+        slots = torch.stack([F.pad(channels, (0, most - len(channels))) for channels in own])
+        filled = torch.stack([(torch.arange(most) < len(channels)).float() for channels in own])
+        self.slots, self.filled = nn.Buffer(slots, persistent=False), nn.Buffer(filled, persistent=False)  # (G, most)
         slot = ((member.cumsum(-1) * member).amax(0).long() - 1).clamp(min=0)
-        self.register_buffer("place", self.owner * most + slot, persistent=False)  # of a channel in all slots
+        self.owner = nn.Buffer(member.argmax(0), persistent=False)  # (C,) group of a channel
+        self.place = nn.Buffer(self.owner * most + slot, persistent=False)  # (C,) of a channel in all slots
         sizes = [math.prod(row) for row in levels]
         self.codebook: Grid | Codebook = Grid(levels) if kind == "fsq" else Codebook(sizes, dims)
         self.dims = self.codebook.dims
-        self.encoder = GroupMLP(groups, most, hidden, self.dims)
-        self.decoder = GroupMLP(groups, self.dims, hidden, most)
+        self.encoder = GroupMLP(groups, most, self.dims)
+        self.decoder = GroupMLP(groups, self.dims, most)
 
     def latent(self, motion: Tensor) -> Tensor:
-        """(B, T, C) standardised -> (B, T, G, D), not yet codes."""
+        """Return (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""
         out: Tensor = self.encoder(motion[..., self.slots] * self.filled)
         return out
 
     def encode(self, motion: Tensor) -> Tensor:
-        """(B, T, C) standardised -> codes (B, T, G, D) of the codebook."""
+        """Return codes (B, T, G, D) of the codebook of standardised motion (B, T, C)."""
         return self.codebook.nearest(self.latent(motion))
 
     def decode(self, codes: Tensor) -> Tensor:
-        """(B, T, G, D) -> (B, T, C): each channel from its own group's code."""
+        """Return motion (B, T, C) of codes (B, T, G, D): each channel from the code of its group."""
         return self.by_channel(self.decoder(codes))
 
     def by_channel(self, slots: Tensor) -> Tensor:
-        """What `decoder` makes, (..., G, slots of a group), in the order of channels (..., C)."""
+        """Return the output of `decoder`, (..., G, slots of a group), in the order of channels (..., C)."""
         return slots.flatten(-2).index_select(-1, self.place) * self.drawn
 
     def indices(self, codes: Tensor) -> Tensor:
-        """Codes (..., G, D) -> (..., G) from 0."""
+        """Return the indices (..., G), from 0, of codes (..., G, D)."""
         return self.codebook.indices(codes)
 
     def codes(self, indices: Tensor) -> Tensor:
-        """The inverse."""
+        """Return the codes (..., G, D) of indices (..., G)."""
         return self.codebook.codes(indices)

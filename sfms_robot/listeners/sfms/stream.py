@@ -1,13 +1,10 @@
-"""SFMS as it runs: one speaker frame in, and on every `hop`-th a plan of the next 8 frames out.
+"""SFMS as it runs: one speaker frame in, and on every `hop`-th a plan of the next 8 frames out. numpy only.
 
-Tokens once drawn stay drawn while what they were drawn for holds: a new plan keeps what is left of the one before and
-draws only the `hop` frames at its far end. So a keyframe is decided (future - hop) to future frames ahead, 0.16 to
-0.32 s with hop 4, and re-planning cannot jitter. A listener that is told of events compares what it is told now with
-what the tokens were drawn under: from the first future frame on for which that differs they are drawn anew, but never
-the next frame's, which servos are already under way to. Frames that are kept show what they showed: the way to a
-keyframe behind them begins at the last of them. What is behind the last keyframe drawn is an extrapolation,
-which the next plan may correct: it starts where the motion was, at the speed it had, and the difference fades over
-`seam_frames`.
+A new plan keeps the tokens that are left of the one before and draws only the `hop` frames at its far end. So a
+keyframe is decided (future - hop) to future frames ahead, 0.16 to 0.32 s with hop 4, and planning again cannot jitter.
+Only an event that is decided meanwhile calls tokens off: `draw` shows the window as a timeline. Motion behind the last
+keyframe drawn is an extrapolation, which the next plan may correct: it starts where the motion was, at the speed it
+had, and the difference fades over `seam_frames` (`join`).
 
 Between plans nothing is computed: frames are kept, and become features with the next plan, all of them at once.
 """
@@ -24,10 +21,8 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.frames import (
-    AUDIO_HZ,
     CHANNEL_INDEX,
     FRAME_S,
-    FRAME_SAMPLES,
     MOTION_DIM,
     SMILE_CORNERS,
     Doubles,
@@ -36,30 +31,41 @@ from sfms_robot.frames import (
     SpeakerFrame,
     changed,
 )
+from sfms_robot.listeners.audio_frontend import AudioFrontend, AudioState, check_length
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HEAD, HeadSway
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend, AudioState
-from sfms_robot.listeners.sfms.draw import Reach, Sampler, Seen, ToldCourse
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, Tokens, around, later, neutral_mask, passed, revoked
+from sfms_robot.listeners.sfms.draw import (
+    UNDECIDED,
+    CodeReach,
+    EventCourse,
+    PlanInputs,
+    Sampler,
+    Tokens,
+    around,
+    later,
+    neutral_mask,
+    passed,
+    revoked,
+)
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 
 _NO_FACE: Final = np.full(MOTION_DIM, np.nan, np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SpeakerState:
-    """The speaker's last P frames up to the newest plan, the newest last, as `draw.Seen` wants them (no batch); and
-    what was heard since then, which becomes features with the next plan, all of it at once.
+    """The speaker's last P frames up to the newest plan, the newest last, and the frames since then.
 
     Attributes:
         sounds, faces: of every frame since: its samples, and its motion (58,), NaN where no face is known.
-        audio: what unfinished features still need.
+        audio: state of unfinished features.
         rows: (R, bins) sound of the newest of the P frames, standardised.
+        voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.PlanInputs`.
     """
 
-    sounds: tuple[Floats, ...]
-    faces: tuple[Floats, ...]
+    sounds: tuple[Floats, ...] = ()
+    faces: tuple[Floats, ...] = ()
     audio: AudioState
     rows: Floats
     voice: Floats
@@ -69,18 +75,18 @@ class SpeakerState:
     face_known: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Memory:
-    """What one stream remembers; values only: a step makes a new one. All but `frames` is as of the newest plan.
+@dataclass(frozen=True, kw_only=True)
+class SfmsMemory:
+    """Memory of one stream; values only: a step makes a new one. All but `frames` is as of the newest plan.
 
     Attributes:
-        seed: what it draws hangs on it (`lots`).
-        frames: how many have been heard.
-        speaker: of the last P frames.
-        tokens: (P + H, G) own tokens up to then, those drawn for the future, UNDECIDED.
-        control: (P + H, K) what was told of each of those frames when they were drawn.
+        seed: of all its random numbers (`stream_rng`).
+        frames: how many it has taken.
+        speaker: the last P frames.
+        tokens: (P + H, G) own tokens: past, drawn for the future, UNDECIDED.
+        control: (P + H, K) control rows that they were drawn under.
         path: (2 + H, C) standardised: the frame before, the frame itself, then the plan in force.
-        sway: this stream's own (`HeadSway.start`).
+        sway: of this stream (`HeadSway.start`).
     """
 
     seed: int
@@ -93,7 +99,7 @@ class Memory:
 
 
 class SfmsListener(RunsOnEngine):
-    """`ports.BatchListener`. Holds weights only: its engine does, which runs `networks`."""
+    """A `ports.BatchListener`. It has no state but the weights, which its engine holds (networks: `model.networks`)."""
 
     def __init__(
         self,
@@ -111,68 +117,66 @@ class SfmsListener(RunsOnEngine):
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
-        # Behind the last keyframe is what it was: then one that leaves the window has to be held on to.
+        # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
         mask = neutral_mask(settings.past_frames, len(settings.groups))
-        neutral, codes = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
+        neutral, (codes,) = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
         self._neutral = neutral[0]
         groups = settings.groups.values()
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
-        reach = Reach(codes[0], own, sizes, self._scales["motion_speed"], bounded)
-        self.sampler = Sampler(settings, engine, reach, self._courses(codes[0]))
+        reach = CodeReach(codes, own, sizes, self._scales["motion_speed"], bounded)
+        self.sampler = Sampler(settings, engine, reach, self._courses(codes))
 
-    def _courses(self, codes: Floats) -> list[ToldCourse]:
-        """That this listener keeps to, of the standardised motion (V, C) of every code."""
-        sampling, found = self.settings.sampling, []
-        for how, name, shown in (
+    def _courses(self, codes: Floats) -> list[EventCourse]:
+        """Return the courses that this listener keeps to; `codes` (V, C): standardised motion of every code."""
+        sampling = self.settings.sampling
+        courses = []
+        for how, group, shown in (
             (sampling.nod, self.settings.nodding_group, ("pitch",)),
             (sampling.smile, self.settings.smiling_group, SMILE_CORNERS),
         ):
-            if how is not None and name is not None:
-                found.append(
-                    ToldCourse(how, list(self.settings.groups).index(name), self._shown_by(codes, name, shown))
-                )
-        return found
-
-    def _shown_by(self, codes: Floats, group: str, shown: Sequence[str]) -> Doubles:
-        """What every code (V, C) of a group makes of these channels of our motion, in the mean, on a face at rest."""
-        own = [self.settings.channels.index(name) for name in self.settings.groups[group].channels]
-        rows = self._still(self.settings.groups[group].codes)
-        rows[:, own] = codes[: len(rows), own]
-        motion, _ = self.space.decode(rows * self._scales["motion_std"] + self._scales["motion_mean"])
-        return np.asarray(motion[:, [CHANNEL_INDEX[name] for name in shown]].mean(axis=1), np.float64)
+            if how is None or group is None:
+                continue
+            # The mean that each code of the group makes of the channels shown, on a face at rest.
+            own = [self.settings.channels.index(name) for name in self.settings.groups[group].channels]
+            rows = self._still(self.settings.groups[group].codes)
+            rows[:, own] = codes[: len(rows), own]
+            motion, _ = self.space.decode(rows * self._scales["motion_std"] + self._scales["motion_mean"])
+            values = np.asarray(motion[:, [CHANNEL_INDEX[name] for name in shown]].mean(axis=1), np.float64)
+            courses.append(EventCourse(how, list(self.settings.groups).index(group), values))
+        return courses
 
     @property
     def hop(self) -> int:
+        """Return the frames from one plan to the next."""
         return self.settings.hop_frames
 
     @property
     def hops(self) -> Sequence[int]:
-        """Those that `at_hop` may be asked for."""
+        """Return the hops that `at_hop` takes."""
         return range(1, self.horizon + 1) if self.settings.hop == "auto" else (self.hop,)
 
     def at_hop(self, hop: int) -> SfmsListener:
-        """The same weights, planning every `hop` frames."""
+        """Return a listener of the same weights that plans every `hop` frames."""
         other = copy.copy(self)
         other.settings = self.settings.model_copy(update={"hop": hop})
         return other
 
     @property
     def horizon(self) -> int:
+        """Return the frames of a plan."""
         return self.settings.future_frames
 
     @property
     def control_frames(self) -> tuple[int, int]:
-        """How many frames up to the newest heard, and how many after it, `step` wants to be told of; none without."""
+        """Return how many control rows `step` takes, up to the newest frame and after it; (0, 0) without events."""
         return (self.settings.past_frames, self.horizon) if self._columns else (0, 0)
 
-    def start(self, seed: int) -> Memory:
-        """Memory of a stream that has heard nothing and looked neutral so far."""
+    def start(self, seed: int) -> SfmsMemory:
+        """Return the memory of a stream without sound so far and with a neutral face."""
         p = self.settings.past_frames
         speaker = SpeakerState(
-            sounds=(),
-            faces=(),
             audio=self.frontend.start(),
             rows=np.zeros(self.frontend.shape, np.float32),
             voice=np.zeros((p, self.settings.predictor_width), np.float32),
@@ -183,22 +187,25 @@ class SfmsListener(RunsOnEngine):
         )
         tokens, path = self.at_rest()
         control = np.zeros((len(tokens), self._columns), np.float32)
-        return Memory(seed, 0, speaker, tokens, control, path, self.sway.start(seed))
+        sway = self.sway.start(seed)
+        return SfmsMemory(seed=seed, frames=0, speaker=speaker, tokens=tokens, control=control, path=path, sway=sway)
 
     def at_rest(self) -> tuple[Tokens, Floats]:
-        """Tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
+        """Return tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
-    def is_due(self, memory: Memory) -> bool:
-        """Whether the next frame brings a plan."""
+    def is_due(self, memory: SfmsMemory) -> bool:
+        """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
 
-    def step(self, speaker: SpeakerFrame, memory: Memory, control: Floats | None = None) -> tuple[Plan | None, Memory]:
+    def step(
+        self, speaker: SpeakerFrame, memory: SfmsMemory, control: Floats | None = None
+    ) -> tuple[Plan | None, SfmsMemory]:
         """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
 
         `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None
-        for a listener that is not told of events, and for a frame that brings no plan.
+        without events, and for a frame that brings no plan.
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """
@@ -207,169 +214,182 @@ class SfmsListener(RunsOnEngine):
     def step_each(
         self,
         speakers: Sequence[SpeakerFrame],
-        memories: Sequence[Memory],
+        memories: Sequence[SfmsMemory],
         controls: Sequence[Floats | None] | None = None,
-    ) -> list[tuple[Plan | None, Memory]]:
-        """See `ports.BatchListener`; controls as of `step`. Those that are due are planned together."""
+    ) -> list[tuple[Plan | None, SfmsMemory]]:
+        """Step several streams, see `ports.BatchListener`; controls as of `step`. Those due are planned together."""
         heard = [_listened(*each) for each in zip(speakers, [memory.speaker for memory in memories], strict=True)]
-        return self._stepped([frame.time_s for frame in speakers], heard, memories, controls)
+        return self._stepped(speakers, heard, memories, controls)
 
     def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Memory], controls: Sequence[Floats | None] | None = None
-    ) -> tuple[list[Plan], list[Memory]]:
-        """`step` of streams that began together and heard the same speaker ever since; no plans between hops.
+        self, speaker: SpeakerFrame, memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None = None
+    ) -> tuple[list[Plan], list[SfmsMemory]]:
+        """Step streams that began together with the same speaker; return their plans, none between hops.
 
-        As `step_each`, and the speaker is listened to once.
+        As `step_each`, but features of the speaker are computed once.
         """
         heard = [_listened(speaker, memories[0].speaker)] * len(memories)
-        found = self._stepped([speaker.time_s] * len(memories), heard, memories, controls)
+        found = self._stepped([speaker] * len(memories), heard, memories, controls)
         return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
     def _stepped(
         self,
-        times_s: Sequence[float],
+        speakers: Sequence[SpeakerFrame],
         heard: Sequence[SpeakerState],
-        memories: Sequence[Memory],
+        memories: Sequence[SfmsMemory],
         controls: Sequence[Floats | None] | None,
-    ) -> list[tuple[Plan | None, Memory]]:
-        """Every stream one frame on, what its speaker did in it heard already."""
-        found: list[tuple[Plan | None, Memory]] = [
+    ) -> list[tuple[Plan | None, SfmsMemory]]:
+        """Move every stream one frame on; `heard` are their speakers with the new frame."""
+        found: list[tuple[Plan | None, SfmsMemory]] = [
             (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
             for memory, speaker in zip(memories, heard, strict=True)
         ]
-        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]
+        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
-            told = self.told([None if controls is None else controls[row] for row in due])
-            planned = self._planned([times_s[row] for row in due], [found[row][1] for row in due], told)
+            control = self.told([None if controls is None else controls[row] for row in due])
+            planned = self._planned([speakers[row].time_s for row in due], [found[row][1] for row in due], control)
             for row, each in zip(due, planned, strict=True):
                 found[row] = each
         return found
 
-    def _planned(self, times_s: Sequence[float], memories: Sequence[Memory], told: Floats) -> list[tuple[Plan, Memory]]:
-        """Plans of streams that have heard all up to now, told (B, P + H, K), and their memories with them."""
-        tokens, path, control = self._moved_on(memories)
-        speakers, seen = self._taken_in([memory.speaker for memory in memories])
-        tokens, settled = revoked(tokens, control, told, self.horizon)
-        newest = [memory.frames - 1 for memory in memories]
-        window = Seen(**seen, tokens=tokens, control=told, settled=settled)
-        tokens, path = self.plan(window, path, [memory.seed for memory in memories], newest)
-        sway = stacked([memory.sway for memory in memories])
-        plans = self._plans(times_s, self.with_sway(self.shown(path), sway, np.array(newest) + 1))
-        after = [
-            changed(memory, speaker=speaker, tokens=own, control=rows, path=way)
-            for memory, speaker, own, rows, way in zip(memories, speakers, tokens, told, path, strict=True)
-        ]
-        return list(zip(plans, after, strict=True))
-
-    def _moved_on(self, memories: Sequence[Memory]) -> tuple[Tokens, Floats, Floats]:
-        """Tokens, path and control (B, ...) of now, the frames heard since the last plan further on."""
-        tokens, path, control = (
+    def _planned(
+        self, times_s: Sequence[float], memories: Sequence[SfmsMemory], control: Floats
+    ) -> list[tuple[Plan, SfmsMemory]]:
+        """Return plans made at these times by B streams with control (B, P + H, K), and their memories."""
+        tokens, path, drawn_under = (
             stacked([getattr(memory, name) for memory in memories]) for name in ("tokens", "path", "control")
         )
-        since = [len(memory.speaker.sounds) for memory in memories]
-        if len(set(since)) == 1:
-            return *passed(tokens, path, since[0], self.holds), later(control, since[0])
-        for frames in set(since):
-            rows = [row for row, own in enumerate(since) if own == frames]
-            tokens[rows], path[rows] = passed(tokens[rows], path[rows], frames, self.holds)
-            control[rows] = later(control[rows], frames)
-        return tokens, path, control
+        # 1. The window moves on by the frames since the last plan, which differ from stream to stream.
+        since = np.array([len(memory.speaker.sounds) for memory in memories])
+        moved, way, under = np.empty_like(tokens), np.empty_like(path), np.empty_like(drawn_under)
+        for frames in set(since.tolist()):
+            rows = since == frames
+            moved[rows], way[rows] = passed(tokens[rows], path[rows], frames, self.holds)
+            under[rows] = later(drawn_under[rows], frames)
+        # 2. Events that were decided since then call tokens off (`draw.revoked`).
+        tokens, settled = revoked(moved, under, control, self.horizon)
+        # 3. Sound and faces since then become features.
+        speakers, seen = self._taken_in([memory.speaker for memory in memories])
+        newest = [memory.frames - 1 for memory in memories]
+        # 4. Undecided tokens are drawn and decoded.
+        inputs = PlanInputs(**seen, tokens=tokens, control=control, settled=settled)
+        tokens, path = self.plan(inputs, way, [memory.seed for memory in memories], newest)
+        # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
+        sway = stacked([memory.sway for memory in memories])
+        motion, jaw_rad = self.space.decode(
+            self.with_sway(self.shown(path), sway, np.array(newest) + 1).reshape(-1, path.shape[-1])
+        )
+        ahead_s: Doubles = FRAME_S * np.arange(1, self.horizon + 1, dtype=np.float64)
+        found = []
+        for row, (at_s, memory) in enumerate(zip(times_s, memories, strict=True)):
+            own = slice(row * self.horizon, (row + 1) * self.horizon)
+            plan = Plan(at_s, np.add(at_s, ahead_s), motion[own], None if jaw_rad is None else jaw_rad[own])
+            after = changed(memory, speaker=speakers[row], tokens=tokens[row], control=control[row], path=path[row])
+            found.append((plan, after))
+        return found
 
     def told(self, controls: Sequence[Floats | None]) -> Floats:
-        """What the predictor is told of controls as of `step`, (B, P + H, K).
+        """Return controls as of `step` for the predictor, (B, P + H, K).
 
-        Raises ValueError for another shape, and where nothing is told to one that must be.
+        Raises ValueError for another shape, and for None with a listener that needs control.
         """
-        rows = sum(self.control_frames)
+        wanted = (sum(self.control_frames), self._columns)
         if not self._columns and all(one is None for one in controls):
             return np.zeros((len(controls), self.settings.window_frames, 0), np.float32)
-        told = [one for one in controls if one is not None]
-        if len(told) < len(controls):
-            raise ValueError(f"this listener is told of events: control ({rows}, {self._columns}) is missing")
-        if any(one.shape != (rows, self._columns) for one in told):
-            shapes = ", ".join(str(one.shape) for one in told)
-            raise ValueError(f"control has shape {shapes}, not {len(told)} times ({rows}, {self._columns})")
-        return stacked(told).astype(np.float32)
+        given = [one for one in controls if one is not None]
+        if len(given) < len(controls):
+            raise ValueError(f"this listener takes events: control {wanted} is missing")
+        if any(one.shape != wanted for one in given):
+            shapes = ", ".join(str(one.shape) for one in given)
+            raise ValueError(f"control has shape {shapes}, not {len(given)} times {wanted}")
+        return stacked(given).astype(np.float32)
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
-        """Motion (..., N, C), standardised, of frames `first`, `first` + 1, ... -> in the model's space, with the slow
-        motion (..., 3, L, S) of each stream; `first` is of all streams, or (...) of each.
+        """Return motion in the model's space of standardised motion (..., N, C), with the slow motion of the head.
+
+        Args:
+            shown: of frames `first`, `first` + 1, ...
+            sway: (..., 3, L, S) of each stream.
+            first: of all streams, or (...) of each.
         """
         motion = shown * self._scales["motion_std"] + self._scales["motion_mean"]
         return self.sway.added(motion, sway, first)
 
     def shown(self, path: Floats) -> Floats:
-        """Path (..., 2 + H, C) -> what is seen of its future (..., H, C), both standardised: the head is smoothed."""
+        """Return the future (..., H, C) of a path (..., 2 + H, C), standardised, with the head smoothed."""
         if not self.settings.sampling.smoothing:
             return path[..., 2:, :]
+        # x_t + s ((x_(t-1) + x_(t+1)) / 2 - x_t); behind the last frame the motion continues straight.
         beyond = 2 * path[..., -1:, :] - path[..., -2:-1, :]
         before, own = path[..., 1:-1, :], path[..., 2:, :]
         after = np.concatenate([path[..., 3:, :], beyond], axis=-2)
         return np.asarray(own + self._smoothing * ((before + after) / 2 - own))
 
-    def _plans(self, made_at_s: Sequence[float], shown: Floats) -> list[Plan]:
-        """Motion (B, H, C) in the model's space, of plans made at those times."""
-        motion, jaw_rad = self.space.decode(shown.reshape(-1, shown.shape[-1]))
-        motion = motion.reshape(*shown.shape[:2], -1)
-        jaws = [None] * len(shown) if jaw_rad is None else [*jaw_rad.reshape(*shown.shape[:2], -1)]
-        ahead_s: Doubles = FRAME_S * np.arange(1, self.horizon + 1, dtype=np.float64)
-        return [
-            Plan(at_s, np.add(at_s, ahead_s), frames, jaw)
-            for at_s, frames, jaw in zip(made_at_s, motion, jaws, strict=True)
-        ]
+    def plan(
+        self, seen: PlanInputs, path: Floats, seeds: Sequence[int], newest: Sequence[int]
+    ) -> tuple[Tokens, Floats]:
+        """Return the tokens (B, P + H, G) and path (B, 2 + H, C) of a new plan of B streams.
 
-    def plan(self, seen: Seen, path: Floats, seeds: Sequence[int], newest: Sequence[int]) -> tuple[Tokens, Floats]:
-        """New plans of B streams: tokens (B, P + H, G), path (B, 2 + H, C). `path` is the old one, as played so far.
-
-        `newest`: the frame that each has heard last, from 0 at its beginning.
+        Args:
+            seen: inputs of the plan.
+            path: (B, 2 + H, C) the old plan, as played so far.
+            seeds: of each stream.
+            newest: number of the newest frame of each stream, from 0 at its beginning.
         """
         tokens = self.sampler.draw(seen, seeds, [frame + self.horizon for frame in newest])
         (decoded,) = self.engine.run("decode", tokens, *around(tokens))
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
     def voices(self, rows: Floats) -> Floats:
-        """Standardised sound (N, 2R, bins) of N frames, each behind the one before it -> (N, W)."""
+        """Return (N, W) of standardised sound (N, 2R, bins) of N frames, each behind the one before it."""
         return self.engine.run("hear", rows)[0]
 
     def standardise_sound(self, rows: Floats) -> Floats:
-        """Rows (..., bins) of sound features, likewise."""
+        """Return rows (..., bins) of sound features in the units of the model."""
         return np.asarray((rows - self._scales["sound_mean"]) / self._scales["sound_std"], np.float32)
 
     def _still(self, frames: int) -> Floats:
-        """(frames, C) of a face at rest, standardised."""
+        """Return standardised motion (frames, C) of a face at rest."""
         return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
 
-    def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, NDArray[Any]]]:
-        """States whose frames since the last plan are among their P; and those of all, the speaker's part of a `Seen`:
-        one speaker alone where all streams have the same.
+    def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, Any]]:
+        """Return states whose frames since the last plan are among their P, and the speaker's part of `PlanInputs`.
+
+        Where all streams have the same speaker, that part is of one stream.
         """
         if len(states) > 1 and all(state is states[0] for state in states):
-            (state,), seen = self._taken_in(states[:1])
-            return [state] * len(states), seen
+            one, seen = self._taken_in(states[:1])
+            return [*one] * len(states), seen
         counts = [len(state.sounds) for state in states]
         ends: NDArray[np.int64] = np.cumsum(counts, dtype=np.int64)
         rows, phase, audio = self.frontend.step_each(
             [state.sounds for state in states], [state.audio for state in states]
         )
         heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
+        # A frame without sound is 0, the mean of the data, not silence.
         rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
+        # Each frame behind the one before it, the first of a stream behind the newest of its last plan: (N, 2R, bins).
+        last = np.concatenate([rows[:1], rows[:-1]])
+        last[ends - counts] = [state.rows for state in states]
         face, known = self._faces([face for state in states for face in state.faces])
         new = {
             "face": face,
             "face_known": known,
-            "voice": self.voices(_behind(rows, [state.rows for state in states], ends - counts)),
+            "voice": self.voices(np.concatenate([last, rows], axis=1)),
             "heard": heard,
             "phase": phase,
         }
-        seen = {name: _pushed([getattr(state, name) for state in states], part, counts) for name, part in new.items()}
+        found: dict[str, Any] = {
+            name: _pushed([getattr(state, name) for state in states], part, counts) for name, part in new.items()
+        }
         after = [
-            SpeakerState((), (), sound, rows[end - 1], **{name: part[row] for name, part in seen.items()})
+            SpeakerState(audio=sound, rows=rows[end - 1], **{name: part[row] for name, part in found.items()})
             for row, (sound, end) in enumerate(zip(audio, ends.tolist(), strict=True))
         ]
-        return after, seen
+        return after, found
 
     def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
-        """Motion (58,) of N frames, not finite where no face is known -> (N, C) standardised, and which are known."""
+        """Return standardised motion (N, C) and which faces are known, of motion (58,) of N frames, NaN where not."""
         rows = stacked(motion)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(rows).all(axis=1))
         faces = np.zeros((len(rows), self.space.dim), np.float32)
@@ -379,41 +399,28 @@ class SfmsListener(RunsOnEngine):
 
 
 def _listened(speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
-    """With the newest frame. Raises ValueError for another number of samples than those of a frame, or none."""
-    if len(speaker.audio) not in (0, FRAME_SAMPLES):
-        raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(speaker.audio)}")
+    """Return the state with a new frame. Raises ValueError for another number of samples than a frame has, or none."""
+    check_length(speaker.audio)
     face = _NO_FACE if speaker.face is None else speaker.face.motion
-    sound = np.array(speaker.audio, np.float32)  # whoever gave it may use it again
+    sound = np.array(speaker.audio, np.float32)  # a copy: the caller may use the array again
     return changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
 
 
-def _behind(rows: Floats, before: Sequence[Floats], begins: NDArray[np.int64]) -> Floats:
-    """Rows (N, R, bins) of N frames, each behind those of the frame before it: (N, 2R, bins). Streams begin at
-    `begins`, and theirs are `before`.
-    """
-    size = rows.shape[1]
-    out = np.empty((len(rows), 2 * size, rows.shape[2]), np.float32)
-    out[:, size:] = rows
-    out[1:, :size] = rows[:-1]
-    out[begins, :size] = before
-    return out
-
-
 def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[int]) -> NDArray[Any]:
-    """Queues (P, ...) -> (N, P, ...), each with its share of `new`, as many as `counts` says, for its oldest."""
+    """Return N queues (P, ...) as (N, P, ...), each without its oldest and with its `counts` rows of `new`."""
     longest = len(queues[0])
     out = np.empty((len(queues), *queues[0].shape), queues[0].dtype)
     end = 0
     for row, (queue, count) in enumerate(zip(queues, counts, strict=True)):
         end += count
-        kept = max(longest - count, 0)
+        kept = max(longest - count, 0)  # more frames than P: only the newest P of them
         out[row, :kept] = queue[longest - kept :]
         out[row, kept:] = new[end - (longest - kept) : end]
     return out
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
-    """Plan that goes on from where the motion was.
+    """Return a plan that continues from where the motion was.
 
     Args:
         tail: (..., 2, C) the frame before and this frame as played.
@@ -421,7 +428,8 @@ def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
         seam: frames over which the difference fades.
 
     Returns:
-        (..., 2 + H, C): `tail`, then `decoded` plus a cubic: the difference in place and speed, which ends flat.
+        (..., 2 + H, C): `tail`, then `decoded` plus a cubic that begins with the difference in place and speed and
+        ends flat: with u = frame / seam, offset (1 - u)^2 (1 + 2u) + speed seam u (1 - u)^2.
     """
     gap = tail - decoded[..., :2, :]
     before, offset = gap[..., :1, :], gap[..., 1:, :]

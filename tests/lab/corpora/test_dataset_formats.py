@@ -20,7 +20,7 @@ from sfms_robot.lab.corpora.external import l2l, react
 from sfms_robot.lab.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
 from sfms_robot.lab.corpora.learning2listen import l2l_bilateral
 from sfms_robot.lab.learning.sfms.features import gather
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
+from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.spaces import decode, rest_of

@@ -123,7 +123,7 @@ def test_wav2vec2_that_ships_with_the_data_needs_no_model_to_train_and_one_to_st
     assert corpus.frames.sound.shape == (60, 1, 768) and corpus.frames.heard.all()
     np.testing.assert_allclose(corpus.frames.sound[:, 0], shipped, atol=2e-3)
     for use in (lambda: corpus_of(one, dyad()), lambda: one.step(frames_of_dyad(dyad())[0], one.start(1))):
-        with pytest.raises(ConfigError, match="audio: wav2vec2 needs its model's folder"):
+        with pytest.raises(ConfigError, match="wav2vec2: expected the folder of a model"):
             use()
 
 

@@ -34,12 +34,11 @@ from sfms_robot.lab.learning.arig.losses import (
 )
 from sfms_robot.lab.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.lab.learning.job import Run
-from sfms_robot.listeners import arig, checkpoint
-from sfms_robot.listeners.arig import audio_frontend
-from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, hear
+from sfms_robot.listeners import arig, audio_frontend, checkpoint
+from sfms_robot.listeners.arig.event_curves import features
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sojourns import FIRST, NODDING
-from sfms_robot.listeners.arig.told import features
+from sfms_robot.listeners.arig.stream import FIRST, NODDING
+from sfms_robot.listeners.audio_frontend import MEL_WIDTH, hear_each
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB
 
@@ -201,10 +200,10 @@ def test_a_quiet_room_takes_from_what_is_no_speech_down_to_digital_silence(corpu
 def test_a_silent_user_is_heard_as_a_stream_hears_silence(corpus):
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][::9][:10], WINDOW)
     found, _ = augment(told, a_student().model, quiet(silent_user=1), torch.Generator().manual_seed(0))
-    state, heard = audio_frontend.start(), []
+    state, heard = audio_frontend.TRACKS.start(), []
     for _ in range(WINDOW):
-        sound, _, state = hear(np.zeros(FRAME_SAMPLES, np.float32), state)
-        heard.append(sound)
+        sound, _, (state,) = hear_each([np.zeros(FRAME_SAMPLES, np.float32)], [state])
+        heard.append(sound[0])
     assert torch.equal(found.user_sound, torch.from_numpy(np.stack(heard)).expand(10, -1, -1))
     assert told.voiced[..., 1].any() and not found.voiced[..., 1].any()
     assert torch.equal(found.user_heard, told.user_heard)

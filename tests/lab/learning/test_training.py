@@ -23,8 +23,8 @@ from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather
 from sfms_robot.lab.learning.sfms.tokens import place_all
 from sfms_robot.listeners import checkpoint, sfms
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.draw import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace

@@ -7,20 +7,20 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_arig import arig_listener, arig_model, dyad_of, noise_of, streamed, talk
+from tiny_arig import arig_listener, arig_model, dyad_of, generate, losses, noise_of, streamed, talk
 
 from sfms_robot.config.listener import EVENT_STATES, STATES, paper_state
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, ListenerEvent
-from sfms_robot.listeners.arig.sojourns import (
+from sfms_robot.listeners.arig.stream import (
     FEEDBACK,
     LISTENING,
     NODDING,
     SMILING,
+    ArigListener,
     Sojourn,
     draw_sojourn,
     with_feedback,
 )
-from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.idle import sway_at
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -77,8 +77,7 @@ def test_stream_equals_offline_given_the_states_that_were_drawn(changes):
         made.append(plan.frames[0])
         states.append(memory.state)
     dyad = dyad_of(listener, speaker, torch.from_numpy(np.stack(made)), control)
-    with torch.no_grad():
-        offline = listener.model.generate(dyad, noise_of(listener, 31, seed=3), torch.tensor([states]))
+    offline = generate(listener.model, dyad, noise_of(listener, 31, seed=3), torch.tensor([states]))
     assert 0 < np.stack(made)[:, FACE].min() and np.stack(made)[:, FACE].max() < 1
     np.testing.assert_allclose(np.stack(made), offline[0], atol=2e-5)
 
@@ -94,13 +93,6 @@ def test_later_control_never_changes_earlier_plans(told, changed_from: int):
     assert not np.array_equal(before[changed_from:], after[changed_from:])
 
 
-def test_nothing_told_is_nothing_happening(told):
-    speaker = talk(6)
-    silent = streamed(told, speaker, 1, nods(7))
-    np.testing.assert_array_equal(streamed(told, speaker), silent)
-    assert not np.array_equal(streamed(told, speaker, 1, nods(7, 0.05)), silent)
-
-
 def test_gradients_reach_the_control_input():
     listener = soft(arig_listener(**TOLD))
     speaker = talk(12)
@@ -108,7 +100,7 @@ def test_gradients_reach_the_control_input():
     dyad = dyad_of(listener, speaker, torch.rand(12, 58), control.detach().numpy())
     dyad = dataclasses.replace(dyad, control=control[None])
     states = torch.zeros(1, 13, dtype=torch.long)
-    listener.model.losses(dyad, states, torch.Generator().manual_seed(0)).motion.sum().backward()
+    losses(listener.model, dyad, states)[0].sum().backward()
     assert bool((control.grad.abs().sum(1) > 0).all())  # of every frame
 
 
@@ -123,13 +115,6 @@ def test_a_listener_without_events_takes_no_control():
     assert deaf.control_frames == (0, 0) and arig_listener(**TOLD).control_frames == (1, 1)
     with pytest.raises(ValueError, match="control is for a listener with events: true"):
         deaf.step(talk(1)[0], deaf.start(1), nods(2))
-
-
-def test_offline_control_of_another_shape_is_refused_by_name(told):
-    dyad = dyad_of(told, talk(5), torch.rand(5, 58), nods(6))
-    for wrong in (None, torch.zeros(1, 6, 3), torch.zeros(1, 5, len(COLUMNS))):
-        with pytest.raises(ValueError, match="control is"):
-            told.model.condition(dataclasses.replace(dyad, control=wrong))
 
 
 @pytest.mark.parametrize("draws", ["motion", "step", "innovation"])

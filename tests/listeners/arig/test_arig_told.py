@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tiny_arig import arig_model
 
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, POSE_CHANNELS, ListenerEvent
-from sfms_robot.listeners.arig import told
+from sfms_robot.listeners.arig import event_curves as curves
 from sfms_robot.signals.control import COLUMNS, KINDS, control_track
 
 PITCH, SMILE = CHANNEL_INDEX["pitch"], CHANNEL_INDEX["mouthSmileLeft"]
@@ -19,8 +19,8 @@ def rows_of(*events: ListenerEvent, frames: int = 100) -> torch.Tensor:
 
 
 def test_nothing_told_is_the_one_of_rest():
-    found = told.features(torch.zeros(3, len(COLUMNS)))
-    assert found.shape == (3, told.FEATURES) and bool((found[:, 0] == 1).all()) and not found[:, 1:].any()
+    found = curves.features(torch.zeros(3, len(COLUMNS)))
+    assert found.shape == (3, curves.FEATURES) and bool((found[:, 0] == 1).all()) and not found[:, 1:].any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -28,7 +28,7 @@ def test_nothing_told_is_the_one_of_rest():
 @settings(max_examples=10)
 def test_twice_the_size_is_twice_as_far_from_rest(kind: str, start_s: float, duration_s: float, size: float):
     one, two = (
-        told.features(rows_of(ListenerEvent(kind, start_s, duration_s, scale * size, 2)))[:, 1:] for scale in (1, 2)
+        curves.features(rows_of(ListenerEvent(kind, start_s, duration_s, scale * size, 2)))[:, 1:] for scale in (1, 2)
     )
     assert one.isfinite().all() and one.any()
     torch.testing.assert_close(two, 2 * one, rtol=1e-4, atol=1e-5)
@@ -36,7 +36,7 @@ def test_twice_the_size_is_twice_as_far_from_rest(kind: str, start_s: float, dur
 
 def test_hats_add_up_to_the_size_of_what_is_under_way():
     rows = rows_of(ListenerEvent("smile", 0.3, 2.0, 0.5))
-    found = told.features(rows)[:, 1:]
+    found = curves.features(rows)[:, 1:]
     active = rows[:, COLUMNS.index("smile.active")] > 0
     torch.testing.assert_close(found.sum(1), torch.where(active, 2 * 0.5, 0.0))  # over its course, and since it began
 
@@ -51,11 +51,11 @@ def test_curves_of_the_data_are_found_again():
         for at, (start, length) in enumerate(zip(starts, lengths, strict=True))
     ]
     rows = rows_of(*events, frames=int(starts[-1] * 25))
-    truth = torch.zeros(told.FEATURES, 58)
-    truth[0], truth[1:, PITCH] = 0.2, torch.randn(told.FEATURES - 1, generator=torch.Generator().manual_seed(0))
-    made = told.features(rows) @ truth
-    found = told.fit(rows, made + 0.01 * torch.randn(made.shape, generator=torch.Generator().manual_seed(1)))
-    assert float((told.features(rows) @ found - made).square().mean().sqrt()) < 0.1 * float(made[:, PITCH].std())
+    truth = torch.zeros(curves.FEATURES, 58)
+    truth[0], truth[1:, PITCH] = 0.2, torch.randn(curves.FEATURES - 1, generator=torch.Generator().manual_seed(0))
+    made = curves.features(rows) @ truth
+    found = curves.fit(rows, made + 0.01 * torch.randn(made.shape, generator=torch.Generator().manual_seed(1)))
+    assert float((curves.features(rows) @ found - made).square().mean().sqrt()) < 0.1 * float(made[:, PITCH].std())
 
 
 @given(rho=st.floats(0.0, 0.99), off=st.floats(-2, 2))
@@ -67,7 +67,7 @@ def test_what_leaves_the_told_course_comes_back_to_it(rho: float, off: float):
     model.motion_high.fill_(100)
     model.told.normal_(generator=torch.Generator().manual_seed(0))
     rows = rows_of(ListenerEvent("nod", 0.2, 0.8, 0.1, 2), frames=30)
-    course = model._at_rest(told.features(rows) @ model.told)
+    course = (curves.features(rows) @ model.told).where(model.is_drawn, 0.0)
     over = rows[:, COLUMNS.index("nod.over")] * rows[:, COLUMNS.index("nod.active")]
     place = course[0] + off * model.is_drawn
     for frame in range(1, 30):
@@ -87,8 +87,8 @@ def test_nothing_is_left_of_what_was_drawn_beside_an_event_once_it_is_over(
     kind: str, start_s: float, duration_s: float
 ):
     """Less and less of it while it lasts, of what the kind moves alone."""
-    rows, moved = rows_of(ListenerEvent(kind, start_s, duration_s, 0.1), frames=200), told.moves(CHANNELS)
-    share = told.remains(rows[:-1], rows[1:], moved)
+    rows, moved = rows_of(ListenerEvent(kind, start_s, duration_s, 0.1), frames=200), curves.moves(CHANNELS)
+    share = curves.remains(rows[:-1], rows[1:], moved)
     assert bool((share >= 0).all()) and bool((share <= 1).all())
     own = moved[KINDS.index(kind)]
     assert bool((share[:, ~own] == 1).all()) and not bool((share.prod(0)[own] > 0).any())
@@ -98,9 +98,9 @@ def test_nothing_is_left_of_what_was_drawn_beside_an_event_once_it_is_over(
 
 def test_events_one_upon_the_other_take_back_what_either_moves():
     smile, brow = ListenerEvent("smile", 0.2, 3.0, 0.5), ListenerEvent("brow_raise", 1.0, 1.0, 0.5)
-    moved = told.moves(CHANNELS)
+    moved = curves.moves(CHANNELS)
     both, one, other = (
-        told.remains(rows[:-1], rows[1:], moved)
+        curves.remains(rows[:-1], rows[1:], moved)
         for rows in (rows_of(*some) for some in ((smile, brow), (smile,), (brow,)))
     )
     torch.testing.assert_close(both, one * other)
@@ -109,7 +109,7 @@ def test_events_one_upon_the_other_take_back_what_either_moves():
 def test_a_jaw_may_speak_while_its_mouth_smiles():
     kinds = {
         kind: {CHANNELS[at] for at in np.flatnonzero(row)}
-        for kind, row in zip(KINDS, told.moves(CHANNELS), strict=True)
+        for kind, row in zip(KINDS, curves.moves(CHANNELS), strict=True)
     }
     assert "jawOpen" not in kinds["smile"] and "jawOpen" in kinds["laugh"] and "mouthSmileLeft" in kinds["smile"]
     assert kinds["nod"] == set(POSE_CHANNELS) and kinds["blink"] == {"eyeBlinkLeft", "eyeBlinkRight"}
@@ -139,5 +139,5 @@ def test_what_an_event_moves_is_not_held():
     model.rest_range.fill_(0.1)
     rows = rows_of(ListenerEvent("smile", 0.0, 2.0, 0.5), frames=2).reshape(-1)
     made = model.drawn(torch.full((58,), 3.0), torch.zeros(58), rows, torch.tensor(False)).abs()
-    smiles = told.moves(CHANNELS)[KINDS.index("smile")]
+    smiles = curves.moves(CHANNELS)[KINDS.index("smile")]
     assert bool((made[smiles] > 0.1).all()) and bool((made[~smiles] <= 0.1).all())

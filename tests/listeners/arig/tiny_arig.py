@@ -2,13 +2,15 @@
 
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.arig import audio_frontend, torch_engine
+from sfms_robot.listeners import audio_frontend
+from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
-from sfms_robot.listeners.arig.stream import ArigListener
-from sfms_robot.listeners.lots import Use, normals
+from sfms_robot.listeners.arig.stream import FIRST, ArigListener
+from sfms_robot.listeners.stream_rng import Use, normals
 
 RAW = {
     "kind": "arig",
@@ -92,3 +94,23 @@ def dyad_of(
         voiced=torch.from_numpy(np.stack([np.r_[False, agent_voiced], user_voiced], axis=-1))[None],
         control=None if control is None else torch.from_numpy(control)[None],
     )
+
+
+def losses(model: ArigModel, dyad: Dyad, states: torch.Tensor, seed: int = 0):
+    """Return equation (3) and the cross-entropy of the states (None without); every frame is given the true past."""
+    found = model.condition(dyad, torch.where(states < 0, FIRST, states))
+    standard = model.standardise(dyad.agent_motion)
+    wanted = model.moved(standard[:, 1:], standard[:, :-1], model.rows(dyad)).flatten(0, 1)
+    motion = model.sample_loss(found.z.flatten(0, 1), wanted, generator=torch.Generator().manual_seed(seed))
+    if found.states is None:
+        return motion, None
+    return motion, F.cross_entropy(found.states.transpose(1, 2), states[:, 1:], reduction="none")
+
+
+@torch.no_grad()
+def generate(model: ArigModel, dyad: Dyad, noise: torch.Tensor, states: torch.Tensor | None = None) -> torch.Tensor:
+    """Return motion (B, N-1, C) of frames 1..N-1 from the given past; noise (B, N-1, *noise_shape)."""
+    found = model.condition(dyad, states)
+    made = model.sample(found.z.flatten(0, 1), noise.flatten(0, 1)).view(found.moved.shape)
+    last = model.standardise(dyad.agent_motion[:, :-1])
+    return model.restore(model.drawn(made, last, model.rows(dyad), dyad.voiced[:, 1:, 0]))

@@ -9,7 +9,7 @@ from tiny_sfms import plans_of, speech, tiny_listener, told_listener
 from sfms_robot.config import NodCourse, SmileCourse
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_CORNERS, ListenerEvent
-from sfms_robot.listeners.sfms.draw import ToldCourse, nod_course, smile_course, smile_share
+from sfms_robot.listeners.sfms.draw import EventCourse, nod_course, smile_course, smile_share
 from sfms_robot.signals.control import COLUMNS, control_track
 
 SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
@@ -52,7 +52,7 @@ def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
 def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
     """The transition as much as the code that is held; with none held, as one at rest."""
     wanted = np.array([np.nan, 0.5, 0.5, 0.2])
-    smiling, lost = ToldCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
+    smiling, lost = EventCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
     assert smiling.tolist() == [1, 2, 3] and lost.shape == (3, 12) and (lost >= 0).all()
     np.testing.assert_allclose(lost[0, 1:], (CODES - 0.5) ** 2 / 0.02, rtol=1e-5)
     np.testing.assert_allclose(lost[:, 0], [lost[0, 6], lost[1, 1], lost[2, 3]])
@@ -107,21 +107,6 @@ def test_smiles_that_are_not_told_are_as_they_were():
     before, after = (plans_of(one, speech(50), events=[nod]) for one in (plain, steered))
     for index, plan in before.items():
         np.testing.assert_array_equal(after[index].frames, plan.frames)
-
-
-def test_streams_that_smile_beside_others_do_what_each_does_alone():
-    listener = told_listener(hop=2, sampling={"smile": {"spread": 0.05}})
-    past, ahead = listener.control_frames
-    own = ((SMILE,), (), (LAUGH, ListenerEvent("smile", 0.4, 1.5, 0.3)))
-    alone = [plans_of(listener, speech(40), seed, events) for seed, events in zip((1, 2, 3), own, strict=True)]
-    memories = [listener.start(seed) for seed in (1, 2, 3)]
-    for index, frame in enumerate(speech(40)):
-        known = [[e for e in events if e.start_s <= (index + 3) * 0.04 + 1e-9] for events in own]
-        plans, memories = listener.step_many(
-            frame, memories, [control_track(each, index + 1 - past, past + ahead) for each in known]
-        )
-        for plan, each in zip(plans, alone, strict=False):
-            np.testing.assert_allclose(plan.frames, each[index].frames, atol=1e-5)
 
 
 @pytest.mark.parametrize(

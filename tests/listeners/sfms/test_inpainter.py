@@ -2,10 +2,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_sfms import tiny_settings
 
-from sfms_robot.listeners.sfms.keyframes import KEYS_STEP, around
+from sfms_robot.listeners.sfms.draw import KEYS_STEP, around
 from sfms_robot.listeners.sfms.model import Inpainter
-from sfms_robot.listeners.sfms.neighbours import POSITION_BITS, Around, Neighbours
+from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 
 MEMBER = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -14,7 +15,8 @@ MEMBER = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 def parts(residual: bool = True, layers: int = 1) -> tuple[Quantizer, Inpainter]:
     torch.manual_seed(0)
     quantizer = Quantizer(MEMBER, [[5, 5], [5, 5]])
-    return quantizer, Inpainter(quantizer, 8, 2, layers, residual).eval()
+    settings = tiny_settings(tokenizer_width=8, tokenizer_layers=layers, inpainter="residual" if residual else "paper")
+    return quantizer, Inpainter(quantizer, settings).eval()
 
 
 def some_mask(frames: int, seed: int = 0) -> torch.Tensor:

@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_sfms import tiny_listener
+from tiny_sfms import tiny_listener, tiny_settings
 
-from sfms_robot.listeners.sfms import keyframes
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder, last_keyframes
+from sfms_robot.listeners.audio_frontend import SHAPES
+from sfms_robot.listeners.sfms import draw
+from sfms_robot.listeners.sfms.draw import UNDECIDED
+from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
@@ -78,8 +79,8 @@ def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
     one, copies = context(), context()
     own = torch.cat([one.tokens, one.tokens.flip(1).clamp(min=0)])
     names = ("face", "face_known", "voice", "heard", "phase")
-    both = (getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in names)
-    copies = Context(*both, own, one.control.expand(2, -1, -1))
+    both = {name: getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in names}
+    copies = Context(**both, tokens=own, control=one.control.expand(2, -1, -1))
     with torch.no_grad():
         torch.testing.assert_close(tiny.model.predictor(replace(one, tokens=own)), tiny.model.predictor(copies))
 
@@ -93,34 +94,22 @@ def test_every_weight_has_a_gradient(tiny):
     assert [name for name, weight in predictor.named_parameters() if weight.grad is None] == []
 
 
-@pytest.mark.parametrize("rows, bins", [(4, 128), (1, 78)])
+@pytest.mark.parametrize("audio", ["mel", "mfcc78"])
 @pytest.mark.parametrize("chunk", [1, 3, 7])
-def test_listening_in_chunks_equals_listening_at_once(rows: int, bins: int, chunk: int):
-    encoder = SpeakerEncoder(58, rows, bins, 0, 16, 2, 1)
+def test_listening_in_chunks_equals_listening_at_once(audio: str, chunk: int):
+    rows, bins = SHAPES[audio]
+    encoder = SpeakerEncoder(tiny_settings(audio=audio, phase=False))
     sound = torch.randn(1, 22 * rows, bins)
     whole = encoder.listen(sound)
     parts = [encoder.listen(sound[:, at * rows : (at + chunk + 1) * rows]) for at in range(0, 21, chunk)]
     torch.testing.assert_close(torch.cat(parts, dim=1)[:, :21], whole)
 
 
-def test_trails_are_the_last_two_keyframes_at_every_frame():
-    tokens = torch.tensor([0, 3, 0, 5, 0])[None, :, None]
-    recent = last_keyframes(tokens)
-    assert recent.tokens[0, :, 0].tolist() == [[0, 0], [3, 0], [3, 0], [5, 3], [5, 3]]
-    assert recent.at[0, :, 0].tolist() == [[-1, -1], [1, -1], [1, -1], [3, 1], [3, 1]]
-
-
 def test_a_trail_grown_frame_by_frame_is_the_trail_of_the_whole():
     tokens = np.random.default_rng(0).integers(0, 3, (4, 30, 5))
-    whole = keyframes.last_keyframes(tokens)
-    grown = keyframes.LastKeyframes(*(part[:, 9] for part in whole))
+    whole = draw.last_keyframes(tokens)
+    grown = draw.LastKeyframes(*(part[:, 9] for part in whole))
     for frame in range(10, 30):
-        grown = grown.then(tokens[:, frame], frame)
+        grown = draw.with_drawn(grown, tokens[:, frame], frame)
         for a, b in zip(grown, whole, strict=True):
             assert np.array_equal(a, b[:, frame])
-
-
-def test_learned_vectors_take_a_parameter_where_a_grid_needs_none():
-    grid, vectors = (tiny_listener(quantizer=kind).model.predictor for kind in ("fsq", "vq"))
-    assert "codes" not in dict(grid.named_parameters()) and "codes" in dict(vectors.named_parameters())
-    assert logits(vectors, context()).isfinite().any()

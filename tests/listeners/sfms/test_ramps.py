@@ -9,7 +9,7 @@ from sfms_robot.frames import CHANNEL_INDEX, ListenerEvent
 from sfms_robot.lab.evaluation.detection import added_up, asked_and_seen
 from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import at_hop, load_listener
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED, anchored, revoked
+from sfms_robot.listeners.sfms.draw import UNDECIDED, anchored, revoked
 
 NOW, RAMP = 4, 4
 

@@ -7,33 +7,8 @@ from hypothesis import strategies as st
 from tiny_sfms import tiny_settings
 
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.neighbours import Neighbours
+from sfms_robot.listeners.sfms.piecewise_linear import Neighbours
 from sfms_robot.listeners.sfms.placement import Strategy
-
-
-def test_tokens_mark_exactly_the_keyframes(tiny):
-    tokenizer = tiny.model.tokenizer
-    motion = torch.randn(2, 48, 58)
-    mask = tokenizer.place(motion)
-    assert torch.equal(tokenizer.encode(motion, mask) > 0, mask > 0)
-    assert mask.sum(1).tolist() == [[6.0, 5.0]] * 2
-
-
-def test_decoding_tokens_equals_inpainting_their_codes(tiny):
-    tokenizer = tiny.model.tokenizer
-    motion = torch.randn(2, 48, 58)
-    mask = tokenizer.place(motion)
-    codes = tokenizer.quantizer.encode(motion)
-    torch.testing.assert_close(tokenizer.decode(tokenizer.encode(motion, mask)), tokenizer.inpaint(codes, mask))
-
-
-def test_what_is_not_a_keyframe_does_not_reach_the_inpainter(tiny):
-    tokenizer = tiny.model.tokenizer
-    motion = torch.randn(1, 48, 58)
-    mask = tokenizer.place(motion)
-    codes = tokenizer.quantizer.encode(motion)
-    noise = torch.where(mask[..., None] > 0, codes, torch.randn_like(codes))
-    assert torch.equal(tokenizer.inpaint(codes, mask), tokenizer.inpaint(noise, mask))
 
 
 @given(st.sets(st.integers(0, 19), min_size=1), st.floats(-3, 3), st.floats(-3, 3))
@@ -51,11 +26,6 @@ def test_ends_are_held_and_a_window_without_keyframes_is_finite(tiny):
     values = torch.full((1, 10, 1, 1), 2.0)
     assert torch.equal(Neighbours.in_mask(mask).interpolate(values), values)
     assert tiny.model.tokenizer.decode(torch.zeros(1, 48, 2).long()).isfinite().all()
-
-
-def test_restoring_undoes_standardising_within_range(tiny):
-    motion = torch.rand(5, 58)
-    torch.testing.assert_close(tiny.model.restore(tiny.model.standardise(motion)), motion)
 
 
 @pytest.mark.parametrize("quantizer", ["fsq", "vq"])

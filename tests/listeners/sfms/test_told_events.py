@@ -11,7 +11,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
-from sfms_robot.listeners.sfms.keyframes import KEPT_FRAMES, UNDECIDED, later, passed, revoked
+from sfms_robot.listeners.sfms.draw import KEPT_FRAMES, UNDECIDED, passed, revoked
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -103,11 +103,6 @@ def test_tokens_are_revoked_from_the_first_future_frame_that_is_told_otherwise()
     assert (after[1, 40 + KEPT_FRAMES :] == UNDECIDED).all() and (after[1, : 40 + KEPT_FRAMES] == 1).all()
 
 
-def test_a_moving_window_takes_what_was_told_with_it():
-    control = np.random.default_rng(0).random((1, 48, len(COLUMNS)), np.float32)
-    np.testing.assert_array_equal(later(control, 3)[:, :45], control[:, 3:])
-
-
 def test_the_last_keyframe_that_leaves_the_window_is_held_at_its_edge():
     tokens, path = np.zeros((1, 48, 2), np.int64), np.zeros((1, 10, 4), np.float32)
     tokens[0, 1, 0], tokens[0, 20, 1] = 5, 3
@@ -137,8 +132,9 @@ def test_the_head_sways_from_rest_and_each_stream_its_own_way(told):
 def context(told, control: torch.Tensor) -> Context:
     memory = told.start(0)
     s = memory.speaker
-    known = (s.face, s.face_known, s.voice, s.heard, s.phase, memory.tokens)
-    return Context(*(torch.from_numpy(one[None]) for one in known), control)
+    known = {name: getattr(s, name) for name in ("face", "face_known", "voice", "heard", "phase")}
+    known = {name: torch.from_numpy(one[None]) for name, one in (known | {"tokens": memory.tokens}).items()}
+    return Context(**known, control=control)
 
 
 def test_every_told_number_has_a_gradient_and_so_has_every_weight():
@@ -179,15 +175,6 @@ def test_one_that_is_not_told_takes_none(tiny):
     assert tiny.control_frames == (0, 0)
     with pytest.raises(ValueError, match=r"control has shape \(48, 36\)"):
         tiny.step(speech(1)[0], tiny.start(1), np.zeros((48, 36), np.float32))
-
-
-def test_graphs_make_the_same_plans():
-    speaker = speech(50)
-    before, after = (
-        plans_of(one, speaker, events=[NOD, SMILE]) for one in (told_listener(), told_listener().build_graphs())
-    )
-    for index, plan in before.items():
-        np.testing.assert_allclose(after[index].frames, plan.frames, atol=1e-5)
 
 
 NECK = {"channels": POSE_CHANNELS, "levels": (3, 2)}

@@ -14,8 +14,7 @@ from sfms_robot.errors import ModelError
 from sfms_robot.lab.evaluation.baselines.dense import DenseTokenizer
 from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.placement import place
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork, tracks
+from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, place, tracks
 
 FILE: Final = "history.json"
 SNAPSHOTS_AT: Final = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the steps

@@ -27,11 +27,12 @@ from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
 from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.lab.learning.staged_frames import Scratch
-from sfms_robot.listeners.arig import audio_frontend, told
+from sfms_robot.listeners import audio_frontend
+from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
 from sfms_robot.listeners.arig.modules import StateUnderstanding
 from sfms_robot.listeners.arig.sampler import Denoiser
-from sfms_robot.listeners.arig.sojourns import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
+from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
@@ -194,12 +195,12 @@ def _pairs(of_dyads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _remains(model: ArigModel, corpus: ArigCorpus) -> Tensor | None:
-    """`told.remains` of every frame but the first of a dyad (N, C); None for a model that is told of nothing."""
+    """`event_curves.remains` of every frame but the first of a dyad (N, C); None for a model without events."""
     control = corpus.frames.control
     if not model.is_told or control is None:
         return None
     of_dyads = torch.split(control, list(corpus.lengths))
-    return torch.cat([told.remains(rows[:-1], rows[1:], model.moves) for rows in of_dyads])
+    return torch.cat([event_curves.remains(rows[:-1], rows[1:], model.moves) for rows in of_dyads])
 
 
 def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) -> None:
@@ -210,7 +211,7 @@ def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) 
     lengths, still = list(corpus.lengths), []
     for rows, talk in zip(torch.split(control, lengths), torch.split(talks, lengths), strict=True):
         near = F.max_pool1d(talk[None], 2 * PAUSE_FRAMES + 1, 1, PAUSE_FRAMES)[0] > 0
-        still.append(~(told.moved_channels(rows, model.moves) | near[:, None]))
+        still.append(~(event_curves.moved_channels(rows, model.moves) | near[:, None]))
     rests, off = torch.cat(still), torch.cat(list(of_dyads)).abs()
     for channel in range(model.channels):
         found = off[rests[:, channel], channel]
@@ -223,12 +224,12 @@ def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Te
     control = corpus.frames.control
     if not model.is_told or control is None:
         return standard
-    model.told.copy_(told.fit(control, standard))
+    model.told.copy_(event_curves.fit(control, standard))
     sides = [name in LATERAL_POSE for name in model.settings.channels]
     model.told[:, sides] = 0.0  # nobody tells to which side a shake begins, so none is on average
     lengths = list(corpus.lengths)
     of_dyads = zip(torch.split(standard, lengths), torch.split(control, lengths), strict=True)
-    return torch.cat([motion - told.features(rows) @ model.told for motion, rows in of_dyads])
+    return torch.cat([motion - event_curves.features(rows) @ model.told for motion, rows in of_dyads])
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:

@@ -22,10 +22,10 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.listeners.arig.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.arig.model import ArigModel, Dyad
-from sfms_robot.listeners.arig.parts import weighted_mean
-from sfms_robot.listeners.arig.sojourns import FIRST
+from sfms_robot.listeners.arig.stream import FIRST
+from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
+from sfms_robot.listeners.layers import weighted_mean
 from sfms_robot.signals import mel
 
 RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back

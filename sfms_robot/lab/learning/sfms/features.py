@@ -27,9 +27,9 @@ from sfms_robot.lab.learning.corpus import (
 )
 from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED
+from sfms_robot.listeners.sfms.draw import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.space import MotionSpace

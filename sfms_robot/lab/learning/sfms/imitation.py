@@ -18,8 +18,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sfms_robot.listeners.sfms.exact import completion_errors
-from sfms_robot.listeners.sfms.score import ConditionalScore, Tracks, tracks
+from sfms_robot.listeners.sfms.piecewise_linear import completion_errors
+from sfms_robot.listeners.sfms.placement import ConditionalScore, Tracks, tracks
 
 FLOOR = 0.05  # added to the least error, in squared deviations of the track: below it nobody sees a difference
 SHARPNESS = 0.1  # temperature of the teacher's preferences

@@ -26,10 +26,9 @@ from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_
 from sfms_robot.lab.learning.sfms.tokens import held_tokens, keyframe_tokens, tokenise
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.keyframes import UNDECIDED
-from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.networks import neutral_tokens
+from sfms_robot.listeners.audio_frontend import AudioFrontend
+from sfms_robot.listeners.sfms.draw import UNDECIDED
+from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
 from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace

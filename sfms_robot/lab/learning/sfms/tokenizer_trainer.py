@@ -25,9 +25,8 @@ from sfms_robot.lab.learning.sfms.masks import batches, teacher
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
-from sfms_robot.listeners.sfms.placement import Strategy, place_learned
+from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place_learned
 from sfms_robot.listeners.sfms.quantizer import Codebook
-from sfms_robot.listeners.sfms.score import ConditionalScore, ScoreNetwork
 from sfms_robot.listeners.space import MotionSpace
 
 WEIGHTS = "tokenizer.safetensors"

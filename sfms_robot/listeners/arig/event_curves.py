@@ -1,14 +1,15 @@
-"""What an event that is told does to a face on average: curves over its course, as large as it is said to be.
+"""Average motion of a face during an event: curves over its course, as large as the event. Ours.
 
-`features` of a control row (`signals.control`) times weights that are fitted on the data, by least squares, are the
-motion to be expected of events alone. What is drawn is the rest: a nod that was begun too large is brought back to the
-one that was told, and a smile, which is rare, is not left to be learned from nothing.
+`features` of a control row (`signals.control`) times weights that are fitted on the data by least squares are the
+motion to be expected of events alone. The listener draws the rest: a nod that was begun too large is brought back to
+the size that was decided, and a smile, which is rare, need not be learned from nothing.
 
-Of every kind: hats over how much of it is over, and over how long it lasts already; of those that swing, the first two
-harmonics of where in a swing it is, and these as they die away. All times its size; and a 1, for rest.
+Of every kind of event: piecewise linear curves over the share of it that has passed and over the time since it began;
+of those that swing, the first two harmonics of the place in a swing, and these as they die away. All times its size;
+and a 1, for rest.
 
-`remains` is what an event leaves of what was drawn beside it: nothing, once it is over. A nod that went too far has
-come back by its end, and a mouth that smiled more than it was told to is at rest again.
+`remains` is the part of other motion that an event leaves: 0 by its end. A nod that went too far has come back by its
+end, and a mouth that smiled more than was decided is at rest again.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ _OVER: Final = tuple(step / 8 for step in range(9))
 _SINCE: Final = (0.0, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0, 4.0)  # on the axis of the control row: 0 to 10 s
 _AT: Final = {name: at for at, name in enumerate(COLUMNS)}
 FEATURES: Final = 1 + len(KINDS) * (len(_OVER) + len(_SINCE)) + 8 * len(SWINGING)
-RIDGE: Final = 1.0  # frames that speak for nothing happening
-LEAST: Final = 1e-3  # of an event that is left in any frame of it
+RIDGE: Final = 1.0  # frames of weight that pull towards no motion
+LEAST: Final = 1e-3  # share of an event that is left in any frame of it
 _SMILING: Final = ("mouth", "cheek", "nose", "eyeSquint")
-# Channels that are moved, by how their names begin; a jaw may speak while its mouth smiles.
+# Channels that are moved, by the beginnings of their names; a jaw may speak while its mouth smiles.
 MOVES: Final[Mapping[str, tuple[str, ...]]] = {
     "nod": POSE_CHANNELS,
     "shake": POSE_CHANNELS,
@@ -42,37 +43,38 @@ MOVES: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def features(row: Tensor) -> Tensor:
-    """Control rows (..., K) -> (..., FEATURES), the first of them 1."""
+    """Return features (..., FEATURES) of control rows (..., K); the first of them is 1."""
     found = [torch.ones_like(row[..., :1])]
     for kind in KINDS:
         size = (row[..., _AT[f"{kind}.active"]] * row[..., _AT[f"{kind}.size"]])[..., None]
-        over, since = (row[..., _AT[f"{kind}.{what}"], None] for what in ("over", "since"))
+        over, since = (row[..., _AT[f"{kind}.{name}"], None] for name in ("over", "since"))
         found += [size * _hats(over, _OVER), size * _hats(since, _SINCE)]
         if kind in SWINGING:
-            sine, cosine = (row[..., _AT[f"{kind}.{what}"], None] for what in ("sine", "cosine"))
+            sine, cosine = (row[..., _AT[f"{kind}.{name}"], None] for name in ("sine", "cosine"))
+            # sin a, cos a, sin 2a = 2 sin a cos a, cos 2a = cos^2 a - sin^2 a
             waves = torch.cat([sine, cosine, 2 * sine * cosine, cosine.square() - sine.square()], dim=-1)
             found += [size * waves, size * over * waves]
     return torch.cat(found, dim=-1)
 
 
 def moves(channels: Sequence[str]) -> Tensor:
-    """(KINDS, C) bool: which of the channels each kind moves."""
+    """Return (KINDS, C) bool: the channels that each kind moves."""
     return torch.tensor([[name.startswith(MOVES.get(kind, ())) for name in channels] for kind in KINDS])
 
 
 def moved_channels(row: Tensor, moves: Tensor) -> Tensor:
-    """(..., C) bool: which channels an event of the control row (..., K) moves; `moves` (KINDS, C) as of `moves`."""
+    """Return (..., C) bool: the channels that an event of the control row (..., K) moves; `moves` (KINDS, C)."""
     active = row[..., [_AT[f"{kind}.active"] for kind in KINDS]] > 0
     return (active[..., None] & moves).any(-2)
 
 
 def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
-    """Share (..., C) of what was off after a frame of control row `before` (..., K) that is left at the row `now`.
+    """Return the share (..., C) of a deviation at control row `before` (..., K) that is left at the row `now`.
 
-    1 where no event moves a channel. While one does, what is left of it over what was left a frame ago, which brings
-    anything to 0 by its end, however long it is: the drift of a Brownian bridge.
+    1 where no event moves a channel. While one does, left(t) / left(t - 1), where left is the share of the event still
+    to come: the drift of a Brownian bridge, which brings any deviation to 0 by the end, however long the event is.
     """
-    active, over = ([_AT[f"{kind}.{what}"] for kind in KINDS] for what in ("active", "over"))
+    active, over = ([_AT[f"{kind}.{name}"] for kind in KINDS] for name in ("active", "over"))
     left = 1 - now[..., over] * now[..., active]
     left = torch.where((before[..., active] > 0) & (now[..., active] == 0), 0.0, left)
     was = (1 - before[..., over] * before[..., active]).clamp(min=LEAST)
@@ -81,7 +83,7 @@ def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
 
 
 def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:
-    """x (..., 1) within the knots -> (..., knots): 1 at its own knot, 0 at the next ones, straight in between."""
+    """Return (..., knots) of x (..., 1) within the knots: 1 at its own knot, 0 at the next ones, linear in between."""
     at = torch.tensor(knots, dtype=x.dtype, device=x.device)
     gap = at.diff()
     below, above = (x - at[:-1]) / gap, (at[1:] - x) / gap
@@ -91,7 +93,7 @@ def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:
 
 
 def fit(rows: Tensor, motion: Tensor) -> Tensor:
-    """Weights (FEATURES, C) of least squares for motion (N, C) at control rows (N, K), a little drawn to nothing."""
+    """Return the weights (FEATURES, C) of ridge regression for motion (N, C) at control rows (N, K)."""
     gram = torch.zeros(FEATURES, FEATURES, dtype=torch.float64)
     moved = torch.zeros(FEATURES, motion.shape[1], dtype=torch.float64)
     for row, made in zip(torch.split(rows, 65536), torch.split(motion, 65536), strict=True):

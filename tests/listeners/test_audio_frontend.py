@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import FRAME_SAMPLES
-from sfms_robot.listeners.arig import audio_frontend
+from sfms_robot.listeners import audio_frontend
 from sfms_robot.signals import mel
 
 
@@ -15,9 +15,9 @@ def voice(frames: int) -> np.ndarray:
 def test_a_track_frame_by_frame_is_the_track_as_a_whole():
     samples = voice(64)
     whole, voiced = audio_frontend.track(samples)
-    ears = audio_frontend.start()
+    ears = audio_frontend.TRACKS.start()
     for index, frame in enumerate(samples.reshape(64, FRAME_SAMPLES)):
-        features, present, ears = audio_frontend.hear(frame, ears)
+        (features,), (present,), (ears,) = audio_frontend.hear_each([frame], [ears])
         np.testing.assert_array_equal(features, whole[index])
         assert present and ears.voiced == voiced[index]
     assert 0 < voiced.mean() < 1
@@ -34,10 +34,10 @@ def test_mel_rows_stand_in_for_samples():
 
 @pytest.mark.parametrize("samples", [None, np.zeros(0, np.float32)])
 def test_no_samples_are_silence_not_heard(samples):
-    features, present, _ = audio_frontend.hear(samples, audio_frontend.start())
-    silent, heard, _ = audio_frontend.hear(np.zeros(FRAME_SAMPLES, np.float32), audio_frontend.start())
-    np.testing.assert_array_equal(features, silent)
-    assert (present, heard) == (False, True)
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    features, present, _ = audio_frontend.hear_each([samples, silence], [audio_frontend.TRACKS.start()] * 2)
+    np.testing.assert_array_equal(*features)
+    assert present == [False, True]
 
 
 @pytest.mark.parametrize("samples", [1, 639, 640, 641, 2000])

@@ -1,0 +1,305 @@
+"""The computation of one frame of a stream, as functions of tensors: `FrameNetwork` up to the sampler, `DrawNetwork`.
+
+Offline the same parts run over all frames at once (`model.condition`); that both agree is a law of the tests. As
+functions of tensors alone they can be traced or exported. `RestNetwork` makes the memory before the first frame. Below
+them is the fast path: large layers in 8-bit integers.
+
+N streams, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of a chunk, S
+whole chunks that are kept, L layers that look at them.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.errors import ModelError
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.sampler import Denoiser
+from sfms_robot.listeners.arig.stream import CONTROL_ROWS
+from sfms_robot.listeners.audio_frontend import WIDTHS
+from sfms_robot.listeners.layers import PlainModule
+from sfms_robot.signals.control import COLUMNS
+
+
+class RestNetwork(PlainModule):
+    """A still face and silence as the memory of a stream: called once, when a listener is loaded."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, still: Tensor) -> tuple[Tensor, ...]:
+        """Return embedded motion and silence (1, D), and the keys of each (1, 2D), of still (1, C) standardised."""
+        progress, motion, silence = self.model.progress, self.model.embed_own(still), self.model.no_agent_sound[None]
+        return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
+
+
+class FrameNetwork(PlainModule):
+    """Sounds and face of one frame, and the memory of the stream -> the inputs of the sampler for the next."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self,
+        sounds: Tensor,
+        heard: Tensor,
+        voiced: Tensor,
+        face: Tensor,
+        seen: Tensor,
+        first: Tensor,
+        state: Tensor,
+        rotary: Tensor,
+        view: Tensor,
+        agent_sound: Tensor,
+        agent_behaviour: Tensor,
+        user_behaviour: Tensor,
+        sound_keys: Tensor,
+        motion: Tensor,
+        motion_keys: Tensor,
+        sample: Tensor,
+        rows: Tensor,
+        *past: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Take one frame, equation (2).
+
+        Args:
+            sounds: (N, 2, A) of user and agent; heard: (N, 2) bool, which of them are there.
+            voiced: (N, 2) bool, speech of agent, user.
+            face: (N, C) standardised motion of the user; seen: (N,) bool.
+            first: (N,) bool, of the stream: chunks begin as its behaviour repeated (A.2).
+            state: (N,) conversational state of the frame before.
+            rotary, view, past: place, chunks that there have been, and keys and values of `LongRange.step`.
+            agent_sound, ...: of `stream.ArigMemory`.
+            rows: (N, 2K) control of the frame before and of the frame to be made; arbitrary without events.
+
+        Returns:
+            z (N, D) with the further inputs of the sampler, logits of the state (N, 7 or 9), empty without states, keys
+            and values of the chunk in progress, and the next agent_sound, agent_behaviour, user_behaviour and
+            sound_keys.
+        """
+        model = self.model
+        absent = torch.stack([model.no_user_sound, model.no_agent_sound])
+        embedded = model.embed_sound(sounds, heard, absent)
+        user_sound, now = embedded[:, 0], embedded[:, 1]  # A^u_(T-1) and A^a_T, (N, D)
+        face = model.embed_face(face, seen)  # M^u_(T-1)
+        # 3.2: behaviours I_(T-1) of both; the agent's is made with the sound kept from the frame before.
+        agent_behaviour = _after(agent_behaviour, model.merge_agent(agent_sound, motion), first)
+        user_behaviour = _after(user_behaviour, model.merge_user(user_sound, face), first)
+        sound_keys = push(sound_keys, model.progress.coarse.keys(now))
+        summary = model.short(agent_behaviour, user_behaviour, now, user_sound)  # 3.2, short range
+        cis, made = model.long.step(summary, past, view, rotary)  # 3.2, long range: the cis-token
+        feature, logits = None, cis[:, :0]
+        if model.states is not None:  # 3.3: S_T and s_T
+            feature, logits = model.states(model.states.condition(cis, voiced), state)
+        events = model.embed_events(rows)  # ours
+        outline = model.progress.coarse(motion, sound_keys)  # 3.4: M^a_(T-1) looks at the sounds of three frames
+        z = model.progress.refine(outline, motion_keys, now, cis, feature, events)  # 3.4: latent z
+        z = model.beside(z, events, sample)
+        return z, logits, made, now, agent_behaviour, user_behaviour, sound_keys
+
+
+class DrawNetwork(PlainModule):
+    """Inputs of the sampler and its noise -> the agent's motion, and the memory of it."""
+
+    levels: Tensor | None
+    places: Tensor | None
+
+    def __init__(self, model: ArigModel, kept: bool = True) -> None:
+        """Make one of a model. `kept`: embed the constant noise levels once, else in every frame from the weights."""
+        super().__init__()
+        self.model = model
+        head, levels, places = model.head, None, None
+        if isinstance(head, Denoiser):
+            places = head.places[head.levels]
+            with torch.no_grad():
+                levels = head.time(places) if kept else None
+        self.register_buffer("levels", levels, persistent=False)
+        self.register_buffer("places", places, persistent=False)
+
+    def forward(
+        self,
+        z: Tensor,
+        noise: Tensor,
+        standard: Tensor,
+        motion_keys: Tensor,
+        rows: Tensor | None = None,
+        speaks: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Draw one frame.
+
+        Args:
+            z: of `FrameNetwork`; noise: (N, *model.noise_shape).
+            standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.ArigMemory`.
+            rows: (N, 2K) of `FrameNetwork`, and speaks: (N,) bool, the agent; for a listener with events.
+
+        Returns:
+            Motion (N, C) in plain units, the same standardised (N, C), `model.moved` (N, C), embedded (N, D), and the
+            next motion_keys.
+        """
+        model = self.model
+        levels = self.levels
+        if levels is None and self.places is not None and isinstance(model.head, Denoiser):
+            levels = model.head.time(self.places)
+        made = model.drawn(model.sample(z, noise, levels), standard, rows, speaks)  # equation (4), then ours
+        motion = model.embed_own(made)  # M^a_T, the past of the next frame
+        keys = push(motion_keys, model.progress.temporal.keys(motion))
+        return model.restore(made), made, model.moved(made, standard, rows), motion, keys
+
+
+def push(queue: Tensor, new: Tensor) -> Tensor:
+    """Return (N, S, D) without its oldest row and with `new` (N, D) as its newest."""
+    return torch.cat([queue[:, 1:], new[:, None]], dim=1)
+
+
+def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
+    """Return (N, S, D) with `new` (N, D) as its newest, or `new` repeated where `first` (N,)."""
+    return torch.where(first[:, None, None], new[:, None], push(queue, new))
+
+
+def networks(model: ArigModel, kept: bool = True) -> dict[str, PlainModule]:
+    """Return all networks by name. `kept`: see `DrawNetwork`."""
+    return {"rest": RestNetwork(model), "frame": FrameNetwork(model), "draw": DrawNetwork(model, kept)}
+
+
+def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tensor]]:
+    """Return inputs of every network for this many streams, by the names of network and input."""
+    n, d, h, chunk, channels = streams, settings.width, settings.heads, settings.chunk_frames, len(settings.channels)
+    room = settings.context_chunks - 1
+    told = d + d * settings.events + channels * (settings.draws == "innovation")
+    motion_keys = torch.zeros(n, settings.motion_frames, 2 * d)
+    names = [f"{part}_{layer}" for layer in range(settings.context_layers) for part in ("keys", "values")]
+    frame = {
+        "sounds": torch.zeros(n, 2, WIDTHS[settings.sound]),
+        "heard": torch.ones(n, 2, dtype=torch.bool),
+        "voiced": torch.zeros(n, 2, dtype=torch.bool),
+        "face": torch.zeros(n, channels),
+        "seen": torch.ones(n, dtype=torch.bool),
+        "first": torch.zeros(n, dtype=torch.bool),
+        "state": torch.zeros(n, dtype=torch.long),
+        "rotary": torch.zeros(n, 2, d // h),
+        "view": torch.ones(n, room, dtype=torch.bool),
+        "agent_sound": torch.zeros(n, d),
+        "agent_behaviour": torch.zeros(n, chunk, d),
+        "user_behaviour": torch.zeros(n, chunk, d),
+        "sound_keys": torch.zeros(n, settings.sound_frames, 2 * d),
+        "motion": torch.zeros(n, d),
+        "motion_keys": motion_keys,
+        "sample": torch.zeros(n, channels),
+        "rows": torch.zeros(n, CONTROL_ROWS * len(COLUMNS) * settings.events),
+        **{name: torch.zeros(n, h, room, d // h) for name in names},
+    }
+    noise = (1, 1) if settings.discrete else (settings.diffusion.steps, channels)
+    draw = {
+        "z": torch.zeros(n, told),
+        "noise": torch.zeros(n, *noise),
+        "standard": torch.zeros(n, channels),
+        "motion_keys": motion_keys.clone(),
+    }
+    if settings.events:
+        draw |= {"rows": torch.zeros(n, CONTROL_ROWS * len(COLUMNS)), "speaks": torch.zeros(n, dtype=torch.bool)}
+    return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
+
+
+# --- Large layers in 8 bits -------------------------------------------------------------------------------------------
+#
+# Dynamic quantization. One frame at a time, a layer costs what it takes to read its weights; in bytes that is a
+# quarter. Weights are rounded per output row, the input by its own range. Small layers stay in 32 bits: they gain
+# nothing. Nor does the sampler on torch; in graphs, where a product costs no more than reading its weights, its blocks
+# in integers stay in the fastest cache.
+
+PARTS = ("sound_in", "merge_agent", "merge_user", "short", "long", "states", "progress")
+SAMPLER = ("head.modulation.", "head.up.", "head.down.")  # in graphs: all products of every step but the first and last
+SMALLEST = 64 * 1024  # weights of a layer below which integers gain nothing
+
+
+class Int8Linear(nn.Module):
+    """A stand-in for an nn.Linear."""
+
+    def __init__(self, linear: nn.Linear) -> None:
+        super().__init__()
+        weight = linear.weight.detach()
+        scale = weight.abs().amax(1).clamp(min=1e-12).double() / 127
+        with warnings.catch_warnings():  # torch will rename the function that makes such tensors
+            warnings.simplefilter("ignore", UserWarning)
+            zero = torch.zeros(len(scale), dtype=torch.long)
+            rounded = torch.quantize_per_channel(weight, scale, zero, 0, torch.qint8)
+        self.packed: Any = torch.ops.quantized.linear_prepack(rounded, linear.bias)
+        self.half_range = not torch.cpu._is_vnni_supported()  # older processors add pairs of products in 16 bits
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., out) of x (..., in)."""
+        out: Tensor = torch.ops.quantized.linear_dynamic(x, self.packed, self.half_range)
+        return out
+
+    __call__ = forward  # as PlainModule
+
+
+class Bf16Linear(nn.Module):
+    """A stand-in for an nn.Linear that reads half as much. For benches: integers are faster wherever they exist."""
+
+    def __init__(self, linear: nn.Linear) -> None:
+        super().__init__()
+        self.weight = linear.weight.detach().bfloat16()
+        self.bias = linear.bias.detach().bfloat16()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., out) of x (..., in)."""
+        return F.linear(x.bfloat16(), self.weight, self.bias).float()
+
+    __call__ = forward  # as PlainModule
+
+
+def supported() -> bool:
+    """Return whether this processor multiplies such integers fast."""
+    return torch.backends.quantized.engine in ("x86", "fbgemm", "onednn")
+
+
+def with_precision(model: ArigModel, precision: str) -> ArigModel:
+    """Return the model to run: itself (fp32), or a copy with large layers in integers (int8, or auto if supported).
+
+    Raises ModelError for int8 where the processor has none.
+    """
+    if precision == "fp32" or (precision == "auto" and not supported()):
+        return model
+    if not supported():
+        raise ModelError("precision: int8 needs an x86 processor (valid here: auto, fp32)")
+    return with_layers(model, Int8Linear)
+
+
+def with_layers(model: ArigModel, kind: Callable[[nn.Linear], nn.Module]) -> ArigModel:
+    """Return a copy of the model with large layers of another kind, except those of the sampler."""
+    out = copy.deepcopy(model)
+    for name, part in out.named_children():
+        if name in PARTS:
+            _replace(part, kind)
+    return out
+
+
+def large_layers(model: ArigModel) -> list[str]:
+    """Return the weights, by name, of layers that graphs have in integers: those of `with_precision`, the sampler's."""
+    return [
+        f"{name}.weight"
+        for name, part in model.named_modules()
+        if isinstance(part, nn.Linear)
+        and (name.split(".")[0] in PARTS or name.startswith(SAMPLER))
+        and part.weight.numel() >= SMALLEST
+    ]
+
+
+def _replace(module: nn.Module, kind: Callable[[nn.Linear], nn.Module]) -> None:
+    for name, child in module.named_children():
+        if isinstance(child, nn.Linear):
+            if child.weight.numel() >= SMALLEST:
+                setattr(module, name, kind(child))
+        else:
+            _replace(child, kind)

@@ -1,0 +1,355 @@
+"""Straight lines between keyframes: the values on them, their errors, and the masks with the least error.
+
+`Neighbours` are the keyframes before and after each frame; the inpainter interpolates between them, and so does every
+error here: a line between two keyframes, held before the first and behind the last. `Segments` are the squared errors
+of all stretches between two keyframes. The error of a mask is the sum over its stretches, so the best mask is a
+cheapest path, found by dynamic programming: of k keyframes (`best_frames`), of 1..K keyframes through given frames
+(`completion_errors`), or of as many as pay for themselves (`place_penalised`).
+
+All of this is ours, because a learned placement (IV-B2) needs a measure of how good it is; the paper compares with
+even spacing alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sfms_robot.frames import Doubles
+
+POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as binary digits
+
+
+class Around(NamedTuple):
+    """Keyframes in tokens (B, T, G), as `draw.around` finds them before a network sees the tokens.
+
+    Attributes:
+        before, after: (B, T, G) as `Neighbours.at` takes them.
+        rows: (B, K) frames that hold a keyframe of any group, as rows of (B * T).
+        seen: (B, K) which of those count; the others fill up K.
+        places: (B, T) place of each frame among them, as a row of (B * K); arbitrary for other frames.
+    """
+
+    before: Tensor
+    after: Tensor
+    rows: Tensor
+    seen: Tensor
+    places: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """For every frame and group the keyframe before (or at) it and the one after.
+
+    Before the first and behind the last keyframe the nearest one is held.
+
+    Attributes:
+        frame: (T, 1) number of each frame.
+        before, after: (B, T, G) frames of the two.
+        has_before, has_after: (B, T, G) bool.
+        ramp: a line to a keyframe begins at most this many frames before it, and the keyframe before is held until
+            then; None: a line all the way, the paper's. Ours, because a stream draws its keyframes a few frames ahead:
+            a line that begins earlier would jump when its end is drawn.
+    """
+
+    frame: Tensor
+    before: Tensor
+    after: Tensor
+    has_before: Tensor
+    has_after: Tensor
+    ramp: int | None = None
+
+    @classmethod
+    def in_mask(cls, mask: Tensor, ramp: int | None = None) -> Neighbours:
+        """Return the neighbours in a mask (B, T, G)."""
+        t = mask.shape[1]
+        frame = torch.arange(t, device=mask.device)[:, None]
+        key = mask > 0.5
+        before = torch.where(key, frame, -1).cummax(1).values
+        after = t - 1 - torch.where(key, t - 1 - frame, -1).flip(1).cummax(1).values.flip(1)
+        return cls.at(before, after, ramp)
+
+    @classmethod
+    def at(cls, before: Tensor, after: Tensor, ramp: int | None = None) -> Neighbours:
+        """Return neighbours from the keyframes (B, T, G) at or before each frame (-1: none) and at or after (T)."""
+        t = before.shape[1]
+        frame = torch.arange(t, device=before.device)[:, None]
+        has_before, has_after = before >= 0, after < t
+        return cls(
+            frame=frame,
+            before=torch.where(has_before, before, after).clamp(0, t - 1),
+            after=torch.where(has_after, after, before).clamp(0, t - 1),
+            has_before=has_before,
+            has_after=has_after,
+            ramp=ramp,
+        )
+
+    def last(self, frames: int) -> Neighbours:
+        """Return those of this many frames at the end alone."""
+        return Neighbours(
+            frame=self.frame[-frames:],
+            before=self.before[:, -frames:],
+            after=self.after[:, -frames:],
+            has_before=self.has_before[:, -frames:],
+            has_after=self.has_after[:, -frames:],
+            ramp=self.ramp,
+        )
+
+    @property
+    def since(self) -> Tensor:
+        """Return the frames (B, T, G) since the keyframe before."""
+        return (self.frame - self.before).clamp(min=0)
+
+    @property
+    def until(self) -> Tensor:
+        """Return the frames (B, T, G) until the keyframe after."""
+        return (self.after - self.frame).clamp(min=0)
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """Return the weight (B, T, G) of the keyframe after: 0 at the one before, 1 at the one after."""
+        begin = self.before if self.ramp is None else torch.maximum(self.before, self.after - self.ramp)
+        span = (self.after - begin).clamp(min=1)
+        return ((self.frame - begin) / span).clamp(0.0, 1.0)
+
+    def interpolate(self, values: Tensor) -> Tensor:
+        """Return (B, T, G, D) on the lines between values (B, S, G, D) at keyframes; T are the frames in here."""
+        index = [i[..., None].expand(-1, -1, -1, values.shape[-1]) for i in (self.before, self.after)]
+        first, second = (values.gather(1, i) for i in index)
+        return first + (second - first) * self.weight[..., None]
+
+    def positions(self) -> Tensor:
+        """Return binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
+        powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
+        bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
+        ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
+        return torch.cat([bits.flatten(-2).to(ends), ends], dim=-1)
+
+
+# --- Errors of all stretches, and the best k keyframes ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Squared errors of the stretches of N tracks of T frames.
+
+    Attributes:
+        inside: (N, T, T) between keyframes i < j; infinite where j <= i.
+        before: (N, T) of holding j back to the start; after: (N, T) of holding i to the end.
+    """
+
+    inside: Tensor
+    before: Tensor
+    after: Tensor
+
+    def bounded(self, max_gap: int) -> Segments:
+        """Return these without stretches of more than `max_gap` frames, also to both ends."""
+        t = self.before.shape[-1]
+        frame = torch.arange(t, device=self.before.device)
+        return Segments(
+            self.inside.masked_fill(frame[None, :] - frame[:, None] > max_gap, torch.inf),
+            self.before.masked_fill(frame > max_gap, torch.inf),
+            self.after.masked_fill(t - 1 - frame > max_gap, torch.inf),
+        )
+
+    def through(self, chosen: Tensor) -> Segments:
+        """Return these without stretches that pass over any of the `chosen` frames (N, T)."""
+        seen = chosen.cumsum(-1)  # chosen frames up to and including t
+        ahead = seen - chosen
+        passed = ahead[:, None, :] - seen[:, :, None] > 0.5  # strictly between i and j
+        return Segments(
+            self.inside.masked_fill(passed, torch.inf),
+            self.before.masked_fill(ahead > 0.5, torch.inf),
+            self.after.masked_fill(seen[:, -1:] - seen > 0.5, torch.inf),
+        )
+
+
+def segments(gram: Tensor) -> Segments:
+    """Return the errors of every stretch from the Gram matrix (N, T, T) of the frames, <x_s, x_t>.
+
+    With w = (s - i) / (j - i) the frame s on the line is (1 - w) x_i + w x_j, so its squared error is
+
+        |x_s|^2 - 2 (1 - w) <x_s, x_i> - 2 w <x_s, x_j> + (1 - w)^2 |x_i|^2 + 2 w (1 - w) <x_i, x_j> + w^2 |x_j|^2,
+
+    a sum of Gram entries weighted by 1, s and s^2: prefix sums over s make every stretch O(1).
+    """
+    t = gram.shape[-1]
+    s = torch.arange(t, dtype=gram.dtype, device=gram.device)
+    square = gram.diagonal(dim1=-2, dim2=-1)  # |x_s|^2, (N, T)
+    p0, p1 = gram.cumsum(-2), (gram * s[:, None]).cumsum(-2)  # sums over frames s of <x_s, x_i> and s <x_s, x_i>
+    norm = square.cumsum(-1)
+
+    own0, own1 = p0.diagonal(dim1=-2, dim2=-1), p1.diagonal(dim1=-2, dim2=-1)  # at s = i
+    # Sums over i < s <= j, as matrices (i, j); the interpolation error is zero at s = j, so j may be included.
+    sum0_i = p0.transpose(-1, -2) - own0[..., :, None]  # of <x_s, x_i>
+    sum1_i = p1.transpose(-1, -2) - own1[..., :, None]  # of s <x_s, x_i>
+    sum0_j = own0[..., None, :] - p0  # of <x_s, x_j>
+    sum1_j = own1[..., None, :] - p1  # of s <x_s, x_j>
+    n = (s[None, :] - s[:, None]).clamp(min=1.0)  # j - i
+    i = s[:, None]
+    w_i = sum0_i - (sum1_i - i * sum0_i) / n  # sum of (1 - w) <x_s, x_i>
+    w_j = (sum1_j - i * sum0_j) / n  # sum of w <x_s, x_j>
+    ww = (n + 1) * (2 * n + 1) / (6 * n)  # sum of w^2 over s = i + 1 .. j
+    w1w = (n + 1) / 2 - ww  # sum of w (1 - w)
+    vv = n - (n + 1) + ww  # sum of (1 - w)^2
+    error = norm[..., None, :] - norm[..., :, None] - 2 * w_i - 2 * w_j
+    error = error + vv * square[..., :, None] + 2 * w1w * gram + ww * square[..., None, :]
+    inside = error.clamp(min=0.0).masked_fill(s[None, :] <= s[:, None], torch.inf)
+
+    total0 = p0[..., -1, :]  # sum over all s of <x_s, x_i>
+    before = norm - 2 * own0 + (s + 1) * square
+    after = norm[..., -1:] - norm - 2 * (total0 - own0) + (t - 1 - s) * square
+    return Segments(inside, before.clamp(min=0.0), after.clamp(min=0.0))
+
+
+def best_frames(cost: Segments, count: int) -> Tensor:
+    """Return the frames (N, count) of the best `count` keyframes.
+
+    best[j] = min_i best[i] + inside[i, j], `count` - 1 times; the way back from the cheapest end gives the frames.
+    """
+    best, parents = cost.before, []
+    for _ in range(count - 1):
+        best, parent = (best[:, :, None] + cost.inside).min(dim=1)
+        parents.append(parent)
+    path = [(best + cost.after).argmin(dim=1, keepdim=True)]
+    for parent in reversed(parents):
+        path.append(parent.gather(1, path[-1]))
+    return torch.cat(path[::-1], dim=1)
+
+
+def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
+    """Return the error (N, most, T) of the best mask of 1..`most` keyframes with the `chosen` frames and frame t.
+
+    `chosen`: (N, T). Infinite where that many keyframes cannot include them all. The best next keyframe is where this
+    is smallest. ahead[m][t] is the least error up to t of m keyframes that end with t, behind[m][t] that from t on;
+    two paths that meet at t count it twice: k = m + m' - 1.
+    """
+    allowed = cost.through(chosen)
+    ahead, behind = [allowed.before], [allowed.after]
+    for _ in range(most - 1):
+        ahead.append((ahead[-1][:, :, None] + allowed.inside).amin(dim=1))
+        behind.append((allowed.inside + behind[-1][:, None, :]).amin(dim=2))
+    forward, backward = torch.stack(ahead, 1), torch.stack(behind, 1)  # (N, most, T)
+    totals = [(forward[:, :k] + backward[:, :k].flip(1)).amin(dim=1) for k in range(1, most + 1)]
+    return torch.stack(totals, 1)
+
+
+def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
+    """Return the error (N,) of a mask (N, T): the sum over its stretches, infinite for a mask without keyframes."""
+    key = mask > 0.5
+    frame = torch.arange(mask.shape[1], device=mask.device).expand(mask.shape)
+    last = torch.where(key, frame, -1).cummax(1).values
+    previous = torch.cat([torch.full_like(last[:, :1], -1), last[:, :-1]], dim=1)
+    between = cost.inside.gather(1, previous.clamp(min=0)[:, None])[:, 0]
+    at_key = torch.where(previous >= 0, between, cost.before)
+    behind = cost.after.gather(1, last[:, -1:].clamp(min=0))[:, 0]
+    total = torch.where(key, at_key, 0.0).sum(1) + behind
+    return total.masked_fill(~key.any(1), torch.inf)
+
+
+# --- As many keyframes as pay for themselves --------------------------------------------------------------------------
+#
+# The paper gives every window the same number of keyframes. Motion far away then decides about keyframes here: a nod
+# takes them from the stillness around it and from the next second's smile. With a cost per keyframe, one stands where
+# it saves more than its cost, wherever the others stand: none in stillness except those that `max_gap` requires, many
+# in a nod, and the two sides of a keyframe that two motions share are placed alike.
+#
+#     best[j] = cost + min(before[j], min_i best[i] + stretch[i, j])
+#
+# `stretch[i, j]` is the error between keyframes i and j of `Neighbours.interpolate`: keyframe i is held until the ramp
+# begins at frame b = j - r, r = min(ramp, j - i), then a straight line. With u = max(0, s - b) / r,
+#
+#     stretch[i, j] = sum over i < s <= j of |x_s - (1 - u) x_i - u x_j|^2
+#                   = (sum |x_s|^2 - 2 <x_j, sum u x_s> + ww |x_j|^2)        depends on j, but for where the sum begins
+#                     + (j - i - r + vv) |x_i|^2 - 2 <x_i, sum x_s - sum u x_s - mixed x_j>
+#
+# with ww = sum u^2, mixed = sum u (1 - u), vv = sum (1 - u)^2 over the ramp. With prefix sums all but one product
+# <x_i, y[j]> depends on i or on j alone: a stretch costs one dot product.
+
+
+@torch.no_grad()
+def place_penalised(
+    motion: Tensor, costs: Sequence[float], member: Tensor, max_gap: int | None = None, ramp: int | None = None
+) -> Tensor:
+    """Return the mask (B, T, G) with the least squared error plus costs of its keyframes, at least one per group.
+
+    Args:
+        motion: (B, T, C); scale the channels by how much each matters.
+        costs: (G,) of a keyframe, above 0, in squared units of the motion summed over a group's channels.
+        member: (G, C), 1 where a channel belongs to a group.
+        max_gap: at most this many frames from one keyframe to the next and to both ends; None for no bound.
+        ramp: see above; None for straight lines all the way.
+    """
+    t = motion.shape[1]
+    gap = t if max_gap is None else min(max_gap, t)
+    cost = np.array(costs, np.float64)
+    if not (cost > 0).all():
+        raise ValueError(f"keyframe costs: not all above 0: {list(costs)}")
+    mask = torch.zeros(len(motion), t, len(cost), dtype=motion.dtype)
+    for row, one in enumerate(motion.detach().double().cpu().numpy()):
+        own = [one[:, channels > 0.5] for channels in member.cpu().numpy()]
+        parts = [_stretches(x, gap, ramp) for x in own]
+        before, inside, after = (np.stack(part) for part in zip(*parts, strict=True))
+        for group, frames in enumerate(_cheapest(cost, before, inside, after)):
+            mask[row, frames, group] = 1.0
+    return mask.to(motion.device)
+
+
+def _stretches(x: Doubles, gap: int, ramp: int | None) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the errors of one track x (T, c), infinite where a gap is too large.
+
+    Returns:
+        Held back from each frame to the start (T,); to each frame from the keyframe d frames before it, at column
+        gap - d (T, gap); held from each frame to the end (T,).
+    """
+    t = len(x)
+    x = x - x.mean(axis=0)  # keeps the sums small
+    frame = np.arange(t)
+    norm = (x**2).sum(axis=1)
+    s0, p0, p1 = norm.cumsum(), x.cumsum(axis=0), (x * frame[:, None]).cumsum(axis=0)
+    own = -s0 + 2 * (x * p0).sum(axis=1)  # terms of keyframe i alone
+    inside = np.full((t, gap), np.inf)
+    for d in range(1, min(gap, t - 1) + 1):
+        r = d if ramp is None else min(ramp, d)
+        if d == r:  # from d = ramp on the ramp is the same
+            u = np.arange(1, r + 1) / r
+            ww, mixed, vv = (u**2).sum(), (u * (1 - u)).sum(), ((1 - u) ** 2).sum()
+            begin = np.maximum(frame - r, 0)
+            rising = (p1 - p1[begin] - begin[:, None] * (p0 - p0[begin])) / r  # sum of u x_s
+            y = p0 - rising - mixed * x
+            ends = s0 - 2 * (x * rising).sum(axis=1) + ww * norm  # terms of keyframe j alone
+        i, j = slice(0, t - d), slice(d, t)
+        inside[j, gap - d] = ends[j] + own[i] + (d - r + vv) * norm[i] - 2 * np.einsum("tc,tc->t", x[i], y[j])
+    before = s0 - 2 * (x * p0).sum(axis=1) + (frame + 1) * norm
+    after = s0[-1] - s0 - 2 * (x * (p0[-1] - p0)).sum(axis=1) + (t - 1 - frame) * norm
+    before[frame > gap] = np.inf
+    after[t - 1 - frame > gap] = np.inf
+    return np.maximum(before, 0), np.maximum(inside, 0), np.maximum(after, 0)
+
+
+def _cheapest(cost: Doubles, before: Doubles, inside: Doubles, after: Doubles) -> list[list[int]]:
+    """Return the keyframes of every group, last to first, from `cost` (G,) and `_stretches` of each group."""
+    groups, t, gap = inside.shape
+    best = before + cost[:, None]
+    parent = np.full((groups, t), -1)
+    every = np.arange(groups)
+    for j in range(1, t):
+        first = max(0, j - gap)
+        options = best[:, first:j] + inside[:, j, gap - (j - first) :]
+        i = options.argmin(axis=1)
+        total = options[every, i] + cost
+        better = total < best[:, j]
+        best[better, j], parent[better, j] = total[better], first + i[better]
+    chosen: list[list[int]] = []
+    for group, at in enumerate((best + after).argmin(axis=1).tolist()):
+        chosen.append([])
+        while at >= 0:
+            chosen[-1].append(at)
+            at = int(parent[group, at])
+    return chosen
