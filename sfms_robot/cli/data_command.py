@@ -35,7 +35,7 @@ def compose(
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
     from sfms_robot.cli.show_learning import show
-    from sfms_robot.lab.train.datasets import compose_dyads
+    from sfms_robot.lab.corpora.data_commands import compose_dyads
 
     show(compose_dyads(data, out, minutes, seed, overwrite), json)
 
@@ -51,7 +51,7 @@ def check(
 ) -> None:
     """Read a whole data set once: what is there, and everything that is wrong with it."""
     from sfms_robot.cli.show_learning import print_check, show
-    from sfms_robot.lab.train.datasets import check_data
+    from sfms_robot.lab.corpora.data_commands import check_data
 
     report = check_data(folder, layout, order.value if order else None, window)
     show(report, json, partial(print_check, channels=channels))
@@ -73,7 +73,7 @@ def convert(
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and tell what is lost."""
     from sfms_robot.cli.show_learning import print_conversion, show
-    from sfms_robot.lab.train.data_conversion import convert_data
+    from sfms_robot.lab.corpora.data_commands import convert_data
 
     show(convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order), json,
          print_conversion)  # fmt: skip

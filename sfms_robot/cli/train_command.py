@@ -71,7 +71,7 @@ def tokenizer(
     if dry_run:
         _show_dry_run(config, json)
         return
-    from sfms_robot.lab.train.train_runs import TrainOptions, train_tokenizer
+    from sfms_robot.lab.learning.train_runs import TrainOptions, train_tokenizer
 
     data, out = _both(data, out)
     placed = placement.value if placement else None
@@ -102,7 +102,7 @@ def listener(
     if dry_run:
         _show_dry_run(config, json)
         return
-    from sfms_robot.lab.train.train_runs import TrainOptions, train_listener
+    from sfms_robot.lab.learning.train_runs import TrainOptions, train_listener
 
     data, out = _both(data, out)
     options = TrainOptions(
@@ -124,7 +124,7 @@ def events(
 ) -> None:
     """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
     from sfms_robot.cli.show_learning import print_figures, show
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     show(interruptible(lambda: train_events(data, out, all_series, seed)), json, print_figures)
 
@@ -139,7 +139,7 @@ def idle(
 ) -> None:
     """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
     from sfms_robot.cli.show_learning import show
-    from sfms_robot.lab.train.idle_training import train_idle
+    from sfms_robot.lab.learning.idle_fit import train_idle
 
     show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
 
@@ -154,7 +154,7 @@ def _both(data: Path | None, out: Path | None) -> tuple[Path, Path]:
 def _show_dry_run(config: Path, json: bool) -> None:
     from sfms_robot.cli.show_learning import print_dry_run, show
     from sfms_robot.config import load_training
-    from sfms_robot.lab.train.dry_run import dry_run
+    from sfms_robot.lab.learning.dry_run import dry_run
 
     show(dry_run(load_training(config)), json, print_dry_run)
 

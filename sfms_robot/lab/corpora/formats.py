@@ -21,15 +21,15 @@ from sfms_robot.lab.corpora import stored
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
-from sfms_robot.lab.corpora.external import dualtalk, l2l, lm_listener, react, react2025, seamless, vico
+from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
 from sfms_robot.lab.corpora.reading import pose_last
 from sfms_robot.signals.audio_features import Feature, cached
 
 LAYOUTS: Final = {
     layout.name: layout
     for layout in (
-        l2l.LAYOUT, lm_listener.LAYOUT, react.LAYOUT, react2025.LAYOUT, dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT,
-        vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
+        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.REACT2025_LAYOUT,
+        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}

@@ -16,10 +16,10 @@ import numpy as np
 from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.corpora.meeting_evidence import meeting_evidence
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S
 from sfms_robot.lab.evaluation.reference_hazard import mute
 from sfms_robot.lab.learning.events.event_trainer import scene_of
+from sfms_robot.lab.learning.events.labels import meeting_evidence
 from sfms_robot.listeners.events.evidence import Ints, heard_in
 from sfms_robot.listeners.events.hazards import STEP_FRAMES
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, DecideMemory, EventModel

@@ -27,16 +27,18 @@ from sfms_robot.frames import (
     Floats,
     ListenerEvent,
 )
-from sfms_robot.lab.corpora.compose.motions import SHAPE, edges, slow
-from sfms_robot.lab.corpora.compose.splicing import (
+from sfms_robot.lab.corpora.compose.motions import (
     FADE,
+    SHAPE,
     SMILE,
+    edges,
     first_frame,
     held,
     laid_event,
     over,
     pick,
     placed,
+    slow,
     stretched,
     tiled,
 )

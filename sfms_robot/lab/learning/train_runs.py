@@ -21,12 +21,11 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.evaluation.sampling_calibration import calibrate, rounds
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.job import Run, Watch, progress_bar, tensorboard, together
 from sfms_robot.lab.learning.process_group import joined, local_rank
 from sfms_robot.lab.learning.resume import checkpoint_file
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.watch import Watch, progress_bar, tensorboard, together
 from sfms_robot.listeners import checkpoint
 
 DEVICES = ("auto", "cpu", "cuda")
