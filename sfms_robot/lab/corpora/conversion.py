@@ -29,7 +29,7 @@ _UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
 
 @dataclass
 class Residual:
-    """What conversion lost, over all clips so far: of listeners' motion, frame by frame.
+    """Loss by conversion over all clips so far, of listeners' motion, frame by frame.
 
     Attributes:
         pose_rad: largest angle between a head as filed and as read back from ours in the source's own terms.
@@ -160,7 +160,7 @@ def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
 
 
 def names() -> Mapping[str, str]:
-    """What each figure of `Residual.told` means, for a person."""
+    """Return the meaning of each figure of `Residual.told`, as text."""
     return {
         "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
         "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",

@@ -91,9 +91,9 @@ def scanned(layout: Layout, place: Path, split: str, order: Order | None, progre
 
 
 def _features(dataset: Dataset, task: Any, advance: Callable[[Any], None]) -> tuple[dict[str, int], Sequence[Problem]]:
-    """How many clips have each shipped feature, and what is wrong with those of the others.
+    """Return how many clips have each shipped feature, and the problems of the others.
 
-    A feature that no clip has is not shipped here: that is a count of 0, not a problem of every clip.
+    A feature that no clip has is not shipped: a count of 0, not a problem of every clip.
     """
     counts: Counter[str] = Counter()
     problems: dict[str, list[Problem]] = {}
@@ -211,16 +211,17 @@ def convert_data(
     flame_matrix: Path | None = None,
     flame_order: str = "alphabetical",
 ) -> dict[str, Any]:
-    """Every split of `folder` as out/SPLIT/NAME.npz in `arkit58` at 25 fps, and out/source.yaml with their licence.
+    """Write every split of `folder` as out/SPLIT/NAME.npz in `arkit58` at 25 fps, and out/source.yaml with their
+    licence.
 
-    One clip is held in memory at a time. What cannot be used is left out and counted.
+    One clip is held in memory at a time. Clips that cannot be used are left out and counted.
 
     Returns:
         folder, out, layout, licence, per split: clips, minutes, left_out (by kind, with the first), notes; `residual`:
-        figures of `Residual.told`, measured on the listeners' motion; notes: what our space cannot show.
+        figures of `Residual.told`, measured on the listeners' motion; notes: parts that our space cannot show.
 
-    Raises ConfigError for a folder that is no data set, a space that cannot become ours, an `out` that holds something,
-    a matrix that is none, and where no clip can be used.
+        Raises ConfigError for a folder without a data set, a space that cannot become ours, an `out` that is not empty,
+        an invalid matrix, and where no clip can be used.
     """
     found, place = formats.detect(folder, layout)
     if found.space not in CONVERTIBLE:

@@ -116,7 +116,7 @@ def open_for(space: str, folder: Path, split: str, order: Order | None = None, f
 
 
 def scan_split(layout: Layout, place: Path, split: str, order: Order | None = None) -> Dataset:
-    """One split as it is, empty or in the wrong order: for `data check`."""
+    """Return one split unchecked, even if empty or in the wrong order: for `data check`."""
     return _split(layout, place, split, _checked(order, layout))
 
 

@@ -1,9 +1,9 @@
-"""What a listener leaves out of the small motion of resting faces, as `listeners.idle_motion` draws it.
+"""Small motion of resting faces that a listener lacks, as `listeners.idle_motion` draws it.
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
 region, are the patterns, and their powers by band the spectrum, less what such short windows show of other bands. The
-slowest band is what differs from window to window, of whichever person. Where the listener and its patterns together
+slowest band is the difference between windows, over all people. Where the listener and its patterns together
 rest, and where people do, are quantiles of all frames of these windows.
 """
 
@@ -71,7 +71,9 @@ def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats |
 
 
 def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
-    """What `ours` lack of `theirs`; one entry a person. Raises ValueError where either has no window at all."""
+    """Return the idle motion that `ours` lack beside `theirs`; one entry a person. Raises ValueError without any
+    window.
+    """
     people, listener = ([one.windows for one in faces if len(one.windows)] for faces in (theirs, ours))
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
@@ -178,21 +180,25 @@ TOLD: Final = 8  # channels that move most, in the figures
 
 
 def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
-    """Roll the listener out over `clips` dyads of training, told their events, and write what its resting face lacks.
+    """Roll the listener out over `clips` training dyads with their events, and write the idle motion that it lacks.
 
-    Without the idle motion of an earlier run. Raises ConfigError for a listener that is told of no events, data that
-    do not say them, or faces that never rest. Blocks for about a minute.
+    The idle motion of an earlier run is left out. Raises ConfigError for a listener without events, data without them,
+    or faces that never rest. Blocks for about a minute.
     """
     one_thread()
     folder = find("listeners", name, "config.yaml")
     settings = load_config(folder)
     if not settings.events:
-        raise ConfigError(f"{folder}: is told of no events; what it draws at rest cannot be told from them")
+        raise ConfigError(
+            f"{folder}: expected a listener with events; without them rest and events cannot be separated"
+        )
     every = open_for("arkit58", data, "train")
     rows = np.linspace(0, len(every) - 1, min(clips, len(every))).round().astype(int).tolist()
     chosen = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(every.clips[row] for row in rows)))]
     if not chosen or any(dyad.events is None for dyad in chosen):
-        raise ConfigError(f"{data}: its dyads do not say when listeners blink and smile; what rests cannot be told")
+        raise ConfigError(
+            f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
+        )
     how = LISTENER_KINDS[settings.kind].load_folder(folder)
     with Progress(console=Console(stderr=True)) as progress:
         playing = progress.add_task(f"{name} listens", total=len(chosen))
@@ -210,7 +216,7 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
 
 
 def figures(idle: IdleMotion) -> dict[str, Any]:
-    """How many patterns, how much people differ, and the deviation that it adds to those that move most."""
+    """Return the number of patterns, the spread over people, and the largest deviations that it adds."""
     added = explained(idle)
     most = np.argsort(-added)[:TOLD]
     return {

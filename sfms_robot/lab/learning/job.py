@@ -1,4 +1,4 @@
-"""What the training loop is told, and what it tells: the values that travel between a trainer, `fit` and its watchers.
+"""Values that travel between a trainer, the training loop `fit` and its watchers.
 
 A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.training_loop.fit`:
 
@@ -20,7 +20,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
 Five duties make a resumed run bit-identical on a CPU:
  - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
    or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
- - it takes as many samples as it is told: `phase.batch`, or the part of them that is a piece of a step
+ - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
  - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
@@ -90,7 +90,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Report:
-    """What a watcher sees after every step. `position.held_out` is fresh when `looked`."""
+    """Report to a watcher after every step. `position.held_out` is new when `looked`."""
 
     name: str
     steps: int
@@ -108,13 +108,13 @@ def unwatched(report: Report) -> None:
 
 @dataclass(frozen=True)
 class Run:
-    """How a job is run rather than what it is: the same job gives the same weights whoever watches.
+    """Settings of running a job that do not change its weights.
 
     Attributes:
         group: the processes that run it together.
         accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
-            Into how many pieces a batch is cut is part of what a run is, who takes them is not: a run goes on with any
-            number of processes that can share its pieces.
+            The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
+                    resumed with any number of processes that can share its pieces.
         scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
     """
 
@@ -132,7 +132,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended. `loss` is smoothed and of the last step; `held_out` is of the weights the model now holds."""
+    """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
+    holds.
+    """
 
     loss: float
     held_out: float | None

@@ -1,7 +1,7 @@
-"""The training loop every model shares: `fit` runs a `Job` to its end and survives whatever interrupts it.
+"""The training loop of all models: `fit` runs a `Job` to its end and can be interrupted and resumed.
 
 One step: draw data, loss, gradients, clip, AdamW with a warmed-up cosine rate. Between steps: the held-out loss with
-early stop, and checkpoints from which a run goes on bit for bit (on a CPU). How to write a trainer: `learning.job`.
+early stop, and checkpoints from which a run continues bit for bit (on a CPU). How to write a trainer: `learning.job`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> 
 def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> Outcome:  # noqa: B008
     """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
-    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` goes on from there, and a run that had finished
+    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
     only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
     the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
     checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
@@ -66,7 +66,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     if run.resume:
         position, best = resume.load(file, job, generator)
     elif group.first and (left := resume.peek(file)) is not None and not left.finished:
-        log.warning("%s: was at step %d, begins anew; --resume would have gone on", file, left.step)
+        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left.step)
     began_at = position.step
 
     saved_s = before_s = clock()
@@ -96,7 +96,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             if interrupted:
                 raise KeyboardInterrupt(
                     f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
-                    "the same command with --resume goes on"
+                    "the same command with --resume continues"
                 )
     if best is not None:
         job.model.load_state_dict(best)
@@ -140,7 +140,7 @@ def make_step(
     try:
         value, asked = gradients.group.mean([gradients.of(step, generator), float(pressed)])
     except GroupError as error:
-        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume goes on)") from error
+        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume continues)") from error
     norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
     if not math.isfinite(value) or not math.isfinite(norm):
         broken = f"loss {value:g}, gradient norm {norm:g} at step {step}: not finite"
@@ -203,9 +203,9 @@ def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
 
 @contextmanager
 def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone.
+    """Yield a function that returns whether Ctrl-C was pressed; inside, the first one only raises the flag.
 
-    `patient`: so do all others; whoever started this process (torchrun) passes the terminal's on as its own.
+    `patient`: later ones too, since torchrun passes on those of the terminal. Signals reach the main thread only.
     """
     pressed = threading.Event()
 
@@ -247,7 +247,7 @@ def pieces_of(job: Job, run: Run, file: Path) -> int:
 
 
 class Gradients:
-    """What fills the gradients of a job's parameters, step by step; alike in all processes of the group."""
+    """Gradients of a job's parameters, filled step by step; the same in all processes of the group."""
 
     def __init__(self, job: Job, group: ProcessGroup, pieces: int, file: Path) -> None:
         self.job, self.group, self.file = job, group, file
@@ -293,7 +293,7 @@ class _Loss(nn.Module):
 
 
 def multiplies_bf16(device: torch.device) -> bool:
-    """Whether bf16 is faster there than fp32; a processor without such instructions only pretends."""
+    """Return whether bf16 is faster than fp32 on this device; a processor without such instructions emulates it."""
     return device.type == "cuda" or (device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
 
 

@@ -1,17 +1,18 @@
 """Composed dyads: real timing, real movement, put together here.
 
-Real are: when somebody nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod, and
-when they look at him (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech
-sounds (`voices`). That they belong together is ours: the voice says other words than the meeting did, only its phrases
-begin and end when they did. Meetings, people, takes and voices kept for validation and test are whole ones (`splits`).
+Recorded are: when a listener nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod,
+and when they look at the listener (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
+how speech sounds (`voices`). Their combination is ours: the voice says other words than the meeting did, only its
+phrases begin and end at the same times. Meetings, people, takes and voices kept for validation and test are whole ones
+(`splits`).
 
-All others of a meeting become one speaker. Whoever holds the floor sits straight ahead, and looks at the listener when
-he was annotated to; where nobody annotated his gaze he looks at random and `Dyad.attention` is unknown, as it is while
-no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, his looks
-are drawn from how long looks last in the training part (`looks`), and so is their order, which is ours.
+All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
+when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
+no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, looks are
+drawn from the durations in the training split (`speaking.Dwell`), in an order of ours.
 
-Stretches with nods, above all those with nods at the end of a phrase, and those in which he is spoken to are drawn more
-often than they are in the meetings; asked for enough minutes, a set holds every stretch once.
+Stretches with nods, above all at the end of a phrase, and those in which the listener is addressed are drawn more often
+than they occur in the meetings; a set of enough minutes holds every stretch once.
 
 A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
@@ -79,7 +80,7 @@ class Stretch:
     Attributes:
         nods_per_minute: of listening time.
         answers: nods that begin 0 to 0.8 s after the end of a phrase.
-        addressed: share of the time in which whoever holds the floor is known to look at him.
+        addressed: share of the time in which the person with the floor is known to look at the listener.
     """
 
     person: Person
@@ -91,7 +92,9 @@ class Stretch:
 
     @property
     def weight(self) -> float:
-        """How often it is drawn: more for nods, for nods when a phrase ends, and for being addressed."""
+        """Return how often the stretch is drawn: more for nods, for nods when a phrase ends, and for being
+        addressed.
+        """
         base, most, answer, answers, addressed = _WEIGHTS
         nods = min(self.nods_per_minute, most) + answer * min(self.answers, answers)
         return base + nods + addressed * self.addressed
@@ -107,7 +110,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Material:
-    """What the dyads of one part are made of."""
+    """Recordings and annotations that the dyads of one split are made of."""
 
     people: Sequence[Person]
     voices: Sequence[Voice]
@@ -214,7 +217,7 @@ def conversations(material: Mapping[Split, Material], seed: int, minutes: float)
 
 
 def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
-    """Dyads in which the agent speaks and nobody answers; none of a part without filmed voices."""
+    """Return dyads in which only the agent speaks; none for a split without filmed voices."""
     for number, split in enumerate(SPLITS):
         wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
         part = material[split]
@@ -240,9 +243,10 @@ def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -
 
 
 def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
-    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and that make the scene.
+    """Cut the time of each person into pieces of 30 to 60 s; keep those on camera that fit the scene.
 
-    Listening: he mostly listens. Interaction: he talks a fifth of the time or more, and so do the others together.
+    Listening: the person mostly listens. Interaction: the person talks at least a fifth of the time, and so do the
+    others.
     """
     found = []
     for person in people:
@@ -356,7 +360,7 @@ def speaker_of(
     rng: np.random.Generator,
     laughter: Sequence[Floats] = (),
 ) -> tuple[Floats, Floats]:
-    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
+    """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
     person, frames = stretch.person, stretch.frames
     said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
     speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
@@ -369,9 +373,9 @@ def speaker_of(
 
 
 def attention_of(stretch: Stretch) -> Floats:
-    """(N,) 1 where whoever holds the floor looks at him, 0 where not, NaN where nobody annotated where that one looks.
+    """Return (N,) 1 where the person with the floor looks at the listener, 0 where not, NaN where it was not annotated.
 
-    The floor is held by who began the latest phrase of a second or more.
+    The floor belongs to the person who began the latest phrase of a second or more.
     """
     person = stretch.person
     holder = np.full(stretch.frames, "", dtype="<U1")
@@ -392,7 +396,7 @@ def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -
 
 
 def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
-    """Looks away from whoever has the floor, in seconds of the stretch: annotated ones, or drawn ones."""
+    """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
     if stretch.person.gaze is None:
         return dwell.looks(stretch.frames * FRAME_S, rng)
     return tuple(

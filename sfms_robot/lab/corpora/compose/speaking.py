@@ -1,7 +1,7 @@
-"""Dyads in which the agent speaks and nobody answers: filmed recordings as they are, voice and mouth together.
+"""Dyads in which only the agent speaks: filmed recordings, voice and mouth together.
 
-This is the one place where lips and sound are of one moment and one person throughout; the head and the rest of the
-face come from other recordings. What `--agent-audio` asks of a listener is learned and judged here.
+Only here lips and sound are of one moment and one person throughout; the head and the rest of the face come from other
+recordings. Models learn from these dyads to follow `--agent-audio`, and are scored on them.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ _PLACES: Final = {"table": "down", "slide-screen": "screen", "whiteboard": "scre
 
 @dataclass(frozen=True)
 class Dwell:
-    """How long (seconds each) people looked at whoever had the floor, and elsewhere: where, and how long."""
+    """Durations [s] of looks at the person with the floor, and of looks elsewhere with their target."""
 
     at_s: tuple[float, ...]
     away: tuple[tuple[float, str], ...]
@@ -123,7 +123,7 @@ class Dwell:
 
 
 def learn_dwell(people: Sequence[Person]) -> Dwell:
-    """From everybody whose gaze was annotated; an empty one where nobody's was."""
+    """Return the durations of all people with annotated gaze; empty where there are none."""
     rng = np.random.default_rng(0)
     at_s: list[float] = []
     elsewhere: list[tuple[float, str]] = []

@@ -1,14 +1,16 @@
 """Seamless Interaction (Agrawal et al. 2025; facebookresearch/seamless_interaction @ acc817c): two people face to face.
 
 `{improvised,naturalistic}/{train,dev,test}/BATCH/ARCHIVE/V.._S.._I.._P...{wav,json,npz}`, one of each a person;
-partners share vendor, session and interaction, and each listens to the other. `.wav` is his own voice at 48 kHz;
-`.json` has `metadata:vad`, when he speaks; `.npz` has rows at 30 Hz, of which three are read: `alignment_head_rotation`
+partners share vendor, session and interaction, and each listens to the other. `.wav` is the own voice at 48 kHz;
+`.json` has `metadata:vad`, the spans of speech; `.npz` has rows at 30 Hz, of which three are read:
+`alignment_head_rotation`
 (T, 3), `FAUValue` (T, 24) and `is_valid` (T, 1), under `movement_v4:` where that is there, else under `movement:`.
 
 Invalid frames are filled with zeros, in blocks of 2 s. A listener's clip ends where they begin; a speaker's face is
 unknown there. Rotation is taken as axis-angle in FLAME's axes (`correlations` holds that against the key points),
 relative to the head at rest: its median over the whole interaction, where a person mostly looks, which is the partner.
-Gaze, expression and head codes are a network's own and are not read, nor is the translation, whose unit nobody tells.
+Gaze, expression and head codes are outputs of a network and are not read, nor is the translation, whose unit is not
+documented.
 """
 
 from __future__ import annotations
@@ -119,7 +121,7 @@ def _packed(place: Path, split: str) -> Iterator[Path]:
 
 
 def _found(split: str, files: Mapping[str, Mapping[str, Path]], interactions: int, seen: _Seen) -> tuple[str, ...]:
-    """What is there and what is not, a line each."""
+    """Return what was found and what is missing, a line each."""
     endings = Counter(ending for one in files.values() for ending in one)
     prefixes: Counter[str] = Counter()
     for one in files.values():
@@ -380,7 +382,7 @@ def prefix_of(file: Path) -> str:
 
 
 def _speech(file: Path) -> tuple[tuple[float, float], ...]:
-    """When he speaks. Raises ClipError for what is no annotation, or goes back in time."""
+    """Return the spans of speech. Raises ClipError for an invalid annotation, or one that goes back in time."""
     try:
         told = json.loads(file.read_text(encoding="utf-8"))
         spans = [(float(one["start"]), float(one["end"])) for one in told[VAD]]
@@ -432,7 +434,7 @@ def voice_of(person: Person, first: int, frames: int) -> Floats:
 
 
 def lag_s(active: NDArray[np.bool_], voice: Floats) -> float:
-    """By how much a voice comes after what is annotated of it, (N,) at 30 Hz; 0 where it cannot be told."""
+    """Return the delay of a voice after its annotation, (N,) at 30 Hz; 0 where it is not known."""
     heard = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / FPS), bool)
     told = np.pad(active, (0, max(0, len(heard) - len(active))))[: len(heard)]
     reach = int(_LAGS_S * FPS)

@@ -92,11 +92,11 @@ GROUPS: Final[Mapping[str, Groups]] = {
 
 @dataclass(frozen=True)
 class Student:
-    """One person in one meeting, ready to be taught from: M steps of 80 ms.
+    """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
         evidence: (M, len(EVIDENCE)) as each step begins.
-        listening, others: (N,) frames in which he listens, and in which somebody else speaks.
+        listening, others: (N,) frames in which the person listens, and in which another one speaks.
         lessons: by kind.
     """
 
@@ -108,7 +108,7 @@ class Student:
 
 
 def student(person: Person, rng: np.random.Generator) -> Student:
-    """Evidence and lessons of one person; `rng` draws the events that nobody annotated."""
+    """Return the training rows of one person; `rng` draws the events that were not annotated."""
     meeting = meeting_evidence(person)
     scene = scene_of(meeting)
     spans = spans_of(person, meeting, rng)
@@ -132,12 +132,14 @@ def student(person: Person, rng: np.random.Generator) -> Student:
 
 
 def scene_of(meeting: MeetingEvidence) -> Scene:
-    """As annotators saw it; nobody annotated smiles."""
+    """Return the scene as annotated; smiles were not."""
     return Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
-    """(N,) logarithm of somebody's nods a minute of listening so far, drawn toward people's while it is short."""
+    """Return (N,) the logarithm of a person's nods per minute of listening so far, shrunk toward the mean while it
+    is short.
+    """
     begun = np.searchsorted(np.sort(nods_s[:, 0]), (np.arange(len(listening)) + 1) * FRAME_S - 1e-6)
     listened = np.cumsum(listening) / FRAME_HZ / 60
     return np.asarray(np.log((begun + PRIOR_NODS) / (listened + PRIOR_NODS / PRIOR_PER_MINUTE)))
@@ -247,7 +249,9 @@ class Ranked:
 
 
 def ranked(students: Iterable[Student], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
-    """How `score`, (M, E) -> (M,), ranks onsets above the other steps; meetings of a person by their onsets."""
+    """Return how well `score`, (M, E) -> (M,), ranks onsets above other steps; meetings of a person weighted by
+    onsets.
+    """
     found: dict[str, list[tuple[float, int]]] = {}
     for one in students:
         given = one.lessons.get(kind)

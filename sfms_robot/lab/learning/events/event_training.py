@@ -65,13 +65,13 @@ e15614560ba7b0c1121e3d82c8a6e29c57cff5bd, Apache-2.0. Blinks, brows and sizes: m
 
 def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> dict[str, Any]:
     """Write `out` (if given) and return the figures. Raises ConfigError, also for tables in which people never do what
-    is to be learned: without gaze, say, or without laughs. Without people of validation nothing is ranked.
+    is to be learned, such as gaze or laughs. Without people of validation nothing is ranked.
 
-    `all_series`: taught on everybody, those of validation and test too, so there is nothing to rank: for comparison
-    with what a study learned from the same meetings, by its recipe (89 inputs of nods, ridge 10), never for use.
+    `all_series`: train on all people, validation and test included, without ranking: only for comparison with a study
+    that used the same meetings, by its recipe (89 inputs of nods, ridge 10), never for use.
     """
     if out is not None and not out.parent.is_dir():
-        raise ConfigError(f"--out {out}: {out.parent} is no folder")
+        raise ConfigError(f"--out {out}: {out.parent} expected a folder")
     people = read_people(tables(data))
     split = split_series(people)
     parts = {"train": people if all_series else split["train"], "validation": [] if all_series else split["validation"]}

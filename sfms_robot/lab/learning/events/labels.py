@@ -1,11 +1,11 @@
-"""What people did and when they might have: the events that each hazard is taught, of one person of a meeting.
+"""Labels for the hazards: events of one person of a meeting, and the steps in which they could have happened.
 
     nod, shake, tilt, laugh, mm_hm     as annotated
-    smile, brow_raise                  nobody annotated them: drawn as in composed dyads, from laughs of others, own
+    smile, brow_raise                  not annotated: drawn as in composed dyads, from laughs of others, own
                                        "mm-hm" and nods, and from questions asked; a reaction late
-    gaze_shift                         a look away from somebody who speaks or holds the floor, where annotated
+    gaze_shift                         a look away from a person who speaks or has the floor, where annotated
 
-A hazard is asked every 80 ms; an event belongs to the step in which it begins.
+A hazard is evaluated every 80 ms; an event belongs to the step in which it begins.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def steps_of(mask: Bools) -> Bools:
 
 
 def spans_of(person: Person, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
-    """(K, 2) of everything he did, those that nobody annotated drawn."""
+    """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
     others = person.others_laughs[:, 0]
     smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
     brows = _some(person.asked, BROWS["question"], rng)
@@ -85,13 +85,13 @@ def lesson(spans_s: Doubles, listening: Bools, inside: Doubles | None = None) ->
 
 @dataclass(frozen=True)
 class Looks:
-    """Where somebody's eyes went.
+    """Gaze of one person.
 
     Attributes:
         shifts_s: (K, 2) from each shift to the next.
-        aside: (K,) not to somebody who speaks or holds the floor.
-        at_speaker: (N,) frames in which he looks at such a one.
-        away_s: (J,) instants at which he looks away from one.
+        aside: (K,) True where the target neither speaks nor has the floor.
+        at_speaker: (N,) frames with gaze at a person who speaks or has the floor.
+        away_s: (J,) instants at which the gaze leaves such a person.
     """
 
     shifts_s: Doubles
@@ -101,7 +101,7 @@ class Looks:
 
 
 def looks_of(person: Person, meeting: MeetingEvidence, counts: Bools) -> Looks:
-    """Of somebody whose gaze was annotated; `counts` (N, P) is who speaks or holds the floor (`evidence.counts_in`)."""
+    """Return the gaze of a person with annotations; `counts` (N, P) marks people who speak or have the floor."""
     frames, gaze = len(counts), person.gaze or ()
     target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
     columns = [max(0, meeting.agents.index(where)) if where in meeting.agents else 0 for _, _, where in gaze]
@@ -134,16 +134,16 @@ def per_minute(lessons: Mapping[str, Lesson]) -> float:
 
 @dataclass(frozen=True)
 class MeetingEvidence:
-    """N frames; the people are himself, then the others by letter.
+    """N frames of a meeting; the people are the participant, then the others by letter.
 
     Attributes:
         agents: letters of the P people.
         speaks: (N, P) a word of each is under way.
-        looks: (N, P) each looks at him (1) or not (0); NaN where nobody annotated, and of himself.
-        laughs: (N,) one of the others does. Nobody annotated smiles.
-        nods: (N,) one of the others begins to.
-        listening: (N,) others spoke in the last 2 s, he is silent and in view.
-        spans_s: (K, 2) of what he did, by kind.
+        looks: (N, P) each looks at the participant (1) or not (0); NaN where not annotated, and for the participant.
+            laughs: (N,) one of the others laughs. Smiles were not annotated.
+            nods: (N,) one of the others begins to nod.
+            listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
+            spans_s: (K, 2) of the participant's events, by kind.
     """
 
     agents: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""What an SFMS listener is trained on, frame by frame: both motions, the speaker's sound and the place in a phrase."""
+"""Training data of an SFMS listener, frame by frame: both motions, the speaker's sound and the place in a phrase."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class SfmsFrames:
     """N frames of dyads.
 
     Attributes:
-        motion: (N, C) listener, in the motion space of the model; what the model draws of it.
-        face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
+        motion: (N, C) listener, in the motion space of the model, the part that the model draws.
+            face: (N, C) speaker, in the same space, 0 where unknown; face_known: (N,) bool.
         sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
-        phase: (N, F) where he is in a phrase.
-        control: (N, K) what is told of the listener's events; K = 0 without.
+        phase: (N, F) the speaker's place in a phrase.
+            control: (N, K) control rows of the listener's events; K = 0 without.
         sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
     """
 
@@ -77,8 +77,8 @@ def gather(
 ) -> SfmsCorpus:
     """`corpus.gather` in one motion space.
 
-    `frontend` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
-    `settings`: of a listener that may be told of events; None: one that is not.
+    `frontend` extracts features of the sound; None leaves the sound out, which is enough for a tokenizer.
+    `settings`: of a listener that may get events; None: one that does not.
     """
     one = partial(frames_of, space=space, frontend=frontend, settings=settings)
     return dyads.gather({"listening": listened}, window, one, scratch)
@@ -87,8 +87,8 @@ def gather(
 def frames_of(
     dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
 ) -> SfmsFrames:
-    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener
-    that is told of events where the dyad does not say them.
+    """Return the frames of one dyad. Raises ConfigError for a motion space that cannot be converted, and for a listener
+    with events where the dyad has none.
     """
     control = np.zeros((len(dyad.listener), 0), np.float32)
     if settings is not None and settings.events:
@@ -125,7 +125,7 @@ def _control(dyad: Dyad) -> Floats:
 
 
 def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
-    """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
+    """Return sound (N, R, bins) in half precision and phase (N, F), zeros without sound."""
     frames = len(dyad.listener)
     if frontend is None:
         return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
@@ -186,10 +186,10 @@ def context(
     louder: Tensor | None = None,
     held: Tensor | None = None,
 ) -> Context:
-    """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
+    """Return the predictor's inputs at the seam of each window; `tokens` (N, G), those of the future undecided.
 
-    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
-    `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
+    `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
+    `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
     frames, device = corpus.frames, model.motion_mean.device
     index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
@@ -256,7 +256,7 @@ def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 
 @torch.no_grad()
 def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
-    """What each frame of standardised motion (N, C) would be as a keyframe (N, G)."""
+    """Return the tokens (N, G) of each frame of standardised motion (N, C) as a keyframe."""
     quantizer = model.tokenizer.quantizer
     return torch.cat([quantizer.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
 

@@ -54,11 +54,11 @@ def train_listener(
 ) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
-    How it is sampled is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
+    Sampling is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
 
     `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
-    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)

@@ -48,7 +48,7 @@ def train_tokenizer(
     `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
     Returns the figures of the run and the held-out error. Ctrl-C leaves a checkpoint in `out`, from which
-    `run.resume` goes on; the weights are written when the run is finished.
+    `run.resume` continues; the weights are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
@@ -56,7 +56,7 @@ def train_tokenizer(
     dyads = open_for(space.name, data, "train", order)
     if dyads.fps != FRAME_HZ:
         log.warning(
-            "%s has %g frames a second and is learned as it is; streamed, a listener shows %d a second",
+            "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
             data, dyads.fps, FRAME_HZ,
         )  # fmt: skip
     unseen = open_for(space.name, data, "validation", order)
@@ -306,7 +306,9 @@ def states(
 
 @torch.no_grad()
 def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
-    """How much worse than the best each next frame (S, T) would be with all k keyframes, as a share of the least."""
+    """Return the excess error of each next frame (S, T) over the best one with all k keyframes, as a share of the
+    least.
+    """
     errors = completion_errors(track.cost, chosen, most)  # (S, most, T)
     errors = errors[torch.arange(len(k), device=k.device), k - 1]
     least = errors.amin(1, keepdim=True)
@@ -362,9 +364,9 @@ def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
 
 
 def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn: int) -> Batch:
-    """What every training step draws: windows of the standardised motion (N, C) with their masks.
+    """Return the draw of every training step: windows of the standardised motion (N, C) with their masks.
 
-    `lengths` are those of the dyads in `motion`, `drawn` how many windows are ever asked for.
+    `lengths` are those of the dyads in `motion`, `drawn` the number of windows over the whole training.
     """
     starts = first_frames(lengths, tokenizer.window)
     if teacher(tokenizer.strategy) == "exact" and len(tokenizer.member) > FEW_GROUPS:
