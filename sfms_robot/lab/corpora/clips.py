@@ -59,7 +59,7 @@ class Dyad:
         states: (N,) int8, the listener's conversational state, -1 where not known; None: not known anywhere.
         events: what the listener did, as `frames.ListenerEvent`, times from the first frame; None: not annotated.
         head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that goes with the gaze, which a
-                listener that draws events leaves to `signals.gaze_kinematics`; None: not known separately.
+            listener that draws events leaves to `signals.gaze_kinematics`; None: not known separately.
         attention: (N,) 0..1, whether the speaker looks at the listener, NaN where not known; None: not known anywhere.
     """
 

@@ -114,7 +114,7 @@ class Run:
         group: the processes that run it together.
         accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
             The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
-                    resumed with any number of processes that can share its pieces.
+            resumed with any number of processes that can share its pieces.
         scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
     """
 

@@ -140,10 +140,10 @@ class MeetingEvidence:
         agents: letters of the P people.
         speaks: (N, P) a word of each is under way.
         looks: (N, P) each looks at the participant (1) or not (0); NaN where not annotated, and for the participant.
-            laughs: (N,) one of the others laughs. Smiles were not annotated.
-            nods: (N,) one of the others begins to nod.
-            listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
-            spans_s: (K, 2) of the participant's events, by kind.
+        laughs: (N,) one of the others laughs. Smiles were not annotated.
+        nods: (N,) one of the others begins to nod.
+        listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
+        spans_s: (K, 2) of the participant's events, by kind.
     """
 
     agents: tuple[str, ...]

@@ -47,10 +47,10 @@ class SfmsFrames:
 
     Attributes:
         motion: (N, C) listener, in the motion space of the model, the part that the model draws.
-            face: (N, C) speaker, in the same space, 0 where unknown; face_known: (N,) bool.
+        face: (N, C) speaker, in the same space, 0 where unknown; face_known: (N,) bool.
         sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
         phase: (N, F) the speaker's place in a phrase.
-            control: (N, K) control rows of the listener's events; K = 0 without.
+        control: (N, K) control rows of the listener's events; K = 0 without.
         sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
     """
 
