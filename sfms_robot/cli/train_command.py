@@ -16,7 +16,7 @@ from sfms_robot.data import listener_names
 from sfms_robot.errors import INTERRUPTED, ConfigError
 
 if TYPE_CHECKING:
-    from sfms_robot.lab.train.train_runs import TrainOptions
+    from sfms_robot.lab.learning.train_runs import TrainOptions
 
 app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
 data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
@@ -85,7 +85,7 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    from sfms_robot.lab.train.train_runs import train_tokenizer
+    from sfms_robot.lab.learning.train_runs import train_tokenizer
 
     _train(
         train_tokenizer,
@@ -123,7 +123,7 @@ def listener(
     json: bool = JSON,
 ) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
-    from sfms_robot.lab.train.train_runs import train_listener
+    from sfms_robot.lab.learning.train_runs import train_listener
 
     _train(
         train_listener,
@@ -156,11 +156,11 @@ def _train(
     """Run a phase of training, or one step of every phase, and print its figures."""
     if dry_run:
         from sfms_robot.config import load_training
-        from sfms_robot.lab.train.dry_run import dry_run as estimate
+        from sfms_robot.lab.learning.dry_run import dry_run as estimate
 
         show(estimate(load_training(file)), json)
         return
-    from sfms_robot.lab.train.train_runs import TrainOptions
+    from sfms_robot.lab.learning.train_runs import TrainOptions
 
     if data is None or out is None:
         raise ConfigError(f"{'--data' if data is None else '--out'} is missing; only --dry-run goes without")
@@ -192,7 +192,7 @@ def events(
     json: bool = JSON,
 ) -> None:
     """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     show(interruptible(lambda: train_events(data, out, all_series, seed)), json)
 
@@ -206,7 +206,7 @@ def idle(
     json: bool = JSON,
 ) -> None:
     """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
-    from sfms_robot.lab.train.idle_training import train_idle
+    from sfms_robot.lab.learning.idle_fit import train_idle
 
     show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
 
@@ -226,7 +226,7 @@ def compose(
     json: bool = JSON,
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
-    from sfms_robot.lab.train.datasets import compose_dyads
+    from sfms_robot.lab.corpora.data_commands import compose_dyads
 
     show(compose_dyads(data, out, minutes, seed, overwrite), json)
 
@@ -241,7 +241,7 @@ def check(
     json: bool = JSON,
 ) -> None:
     """Read a whole data set once: its contents, and everything that is wrong with it."""
-    from sfms_robot.lab.train.datasets import check_data
+    from sfms_robot.lab.corpora.data_commands import check_data
 
     report = check_data(folder, layout, order.value if order else None, window)
     show(report, json, partial(_print_data, channels=channels))
@@ -262,7 +262,7 @@ def convert(
     json: bool = JSON,
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
-    from sfms_robot.lab.train.data_conversion import convert_data
+    from sfms_robot.lab.corpora.data_commands import convert_data
 
     converted = convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order)
     show(converted, json)

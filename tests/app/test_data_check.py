@@ -9,8 +9,8 @@ import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora.audio_features import MFCC78
+from sfms_robot.lab.corpora.data_commands import check_data
 from sfms_robot.lab.corpora.formats import open_dataset, with_feature
-from sfms_robot.lab.train.datasets import check_data
 
 
 def problems(report, split="train"):

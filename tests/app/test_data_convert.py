@@ -10,9 +10,9 @@ import yaml
 from sfms_robot.frames import BLENDSHAPES
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.conversion import Residual, to_ours
+from sfms_robot.lab.corpora.data_commands import convert_data
 from sfms_robot.lab.corpora.formats import detect, open_dataset, open_for, split_names
 from sfms_robot.lab.learning.sfms.features import gather
-from sfms_robot.lab.train.data_conversion import convert_data
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.spaces import COEFFICIENTS, decode, rest_of
 

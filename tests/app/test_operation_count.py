@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 
 from sfms_robot.lab.bench.operation_count import OperationCount
-from sfms_robot.lab.train import dry_run
+from sfms_robot.lab.learning.dry_run import dry_run
 
 
 def test_a_layer_costs_two_operations_a_weight_and_row_and_its_gradient_as_many_again():

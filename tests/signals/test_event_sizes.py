@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.data import data_dir
-from sfms_robot.lab.corpora.compose import acting
+from sfms_robot.lab.corpora.compose import render_events
 from sfms_robot.signals.event_sizes import (
     ASIDE_DEG,
     ASIDE_MEAN_S,
@@ -43,6 +43,6 @@ def test_a_swing_is_never_faster_nor_slower_than_a_neck_goes(length_s):
 def test_a_swing_reaches_as_far_as_recorded_ones_do_in_that_time():
     nods = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
     for swing_s in SWING_REACH[0]:
-        manner = acting.NodManner(np.deg2rad(NOD_DEG[2]), 1, swing_s, 1.0)
-        reached = np.median([np.ptp(acting.nod_curve(manner, shape, 0.4, 50)) for shape in nods])
+        manner = render_events.NodManner(np.deg2rad(NOD_DEG[2]), 1, swing_s, 1.0)
+        reached = np.median([np.ptp(render_events.nod_curve(manner, shape, 0.4, 50)) for shape in nods])
         assert np.degrees(swing_reach_rad(swing_s)) == pytest.approx(np.degrees(reached), rel=0.1)

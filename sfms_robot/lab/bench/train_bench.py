@@ -20,11 +20,10 @@ from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
 from sfms_robot.lab.bench.measure import Row, row, times
 from sfms_robot.lab.bench.operation_count import OperationCount
-from sfms_robot.lab.learning.gradients import Gradients
+from sfms_robot.lab.learning.dry_run import jobs_of
 from sfms_robot.lab.learning.job import Job
 from sfms_robot.lab.learning.process_group import ProcessGroup
-from sfms_robot.lab.learning.training_loop import make_step
-from sfms_robot.lab.train.dry_run import jobs_of
+from sfms_robot.lab.learning.training_loop import Gradients, make_step
 
 FILES: Final = ("sfms-small", "arig")
 STEPS: Final = 8

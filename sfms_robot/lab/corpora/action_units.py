@@ -14,7 +14,7 @@ import numpy as np
 from sfms_robot.frames import BLENDSHAPES, Doubles, Floats
 
 # The 24 columns of `FAUValue` of Seamless Interaction. The data set does not say their order; this is the one that
-# software written for it uses, and `corpora.external.seamless_evidence` holds it against the key points of the files.
+# software written for it uses, and `lab.corpora.external.seamless` holds it against the key points of the files.
 FAU_VALUE: Final = (1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 14, 15, 16, 17, 18, 20, 22, 23, 24, 25, 26, 28, 30, 43)
 FULL: Final = 2.0  # the intensity at which its columns saturate: shown as 1
 

@@ -43,24 +43,24 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 @dataclass(frozen=True)
 class Dyad:
-    """N frames: what the speaker does, what the listener did. Sound is `audio`, or `mel`, or not at hand.
+    """N frames of a speaker and of the listener who answered. Sound is `audio`, or `mel`, or missing.
 
     Attributes:
         name: unique, tells the origin (meeting, listener).
         audio: (samples_of(N, fps),) speaker's voice, 16 kHz mono, or None: the data ships no waveform.
         speaker: (N, D) speaker's motion; a row of NaN where the face is not known.
         listener: (N, D) listener's motion: what is to be learned.
-        listening: (N,) True where somebody else spoke in the last 2 s and the listener is silent.
+        listening: (N,) True where another person spoke in the last 2 s and the listener is silent.
         space: of both motions, a key of `WIDTHS`.
         fps: frames a second.
         mel: (4N, 128) natural log of the speaker's mel power, for data that ships this in place of a waveform.
         features: more about each frame by name, (N, F): "hubert", "attributes", ...
         agent_audio: (samples_of(N, fps),) the listener's own voice, or None: the data ships none.
-        states: (N,) int8, his conversational state (`corpora.states`), -1 where not known; None: nowhere.
-        events: what the listener did, as `frames.ListenerEvent`, times from the first frame; None: nobody knows.
-        head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that goes with where he looks, which a
-            listener that draws events leaves to `signals.gaze_kinematics`; None: not known apart.
-        attention: (N,) 0..1, whether the speaker looks at the listener, NaN where not known; None: nowhere.
+        states: (N,) int8, the listener's conversational state, -1 where not known; None: not known anywhere.
+        events: what the listener did, as `frames.ListenerEvent`, times from the first frame; None: not annotated.
+        head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that goes with the gaze, which a
+            listener that draws events leaves to `signals.gaze_kinematics`; None: not known separately.
+        attention: (N,) 0..1, whether the speaker looks at the listener, NaN where not known; None: not known anywhere.
     """
 
     name: str
@@ -200,7 +200,7 @@ def read(file: Path) -> Dyad:
 
 
 def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
-    """What happened and how large, one row each; what was drawn and why stays behind."""
+    """Return kind and size of each event, one row each; the draws behind it are left out."""
     none = (np.nan, np.nan)
     rows = [(e.start_s, e.duration_s, e.size, e.kind, e.swings, e.target_rad or none) for e in events]
     return np.array(rows, _EVENT)

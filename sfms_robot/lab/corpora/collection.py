@@ -128,7 +128,7 @@ class Dataset(Sequence[Dyad]):
         return guarded(clip.name, lambda: replace(dyad, features={**dyad.features, **shipped}))
 
     def map(self, change: Callable[[Dyad], Dyad], space: str | None = None) -> Dataset:
-        """The same set, every dyad changed as it is read (smoothed, moved to another space, given features)."""
+        """Return the same set with every dyad changed when it is read (smoothed, in another space, with features)."""
 
         def changed(clip: Clip) -> Clip:
             return replace(clip, read=lambda: change(guarded(clip.name, clip.read)))
@@ -180,7 +180,7 @@ def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
 
 
 def guarded(where: str, read: Callable[[], _T]) -> _T:
-    """What `read` gives; whatever a broken file makes it raise becomes a ClipError."""
+    """Return what `read` returns; an error that a broken file causes becomes a ClipError."""
     try:
         return read()
     except ClipError:
@@ -191,7 +191,7 @@ def guarded(where: str, read: Callable[[], _T]) -> _T:
 
 @dataclass(frozen=True)
 class Layout:
-    """How one family of data sets lies on disk.
+    """Layout of one family of data sets on disk.
 
     Attributes:
         space, fps: of the motion.

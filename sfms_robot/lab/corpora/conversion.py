@@ -12,12 +12,13 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
-from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.resampling import at_frame_rate
+from sfms_robot.lab.corpora.clips import Dyad, at_rate, samples_of
+from sfms_robot.signals.mel import ROWS_PER_FRAME
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import SPACES, FlameMatrix, decode, encode, limitation
+from sfms_robot.signals.tracks import Track, resample
 
 CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
 _ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw
@@ -27,7 +28,7 @@ _UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
 
 @dataclass
 class Residual:
-    """What conversion lost, over all clips so far: of listeners' motion, frame by frame.
+    """Loss by conversion over all clips so far, of listeners' motion, frame by frame.
 
     Attributes:
         pose_rad: largest angle between a head as filed and as read back from ours in the source's own terms.
@@ -158,7 +159,7 @@ def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
 
 
 def names() -> Mapping[str, str]:
-    """What each figure of `Residual.told` means, for a person."""
+    """Return the meaning of each figure of `Residual.told`, as text."""
     return {
         "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
         "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",
@@ -167,3 +168,54 @@ def names() -> Mapping[str, str]:
         "stored_pose_deg": "head angles as written: largest difference, degrees",
         "stored_blendshape": "blendshapes as written: largest difference",
     }
+
+
+# --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------
+
+SPACE: Final = "arkit58"  # in other spaces a frame between two is not always what lies between their numbers
+
+
+def at_frame_rate(dyad: Dyad) -> Dyad:
+    """The dyad at 25 fps, cut to whole frames: motion linear in time, what is counted in frames the newest known.
+
+    Raises ConfigError for other rates in spaces other than arkit58, and for less than one frame.
+    """
+    if dyad.fps == FRAME_HZ:
+        return dyad
+    if dyad.space != SPACE:
+        raise ConfigError(f"{dyad.name}: {dyad.fps:g} fps in {dyad.space}, a listener is streamed at {FRAME_HZ}")
+    frames = int(len(dyad.listener) * FRAME_HZ / dyad.fps + 1e-6)
+    if not frames:
+        raise ConfigError(f"{dyad.name}: lasts {len(dyad.listener) / dyad.fps:.3f} s, not one frame of {FRAME_S:g} s")
+
+    def voice(samples: Floats | None) -> Floats | None:
+        return None if samples is None else samples[: samples_of(frames, FRAME_HZ)]
+
+    def newest(rows: Floats) -> Floats:
+        return at_rate(rows, dyad.fps, frames, FRAME_HZ)
+
+    return replace(
+        dyad,
+        audio=voice(dyad.audio),
+        agent_audio=voice(dyad.agent_audio),
+        speaker=_motion(dyad.speaker, dyad.fps, frames),
+        listener=_motion(dyad.listener, dyad.fps, frames),
+        listening=at_rate(dyad.listening, dyad.fps, frames, FRAME_HZ),
+        states=None if dyad.states is None else at_rate(dyad.states, dyad.fps, frames, FRAME_HZ),
+        mel=None if dyad.mel is None else _mel(dyad.mel, dyad.fps, frames),
+        features={name: newest(rows) for name, rows in dyad.features.items()},
+        fps=float(FRAME_HZ),
+    )
+
+
+def _mel(rows: Floats, fps: float, frames: int) -> Floats:
+    """(4N, 128) at four rows a frame -> (4 * frames, 128): of each time the newest row."""
+    return at_rate(rows, ROWS_PER_FRAME * fps, ROWS_PER_FRAME * frames, ROWS_PER_FRAME * FRAME_HZ)
+
+
+def _motion(motion: Floats, fps: float, frames: int) -> Floats:
+    """(N, 58) -> (frames, 58). A frame stands for its end, (i + 1) / rate; the first also for what was before it."""
+    ends_s = (np.arange(len(motion)) + 1) / fps
+    found = resample(Track(ends_s, motion, frozenset(CHANNELS)), FRAME_HZ, FRAME_S).motion[:frames]
+    found[(np.arange(frames) + 1) * FRAME_S < ends_s[0] - 1e-6] = motion[0]
+    return found

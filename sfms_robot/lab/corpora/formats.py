@@ -22,14 +22,14 @@ from sfms_robot.lab.corpora.audio_features import Feature, cached
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
-from sfms_robot.lab.corpora.external import dualtalk, l2l, lm_listener, react, react2025, seamless, vico
+from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
 from sfms_robot.lab.corpora.reading import pose_last
 
 LAYOUTS: Final = {
     layout.name: layout
     for layout in (
-        l2l.LAYOUT, lm_listener.LAYOUT, react.LAYOUT, react2025.LAYOUT, dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT,
-        vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
+        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.REACT2025_LAYOUT,
+        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
@@ -116,7 +116,7 @@ def open_for(space: str, folder: Path, split: str, order: Order | None = None, f
 
 
 def scan_split(layout: Layout, place: Path, split: str, order: Order | None = None) -> Dataset:
-    """One split as it is, empty or in the wrong order: for `data check`."""
+    """Return one split unchecked, even if empty or in the wrong order: for `data check`."""
     return _split(layout, place, split, _checked(order, layout))
 
 

@@ -1,6 +1,6 @@
-"""Arrays out of files that somebody else wrote: headers first, and never code.
+"""Arrays from files of other projects: headers first, and never code.
 
-Pickles run whatever they say. Those of data sets hold arrays and plain values, so nothing else is let through.
+A pickle can run code. Those of data sets hold arrays and plain values, and only these are accepted.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def unpickle(file: Path) -> Any:
 
 
 def torch_load(file: Path) -> Any:
-    """What torch saved: tensors, arrays and plain values, as `weights_only` lets through.
+    """Return what torch saved: tensors, arrays and plain values, as `weights_only` allows.
 
     Raises ClipError for a file that needs more.
     """
@@ -185,9 +185,9 @@ def dyad(
     mel: Floats | None = None,
     own: Floats | None = None,
 ) -> Dyad:
-    """A dyad of a data set without annotations: who listens when is told by the two voices, where both are there.
+    """Return a dyad of a data set without annotations: the two voices, where both are there, say who listens when.
 
-    Without the listener's `own` voice he listens all the time, as his role in the data says.
+    Without the listener's `own` voice the listener listens all the time, as the role in the data says.
     """
     frames = len(listener)
     listening = np.ones(frames, bool)
@@ -200,7 +200,7 @@ def dyad(
 def filed_dyad(
     name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, space: str, fps: float, pose_first: bool
 ) -> Dyad:
-    """A dyad whose motion lies in a .npy of the speaker's and one of the listener's; voices likewise, or none."""
+    """Return a dyad with its motion in one .npy file for the speaker and one for the listener; the same for voices."""
     speaker, listener = (
         track(str(file), pose_last(npy(file), pose_first), frames, WIDTHS[space], gaps=gaps)
         for file, gaps in zip(faces, (True, False), strict=True)
@@ -217,7 +217,7 @@ def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floa
 
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
-    """(frames,) in which somebody is heard to speak; a voice that is over says nothing."""
+    """Return (frames,) True in frames with speech; False after the end of the sound."""
     active = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / fps), bool)[:frames]
     return np.pad(active, (0, frames - len(active)))
 

@@ -1,4 +1,4 @@
-"""Who and what is trained on, chosen on and tested on: one table, asked by composing, fitting and judging alike.
+"""Training, validation and test splits: one table for composing, fitting and scoring.
 
 Meetings of a series share their people, so whole series are kept apart; so are whole recordings of voices and faces.
 The series are laid out by hand so that every part has people whose gaze was annotated, and meetings in which nods were

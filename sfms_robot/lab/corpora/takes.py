@@ -1,4 +1,4 @@
-"""Whole recorded faces at 25 fps: what tokenizers are trained and compared on where nobody brought a dataset.
+"""Whole recorded faces at 25 fps, on which tokenizers are trained and compared without a data set of the user's own.
 
 `build` reads them from a folder of recordings, `save` and `load` keep them in one file, `sim/listeners/takes.npz`.
 Nothing is done to them but resampling: resting faces differ from person to person, and a tokenizer has to cope. Held

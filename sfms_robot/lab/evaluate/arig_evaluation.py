@@ -28,7 +28,7 @@ from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.resume import checkpoint_file
-from sfms_robot.lab.train.train_runs import TrainOptions, run_of, train_settings
+from sfms_robot.lab.learning.train_runs import TrainOptions, run_of, train_settings
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.registry import load_listener
 from sfms_robot.ports import Listener

@@ -13,7 +13,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.learning.resume import checkpoint_file
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.lab.train.train_runs import TrainOptions, train_listener, train_tokenizer
+from sfms_robot.lab.learning.train_runs import TrainOptions, train_listener, train_tokenizer
 from sfms_robot.listeners import checkpoint
 
 Kind = Literal["sfms", "arig"]

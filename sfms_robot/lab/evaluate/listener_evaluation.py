@@ -57,8 +57,8 @@ def evaluate_listener(
     An SFMS listener also says how many keyframes it would have foreseen. `hop`: see `load_at_hop`.
     """
     from sfms_robot.lab.corpora.collection import usable
+    from sfms_robot.lab.corpora.conversion import at_frame_rate
     from sfms_robot.lab.corpora.formats import open_for
-    from sfms_robot.lab.corpora.resampling import at_frame_rate
     from sfms_robot.lab.evaluate.hop_choice import load_at_hop
     from sfms_robot.lab.evaluation.behaviour import behaviour
     from sfms_robot.lab.evaluation.rollout import rollouts

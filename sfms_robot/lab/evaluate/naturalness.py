@@ -18,9 +18,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
 from sfms_robot.lab.corpora.reading import speaks
-from sfms_robot.lab.corpora.resampling import at_frame_rate
 from sfms_robot.lab.evaluation import manners as manner
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout
 from sfms_robot.lab.evaluation.two_sample import FOLDS, REGIONS, Told, levelled, told_apart, windows

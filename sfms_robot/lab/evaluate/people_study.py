@@ -25,8 +25,8 @@ from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats, SpeakerFrame
 from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.corpora.resampling import at_frame_rate
 from sfms_robot.lab.evaluate.unseen_speakers import unseen, voice_folders
 from sfms_robot.lab.evaluation.preferences import NEITHER, QUESTIONS, Preference, Trial, summary, trials
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames

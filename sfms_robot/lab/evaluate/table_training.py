@@ -15,9 +15,8 @@ from sfms_robot import config
 from sfms_robot.lab.evaluation.paper.recipes import SizeName, recipes
 from sfms_robot.lab.evaluation.paper.table_trainer import train
 from sfms_robot.lab.learning import resume
-from sfms_robot.lab.learning.job import Run
-from sfms_robot.lab.learning.watch import Watch, progress_bar
-from sfms_robot.lab.train.train_runs import device_of
+from sfms_robot.lab.learning.job import Run, Watch, progress_bar
+from sfms_robot.lab.learning.train_runs import device_of
 from sfms_robot.processes import process_pool
 from sfms_robot.signals.tracks import Take
 

@@ -15,7 +15,7 @@ from sfms_robot.config import find
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
-from sfms_robot.lab.corpora.compose.acting import speaker_motion
+from sfms_robot.lab.corpora.compose.render_events import speaker_motion
 from sfms_robot.lab.corpora.compose.voices import Voice, find_voices, mouth_over
 from sfms_robot.lab.corpora.splits import Split, split_of_voice
 from sfms_robot.lab.evaluate.task_pool import done_in_processes

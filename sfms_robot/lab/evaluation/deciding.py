@@ -16,11 +16,11 @@ import numpy as np
 from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.corpora.meeting_evidence import meeting_evidence
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S
 from sfms_robot.lab.evaluation.reference_hazard import mute
 from sfms_robot.lab.evaluation.whole_recordings import Ints, hazards_in, heard_in, most_in, scene_in, steps_in
 from sfms_robot.lab.learning.events.event_trainer import scene_of
+from sfms_robot.lab.learning.events.labels import meeting_evidence
 from sfms_robot.listeners.events.evidence import Sensed
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, STEP_FRAMES, DecideMemory, EventModel
 from sfms_robot.listeners.stream_rng import Use, uniforms_of

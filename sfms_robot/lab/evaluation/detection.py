@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, YAW_PITCH, Doubles, Floats, ListenerEvent
-from sfms_robot.lab.corpora.compose.acting import Score, act
+from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions, head_part

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.lab.corpora.compose.acting import speaker_motion
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, own_voice
-from sfms_robot.lab.corpora.compose.recorded import heard
+from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, heard, own_voice
+from sfms_robot.lab.corpora.compose.render_events import speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import sent
 from sfms_robot.lab.corpora.compose.voices import Voice, laugh, lay, mouth_over
 from sfms_robot.lab.evaluation import phrase_timing

@@ -23,11 +23,11 @@ from sfms_robot.lab.learning.events.event_trainer import (
     OTHERS,
     OWN_NODS,
     PHASE,
+    Logistic,
     inputs,
     student,
     teach,
 )
-from sfms_robot.lab.learning.events.logistic import Logistic
 from sfms_robot.listeners.events.evidence import HEARD
 from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S
 

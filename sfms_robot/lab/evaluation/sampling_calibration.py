@@ -24,9 +24,8 @@ from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.rollout import OfflineRollout, offline_rollout
 from sfms_robot.lab.learning.corpus import without_gaze
-from sfms_robot.lab.learning.sfms.features import gather
+from sfms_robot.lab.learning.sfms.features import gather, tokenise
 from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
-from sfms_robot.lab.learning.sfms.tokens import tokenise
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel

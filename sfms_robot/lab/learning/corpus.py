@@ -86,7 +86,7 @@ class Corpus(Generic[Frames]):
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
 
     def fingerprint(self) -> dict[str, Any]:
-        """What tells one corpus from another, as plain data. The corpus must be on the CPU."""
+        """Return plain data that differ between corpora. The corpus must be on the CPU."""
         digest = hashlib.blake2b(repr((self.lengths, self.scenes)).encode(), digest_size=8)
         for field in fields(self.frames):
             digest.update(getattr(self.frames, field.name).contiguous().numpy().data)
@@ -186,10 +186,10 @@ def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
 
 
 def without_gaze(dyad: Dyad) -> Dyad:
-    """The dyad with what a listener that is told of events has to draw (`config.Listener.events`): eyeLook* are 0, and
-    the head's part of a gaze shift is taken out of its pose, where that is known.
+    """Return the dyad without its gaze, for listeners that get events (`config.Listener.events`): eyeLook* are 0, and
+    the head's part of a gaze shift is removed from the pose, where it is known.
 
-    Raises ConfigError for motion that is not ours.
+    Raises ConfigError for motion in another space than ours.
     """
     if dyad.space != "arkit58":
         raise ConfigError(f"dyad {dyad.name} is in {dyad.space}: gaze can be taken out of arkit58 alone")
@@ -201,9 +201,9 @@ def without_gaze(dyad: Dyad) -> Dyad:
 
 
 def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (C,) of motion (N, C).
+    """Return mean and deviation (C,) of motion (N, C).
 
-    Deviations are kept between what an eye just sees and what nobody misses: a still channel's noise is not blown up,
+    Deviations are clipped to a visible range: a still channel's noise is not amplified,
     and small movements of a channel that also makes large ones (a turning head) still count.
     """
     least, most = _spread_bounds(channels)

@@ -1,9 +1,9 @@
-"""What a listener leaves out of the small motion of resting faces, as `listeners.idle` draws it.
+"""Small motion of resting faces that a listener lacks, as `listeners.idle_motion` draws it.
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
 region, are the patterns, and their powers by band the spectrum, less what such short windows show of other bands. The
-slowest band is what differs from window to window, of whichever person. Where the listener and its patterns together
+slowest band is the difference between windows, over all people. Where the listener and its patterns together
 rest, and where people do, are quantiles of all frames of these windows.
 """
 
@@ -11,14 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
 from scipy.optimize import nnls
 
+from sfms_robot.config import find
+from sfms_robot.config.listener import LISTENER_KINDS
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
-from sfms_robot.listeners.idle import IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
+from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.formats import open_for
+from sfms_robot.lab.evaluation.rollout import rollouts
+from sfms_robot.listeners.checkpoint import load_config
+from sfms_robot.listeners.idle import FILE, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
+from sfms_robot.listeners.registry import one_thread
 from sfms_robot.signals.events import runs
 
 WINDOW: Final = 2 * FRAME_HZ
@@ -59,7 +71,9 @@ def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats |
 
 
 def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
-    """What `ours` lack of `theirs`; one entry a person. Raises ValueError where either has no window at all."""
+    """Return the idle motion that `ours` lack beside `theirs`; one entry a person. Raises ValueError without any
+    window.
+    """
     people, listener = ([one.windows for one in faces if len(one.windows)] for faces in (theirs, ours))
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
@@ -158,3 +172,55 @@ def _spread(faces: Sequence[Floats]) -> float:
 def explained(idle: IdleMotion) -> NDArray[np.float64]:
     """(52,) deviation of every channel that it adds."""
     return np.asarray(np.sqrt((idle.loadings.astype(np.float64) ** 2).sum(0)), np.float64)
+
+
+# --- Behind `train idle`: what a trained listener leaves out of the small motion of resting faces, into its folder
+
+TOLD: Final = 8  # channels that move most, in the figures
+
+
+def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
+    """Roll the listener out over `clips` training dyads with their events, and write the idle motion that it lacks.
+
+    The idle motion of an earlier run is left out. Raises ConfigError for a listener without events, data without them,
+    or faces that never rest. Blocks for about a minute.
+    """
+    one_thread()
+    folder = find("listeners", name, "config.yaml")
+    settings = load_config(folder)
+    if not settings.events:
+        raise ConfigError(
+            f"{folder}: expected a listener with events; without them rest and events cannot be separated"
+        )
+    every = open_for("arkit58", data, "train")
+    rows = np.linspace(0, len(every) - 1, min(clips, len(every))).round().astype(int).tolist()
+    chosen = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(every.clips[row] for row in rows)))]
+    if not chosen or any(dyad.events is None for dyad in chosen):
+        raise ConfigError(
+            f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
+        )
+    how = LISTENER_KINDS[settings.kind].load_folder(folder)
+    with Progress(console=Console(stderr=True)) as progress:
+        playing = progress.add_task(f"{name} listens", total=len(chosen))
+        shown = rollouts(how, chosen, seed, lambda: progress.advance(playing))
+    theirs = [resting(dyad.listener, dyad.events or (), dyad.agent_audio) for dyad in chosen]
+    ours = [
+        resting(one.motion[0], dyad.events or (), dyad.agent_audio) for one, dyad in zip(shown, chosen, strict=True)
+    ]
+    try:
+        idle = fit_idle(theirs, ours)
+    except ValueError as error:
+        raise ConfigError(f"{data}: {error}") from None
+    idle.save(folder / FILE)
+    return {"out": str(folder / FILE), "dyads": len(chosen), **figures(idle)}
+
+
+def figures(idle: IdleMotion) -> dict[str, Any]:
+    """Return the number of patterns, the spread over people, and the largest deviations that it adds."""
+    added = explained(idle)
+    most = np.argsort(-added)[:TOLD]
+    return {
+        "patterns": len(idle.loadings),
+        "spread": round(idle.spread, 3),
+        "deviation": {BLENDSHAPES[at]: round(float(added[at]), 4) for at in most},
+    }

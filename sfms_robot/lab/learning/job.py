@@ -1,4 +1,4 @@
-"""What the training loop is told, and what it tells: the values that travel between a trainer, `fit` and its watchers.
+"""Values that travel between a trainer, the training loop `fit` and its watchers.
 
 A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.training_loop.fit`:
 
@@ -20,7 +20,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
 Five duties make a resumed run bit-identical on a CPU:
  - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
    or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
- - it takes as many samples as it is told: `phase.batch`, or the part of them that is a piece of a step
+ - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
  - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
@@ -30,15 +30,19 @@ Five duties make a resumed run bit-identical on a CPU:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from sfms_robot import config
+from sfms_robot.errors import optional
 from sfms_robot.lab.learning.process_group import ProcessGroup
 from sfms_robot.lab.learning.staged_frames import Scratch
 
@@ -86,7 +90,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Report:
-    """What a watcher sees after every step. `position.held_out` is fresh when `looked`."""
+    """Report to a watcher after every step. `position.held_out` is new when `looked`."""
 
     name: str
     steps: int
@@ -104,13 +108,13 @@ def unwatched(report: Report) -> None:
 
 @dataclass(frozen=True)
 class Run:
-    """How a job is run rather than what it is: the same job gives the same weights whoever watches.
+    """Settings of running a job that do not change its weights.
 
     Attributes:
         group: the processes that run it together.
         accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
-            Into how many pieces a batch is cut is part of what a run is, who takes them is not: a run goes on with any
-            number of processes that can share its pieces.
+            The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
+            resumed with any number of processes that can share its pieces.
         scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
     """
 
@@ -128,7 +132,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended. `loss` is smoothed and of the last step; `held_out` is of the weights the model now holds."""
+    """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
+    holds.
+    """
 
     loss: float
     held_out: float | None
@@ -136,3 +142,82 @@ class Outcome:
     best_step: int
     stopped: Literal["steps", "patience"]
     resumed_at: int | None
+
+
+# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. They are told; nothing waits
+
+Watch = Callable[[Report], None]
+CURVES_EVERY = 10  # steps
+
+
+@contextmanager
+def progress_bar() -> Iterator[Watch]:
+    """A bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
+    tasks: dict[str, TaskID] = {}
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    ) as bar:
+
+        def watch(report: Report) -> None:
+            at = report.position
+            if report.name not in tasks:  # a resumed run begins where it was, so that the time left counts from there
+                tasks[report.name] = bar.add_task(
+                    report.name, total=report.steps, completed=at.step - 1, figures="", start=True
+                )
+            bar.update(tasks[report.name], completed=at.step, figures=figures(report))
+
+        yield watch
+
+
+def figures(report: Report) -> str:
+    """Loss, held-out loss once there is one, and speed."""
+    at = report.position
+    held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
+    return f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
+
+
+@contextmanager
+def tensorboard(folder: Path) -> Iterator[Watch]:
+    """Curves of loss, held-out loss, gradient norm, learning rate and speed in `folder`/NAME. Raises MissingExtra."""
+    with optional("--tensorboard"):
+        from torch.utils.tensorboard import SummaryWriter
+    writers: dict[str, SummaryWriter] = {}
+
+    def watch(report: Report) -> None:
+        step = report.position.step
+        if report.name not in writers:
+            # Whatever an interrupted run drew past its checkpoint is drawn again.
+            writers[report.name] = SummaryWriter(str(folder / report.name), purge_step=step)
+        curves = {}
+        if step % CURVES_EVERY == 0 or report.position.finished:
+            curves = {
+                "loss": report.loss,
+                "gradient_norm": report.gradient_norm,
+                "learning_rate": report.learning_rate,
+                "frames_per_s": report.frames_per_s,
+            }
+        if report.looked and report.position.held_out is not None:
+            curves["held_out_loss"] = report.position.held_out
+        for name, value in curves.items():
+            writers[report.name].add_scalar(name, value, step)
+
+    try:
+        yield watch
+    finally:
+        for writer in writers.values():
+            writer.close()
+
+
+def together(watches: Sequence[Watch]) -> Watch:
+    """One watcher that tells several."""
+
+    def watch(report: Report) -> None:
+        for one in watches:
+            one(report)
+
+    return watch

@@ -1,8 +1,8 @@
-"""Processes that train one model together, as `torchrun` starts them: who they are, and what they say to each other.
+"""Processes that train one model together, as `torchrun` starts them, and their communication.
 
 A step's batch is cut into pieces, each drawn with a generator of its own; process r of W takes pieces r, r + W, ...
-Who takes a piece changes nothing in it, so the losses of a run do not depend on the number of processes, up to the
-order in which sums are taken. Alone, and with one piece, everything is as it is without any of this.
+A piece is the same in every process, so the losses of a run do not depend on the number of processes, up to the order
+of summation. One process with one piece computes what plain training does.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ProcessGroup:
 
     @property
     def first(self) -> bool:
-        """Whether it is the one that writes files and talks to people."""
+        """Return whether this process writes files and prints."""
         return self.rank == 0
 
     def mean(self, values: Sequence[float]) -> list[float]:
@@ -46,7 +46,7 @@ class ProcessGroup:
         return [float(each) / self.size for each in sums]
 
     def told_by_first(self, find: Callable[[], float]) -> float:
-        """What the first process finds, which alone looks; the others wait for it."""
+        """Return what the first process finds; the others wait for it."""
         if self.size == 1:
             return find()
         found = torch.tensor([find() if self.first else 0.0], dtype=torch.float64, device=_device())
@@ -100,7 +100,7 @@ def local_rank() -> int:
 def _number(name: str, otherwise: int) -> int:
     text = os.environ.get(name, str(otherwise))
     if not text.isdecimal():
-        raise ConfigError(f"{name}={text} in the environment is no number; torchrun sets it")
+        raise ConfigError(f"{name}={text} in the environment: expected a number, as torchrun sets it")
     return int(text)
 
 

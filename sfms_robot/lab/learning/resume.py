@@ -38,7 +38,7 @@ def weights_of(job: Job) -> Weights:
 
 
 def digest_of(module: nn.Module) -> str:
-    """What tells one set of weights from another: for the identity of a job that builds on them."""
+    """Return a digest of the weights, for the identity of a job that builds on them."""
     digest = hashlib.blake2b(digest_size=8)
     for name, value in sorted(module.state_dict().items()):
         digest.update(name.encode())
@@ -98,7 +98,7 @@ def load(file: Path, job: Job, generator: torch.Generator) -> tuple[Position, We
 
 
 def peek(file: Path) -> Position | None:
-    """How far the checkpoint in `file` came; None where there is none that can be read."""
+    """Return the step of the checkpoint in `file`; None where there is no readable one."""
     try:
         with safe_open(file, framework="pt") as opened:
             return Position(**json.loads((opened.metadata() or {})["position"]))

@@ -22,11 +22,11 @@ ROUNDS: Final = 8  # to choose between people and mirror images, at most
 
 
 def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
-    """The slow part (N, S) of motion (N, S): below `CUT_HZ`, and smoothly across the events that move the head.
+    """Return the slow part (N, S) of motion (N, S): below `CUT_HZ`, and smooth across the events that move the head.
 
-    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. While the head nods
-    nobody sees its sway, so those frames weigh nothing: a low-pass alone would take the mean of a nod for sway, and
-    give the nod a swing the other way before it begins.
+    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. Frames of a nod weigh
+    nothing: sway cannot be seen in them, a low-pass alone would take the mean of a nod for sway, and give the nod a
+    swing in the opposite direction before it begins.
     """
     from scipy.linalg import solveh_banded
 
@@ -63,10 +63,10 @@ def without_sway(
 
 
 def fit_sway(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-    """Mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
+    """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
 
-    Each person is brought to the mean size before powers are taken: how much somebody sways is `spread`'s. Of a person
-    and his mirror image, which turns the `lateral` channels around, the one counts who is more like the others.
+    Each person is scaled to the mean size before powers are taken; `spread` holds the sizes. Of a person and the mirror
+    image, with `lateral` channels inverted, the one nearer to the other people counts.
     """
     tracks = [one.double() - one.double().mean(0) for one in slow if len(one) >= 2 * FRAME_HZ]
     if not tracks:

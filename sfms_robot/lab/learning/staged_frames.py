@@ -1,7 +1,7 @@
-"""Frames of a corpus on disk: one file a field, written once, read as they are drawn.
+"""Frames of a corpus on disk: one file per field, written once, read when they are drawn.
 
-The processes of a machine share what the system keeps of the files in memory; the first of them writes. A folder that
-holds frames of an earlier run is written anew.
+The processes of a machine share the system's file cache; the first process writes. A folder with frames of an earlier
+run is written again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _INDEX = "index.json"
 
 @dataclass(frozen=True)
 class Scratch:
-    """Where frames are staged, and by whom."""
+    """Folder of staged frames, and the process that writes it."""
 
     folder: Path
     group: ProcessGroup

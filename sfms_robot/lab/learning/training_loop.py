@@ -1,31 +1,33 @@
-"""The training loop every model shares: `fit` runs a `Job` to its end and survives whatever interrupts it.
+"""The training loop of all models: `fit` runs a `Job` to its end and can be interrupted and resumed.
 
 One step: draw data, loss, gradients, clip, AdamW with a warmed-up cosine rate. Between steps: the held-out loss with
-early stop, and checkpoints from which a run goes on bit for bit (on a CPU). How to write a trainer: `learning.job`.
+early stop, and checkpoints from which a run continues bit for bit (on a CPU). How to write a trainer: `learning.job`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError
 from sfms_robot.lab.learning import resume
-from sfms_robot.lab.learning.gradients import Gradients, pieces_of
-from sfms_robot.lab.learning.job import Job, Outcome, Position, Report, Run
+from sfms_robot.lab.learning.job import Job, LossOf, Outcome, Position, Report, Run
+from sfms_robot.lab.learning.process_group import ProcessGroup
 
 SMOOTHING = 0.98  # of the loss that is shown
 SPEED_SMOOTHING = 0.9
@@ -41,7 +43,7 @@ def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> 
 def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> Outcome:  # noqa: B008
     """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
-    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` goes on from there, and a run that had finished
+    Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
     only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
     the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
     checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
@@ -64,7 +66,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     if run.resume:
         position, best = resume.load(file, job, generator)
     elif group.first and (left := resume.peek(file)) is not None and not left.finished:
-        log.warning("%s: was at step %d, begins anew; --resume would have gone on", file, left.step)
+        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left.step)
     began_at = position.step
 
     saved_s = before_s = clock()
@@ -94,7 +96,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             if interrupted:
                 raise KeyboardInterrupt(
                     f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
-                    "the same command with --resume goes on"
+                    "the same command with --resume continues"
                 )
     if best is not None:
         job.model.load_state_dict(best)
@@ -138,7 +140,7 @@ def make_step(
     try:
         value, asked = gradients.group.mean([gradients.of(step, generator), float(pressed)])
     except GroupError as error:
-        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume goes on)") from error
+        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume continues)") from error
     norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
     if not math.isfinite(value) or not math.isfinite(norm):
         broken = f"loss {value:g}, gradient norm {norm:g} at step {step}: not finite"
@@ -201,9 +203,9 @@ def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
 
 @contextmanager
 def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C was pressed; inside, the first one only raises the flag. Signals reach the main thread alone.
+    """Yield a function that returns whether Ctrl-C was pressed; inside, the first one only raises the flag.
 
-    `patient`: so do all others; whoever started this process (torchrun) passes the terminal's on as its own.
+    `patient`: later ones too, since torchrun passes on those of the terminal. Signals reach the main thread only.
     """
     pressed = threading.Event()
 
@@ -221,3 +223,80 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
         yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+# --- Gradients of one step: of a batch at once, or piece by piece, here and in other processes --------------------
+
+
+def pieces_of(job: Job, run: Run, file: Path) -> int:
+    """Into how many pieces every batch is cut: as the checkpoint in `file` says on resuming, else as the run asks.
+
+    Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
+    """
+    size, batch = run.group.size, job.phase.batch
+    begun = resume.pieces(file) if run.resume else None
+    pieces = size * (run.accumulate or 1) if begun is None or run.accumulate else begun
+    if begun is not None and pieces != begun:
+        raise ConfigError(f"{file}: was begun with {begun} pieces a step, --accumulate {run.accumulate} makes {pieces}")
+    if pieces % size:
+        shares = ", ".join(str(count) for count in range(1, pieces + 1) if pieces % count == 0)
+        raise ConfigError(f"{file}: a step has {pieces} pieces; {size} processes cannot share them ({shares} can)")
+    if batch % pieces:
+        raise ConfigError(f"{job.name}: a batch of {batch} cannot be cut into {pieces} pieces (processes x accumulate)")
+    return pieces
+
+
+class Gradients:
+    """Gradients of a job's parameters, filled step by step; the same in all processes of the group."""
+
+    def __init__(self, job: Job, group: ProcessGroup, pieces: int, file: Path) -> None:
+        self.job, self.group, self.file = job, group, file
+        self._pieces, self._samples = pieces, job.phase.batch // pieces
+        self._half = job.phase.precision == "bf16" and multiplies_bf16(job.device)
+        loss: nn.Module = _Loss(job.model, job.loss_of)
+        if group.size > 1:  # not every part of a model learns in every phase and step
+            with group.talking():
+                loss = DistributedDataParallel(loss, find_unused_parameters=True)
+        self._loss = loss
+
+    def of(self, step: int, generator: torch.Generator) -> float:
+        """The loss of this process' pieces, after its gradients: of all processes, for all. Raises GroupError."""
+        if self._pieces == 1:
+            return self._piece(step, generator, 1)
+        mine = range(self.group.rank, self._pieces, self.group.size)
+        total = 0.0
+        for piece in mine:
+            seed = _seed(self.job.seed, step, piece)
+            torch.manual_seed(seed)  # of dropout
+            quiet = isinstance(self._loss, DistributedDataParallel) and piece != mine[-1]
+            with self._loss.no_sync() if quiet else nullcontext():  # type: ignore[operator]
+                total += self._piece(step, torch.Generator().manual_seed(seed), len(mine))
+        return total
+
+    def _piece(self, step: int, generator: torch.Generator, share: int) -> float:
+        with torch.autocast(self.job.device.type, torch.bfloat16, enabled=self._half):
+            loss: Tensor = self._loss(step, generator, self._samples)
+        with self.group.talking():
+            (loss / share).backward()  # type: ignore[no-untyped-call]
+        return loss.item() / share
+
+
+class _Loss(nn.Module):
+    """A job's loss as a module, which is what gradients are shared of."""
+
+    def __init__(self, model: nn.Module, loss_of: LossOf) -> None:
+        super().__init__()
+        self.model, self._loss_of = model, loss_of
+
+    def forward(self, step: int, generator: torch.Generator, samples: int) -> Tensor:
+        return self._loss_of(step, generator, samples)
+
+
+def multiplies_bf16(device: torch.device) -> bool:
+    """Return whether bf16 is faster than fp32 on this device; a processor without such instructions emulates it."""
+    return device.type == "cuda" or (device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
+
+
+def _seed(seed: int, step: int, piece: int) -> int:
+    digest = hashlib.blake2b(f"{seed} {step} {piece}".encode(), digest_size=7)
+    return int.from_bytes(digest.digest(), "big")

@@ -12,10 +12,9 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, EVENT_KINDS, FRAME_HZ,
 from sfms_robot.lab.corpora import splits
 from sfms_robot.lab.corpora.clips import load
 from sfms_robot.lab.corpora.compose import ami, composed
-from sfms_robot.lab.corpora.compose.acting import Score, act, mirrored, nod_habit, nod_manner
-from sfms_robot.lab.corpora.compose.looks import Dwell, learn_dwell
-from sfms_robot.lab.corpora.compose.motions import edges
-from sfms_robot.lab.corpora.compose.splicing import held, stretched, tiled
+from sfms_robot.lab.corpora.compose.motions import edges, held, stretched, tiled
+from sfms_robot.lab.corpora.compose.render_events import Score, act, mirrored, nod_habit, nod_manner
+from sfms_robot.lab.corpora.compose.speaking import Dwell, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import find_voices, lay, read_voice, split_voices
 from sfms_robot.lab.corpora.splits import SPLITS
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity

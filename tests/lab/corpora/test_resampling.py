@@ -7,7 +7,7 @@ import torch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora.clips import Dyad, at_rate, samples_of
-from sfms_robot.lab.corpora.resampling import at_frame_rate
+from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.learning.sfms.features import gather
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace

@@ -13,9 +13,9 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ
 from sfms_robot.lab.corpora import formats
 from sfms_robot.lab.corpora.action_units import FAU_VALUE, WITHOUT_UNIT, blendshapes_of
 from sfms_robot.lab.corpora.conversion import Residual, in_ours, to_ours
+from sfms_robot.lab.corpora.data_commands import check_data
 from sfms_robot.lab.corpora.external.seamless import stretches
 from sfms_robot.lab.corpora.formats import detect, open_dataset, open_for
-from sfms_robot.lab.train.datasets import check_data
 from sfms_robot.signals.audio import read_audio
 
 ONE, TWO = f"{write.SEAMLESS_ID}_P0947", f"{write.SEAMLESS_ID}_P0948A"

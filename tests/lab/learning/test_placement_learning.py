@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from sfms_robot import config
-from sfms_robot.lab.learning.sfms.imitation import imitation, lively, regrets, states
-from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_loss
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import imitation, lively, regrets, states, tokenizer_loss
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.piecewise_linear import best_frames, completion_errors, mask_cost
 from sfms_robot.listeners.sfms.placement import ConditionalScore, choose, place_static, tracks

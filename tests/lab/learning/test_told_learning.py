@@ -15,11 +15,18 @@ from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.lab.evaluation.sampling_calibration import calibrate
 from sfms_robot.lab.learning.corpus import GAZE, without_gaze
 from sfms_robot.lab.learning.sfms import predictor_trainer, tokenizer_trainer
-from sfms_robot.lab.learning.sfms.features import context, fit_scales, frames_of, gather
-from sfms_robot.lab.learning.sfms.masks import batches
-from sfms_robot.lab.learning.sfms.missed_keyframes import without_last_keyframes
+from sfms_robot.lab.learning.sfms.features import (
+    context,
+    fit_scales,
+    frames_of,
+    gather,
+    held_tokens,
+    place_all,
+    tokenise,
+    without_last_keyframes,
+)
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, starts_with_events
-from sfms_robot.lab.learning.sfms.tokens import held_tokens, place_all, tokenise
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import batches
 from sfms_robot.listeners import sfms
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace

@@ -20,8 +20,7 @@ from sfms_robot.lab.learning.corpus import windows
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather
-from sfms_robot.lab.learning.sfms.tokens import place_all
+from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather, place_all
 from sfms_robot.listeners import checkpoint, sfms
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED

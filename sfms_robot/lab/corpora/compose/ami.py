@@ -36,26 +36,26 @@ _Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
 
 @dataclass(frozen=True)
 class Person:
-    """One participant of one meeting, as a listener to everybody else in it.
+    """One participant of one meeting, as a listener to all the others.
 
     Attributes:
-        meeting, agent, participant: who; `agent` is the letter used as a gaze target.
-        until_s: his head was annotated from 0 to here.
+        meeting, agent, participant: identity; `agent` is the letter used as a gaze target.
+        until_s: the head was annotated from 0 to here.
         nods, shakes, tilts: head gestures (concord signal; discord or negative; other communicative). Some annotators
             left the form of a nod blank; where they did not, 98 % of concord signals are nods.
-        unseen: his head was off camera.
-        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None where nobody annotated it.
-        laughs, talk, backchannels: his own voice.
+        unseen: the head was off camera.
+        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None where it was not annotated.
+        laughs, talk, backchannels: the participant's own voice.
         others: phrases of all the others together, joined across gaps under 0.2 s.
         floor: (start, end, agent) phrases of each of the others.
         others_laughs: laughs of the others.
         asked: ends of the others' acts that ask for something.
         others_backchannels: of the others.
-        mm_hms: his own isolated words under 0.6 s, silent for 0.5 s before and after.
+        mm_hms: own isolated words under 0.6 s, silent for 0.5 s before and after.
         others_nods: (start, end, agent) nods of each of the others.
-        looked_at: (start, end, agent) of each of the others looking at him.
+        looked_at: (start, end, agent) of each of the others looking at the participant.
         gaze_known: the others whose gaze was annotated.
-        words: every single one, by agent, his own among them.
+        words: each word, by agent, own words included.
     """
 
     meeting: str
@@ -130,7 +130,7 @@ def read_people(folder: Path) -> list[Person]:
             )
         )
     if not people:
-        raise ConfigError(f"{folder}: participants: nobody has head annotations of a minute or more")
+        raise ConfigError(f"{folder}: participants: expected head annotations of a minute or more, found none")
     return people
 
 
@@ -155,7 +155,9 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def split_series(people: Iterable[Person]) -> dict[Split, list[Person]]:
-    """People by the part their meeting belongs to (`splits`); who is trained on is left out of the other parts."""
+    """Return people by the split of their meeting (`splits`); people of the training split are left out of the
+    others.
+    """
     parts = by_split((split_of(person.meeting), person) for person in people)
     seen = {person.participant for person in parts["train"]}
     for split in ("validation", "test"):

@@ -1,17 +1,18 @@
 """Composed dyads: real timing, real movement, put together here.
 
-Real are: when somebody nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod, and
-when they look at him (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`); how speech
-sounds (`voices`). That they belong together is ours: the voice says other words than the meeting did, only its phrases
-begin and end when they did. Meetings, people, takes and voices kept for validation and test are whole ones (`splits`).
+Recorded are: when a listener nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod,
+and when they look at the listener (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
+how speech sounds (`voices`). Their combination is ours: the voice says other words than the meeting did, only its
+phrases begin and end at the same times. Meetings, people, takes and voices kept for validation and test are whole ones
+(`splits`).
 
-All others of a meeting become one speaker. Whoever holds the floor sits straight ahead, and looks at the listener when
-he was annotated to; where nobody annotated his gaze he looks at random and `Dyad.attention` is unknown, as it is while
-no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, his looks
-are drawn from how long looks last in the training part (`looks`), and so is their order, which is ours.
+All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
+when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
+no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, looks are
+drawn from the durations in the training split (`speaking.Dwell`), in an order of ours.
 
-Stretches with nods, above all those with nods at the end of a phrase, and those in which he is spoken to are drawn more
-often than they are in the meetings; asked for enough minutes, a set holds every stretch once.
+Stretches with nods, above all at the end of a phrase, and those in which the listener is addressed are drawn more often
+than they occur in the meetings; a set of enough minutes holds every stretch once.
 
 A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
@@ -31,14 +32,13 @@ from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad, save
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.acting import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
-from sfms_robot.lab.corpora.compose.looks import Dwell, away, learn_dwell
-from sfms_robot.lab.corpora.compose.recorded import heard, seen
+from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
+from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
     Voice,
     find_laughter,
@@ -46,6 +46,8 @@ from sfms_robot.lab.corpora.compose.voices import (
     laugh,
     lay,
     mouth_over,
+    reverberant,
+    room,
     split_voices,
 )
 from sfms_robot.lab.corpora.splits import SPLITS, Split
@@ -78,7 +80,7 @@ class Stretch:
     Attributes:
         nods_per_minute: of listening time.
         answers: nods that begin 0 to 0.8 s after the end of a phrase.
-        addressed: share of the time in which whoever holds the floor is known to look at him.
+        addressed: share of the time in which the person with the floor is known to look at the listener.
     """
 
     person: Person
@@ -90,7 +92,9 @@ class Stretch:
 
     @property
     def weight(self) -> float:
-        """How often it is drawn: more for nods, for nods when a phrase ends, and for being addressed."""
+        """Return how often the stretch is drawn: more for nods, for nods when a phrase ends, and for being
+        addressed.
+        """
         base, most, answer, answers, addressed = _WEIGHTS
         nods = min(self.nods_per_minute, most) + answer * min(self.answers, answers)
         return base + nods + addressed * self.addressed
@@ -106,7 +110,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Material:
-    """What the dyads of one part are made of."""
+    """Recordings and annotations that the dyads of one split are made of."""
 
     people: Sequence[Person]
     voices: Sequence[Voice]
@@ -213,7 +217,7 @@ def conversations(material: Mapping[Split, Material], seed: int, minutes: float)
 
 
 def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
-    """Dyads in which the agent speaks and nobody answers; none of a part without filmed voices."""
+    """Return dyads in which only the agent speaks; none for a split without filmed voices."""
     for number, split in enumerate(SPLITS):
         wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
         part = material[split]
@@ -239,9 +243,10 @@ def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -
 
 
 def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
-    """Cut everybody's time into pieces of 30 to 60 s; keep those he was seen in and that make the scene.
+    """Cut the time of each person into pieces of 30 to 60 s; keep those on camera that fit the scene.
 
-    Listening: he mostly listens. Interaction: he talks a fifth of the time or more, and so do the others together.
+    Listening: the person mostly listens. Interaction: the person talks at least a fifth of the time, and so do the
+    others.
     """
     found = []
     for person in people:
@@ -355,7 +360,7 @@ def speaker_of(
     rng: np.random.Generator,
     laughter: Sequence[Floats] = (),
 ) -> tuple[Floats, Floats]:
-    """What is heard and seen of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
+    """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
     person, frames = stretch.person, stretch.frames
     said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
     speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
@@ -368,9 +373,9 @@ def speaker_of(
 
 
 def attention_of(stretch: Stretch) -> Floats:
-    """(N,) 1 where whoever holds the floor looks at him, 0 where not, NaN where nobody annotated where that one looks.
+    """Return (N,) 1 where the person with the floor looks at the listener, 0 where not, NaN where it was not annotated.
 
-    The floor is held by who began the latest phrase of a second or more.
+    The floor belongs to the person who began the latest phrase of a second or more.
     """
     person = stretch.person
     holder = np.full(stretch.frames, "", dtype="<U1")
@@ -391,7 +396,7 @@ def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -
 
 
 def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
-    """Looks away from whoever has the floor, in seconds of the stretch: annotated ones, or drawn ones."""
+    """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
     if stretch.person.gaze is None:
         return dwell.looks(stretch.frames * FRAME_S, rng)
     return tuple(
@@ -413,3 +418,42 @@ def within(spans: Doubles, stretch: Stretch) -> Doubles:
     """Spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
     inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
     return spans[inside] - stretch.start_s
+
+
+# --- A speaker as some microphone in some room and some face tracker would take them ------------------------------
+#
+# None of it is of the person: a listener that was taught with many learns to leave it alone.
+
+_CLOSE: Final = 0.4  # share of microphones that hear no room
+_GAIN_DB: Final = (-14.0, 8.0)
+_TILT: Final = (-0.4, 0.5)
+_LOST: Final = 0.4  # share of trackers that lose a face now and then
+_LOST_A_MINUTE: Final = 2.0
+_LOST_S: Final = (0.3, 3.0)
+
+
+def heard(speech: Floats, voice: Voice, rng: np.random.Generator) -> Floats:
+    """Speech (n,) with room, spectral tilt, gain and noise floor."""
+    direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
+    tilt = np.float32(rng.uniform(*_TILT))
+    toned = direct - tilt * np.concatenate([[0], direct[:-1]]).astype(np.float32)
+    gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
+    return np.asarray(np.clip(gain * toned + room(len(speech), voice, rng), -1, 1), np.float32)
+
+
+def seen(motion: Floats, rng: np.random.Generator) -> Floats:
+    """A face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
+    frames = len(motion)
+    out = motion.copy()
+    stands = np.concatenate([np.deg2rad(rng.normal(0, 5, 3)), rng.normal(0, 0.05, 3)])
+    shakes = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.02]) * np.deg2rad(rng.uniform(0.05, 0.3))  # metres: under 0.1 mm
+    out[:, POSE] += stands + shakes * rng.standard_normal((frames, 6))
+    shapes = out[:, SHAPES]
+    rests = np.maximum(0, rng.normal(0, 0.05, shapes.shape[1]))
+    shapes *= rng.uniform(0.85, 1.1)
+    shapes += rests + rng.uniform(0.002, 0.012) * rng.standard_normal(shapes.shape)
+    np.clip(shapes, 0, 1, out=shapes)
+    if rng.random() < _LOST:
+        for start in rng.uniform(0, frames, rng.poisson(_LOST_A_MINUTE * frames / FRAME_HZ / 60)):
+            out[int(start) : int(start + rng.uniform(*_LOST_S) * FRAME_HZ)] = np.nan
+    return out

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SHAPES, Floats
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, SHAPES, SMILE_CORNERS, Floats, ListenerEvent
 from sfms_robot.lab.corpora.splits import split_of_take
 from sfms_robot.signals.motion_primitives import STEP
 from sfms_robot.signals.tracks import read_track, resample
@@ -294,3 +294,78 @@ def edges(length: int, ramp: int) -> Floats:
     ramp = min(ramp, length // 2)
     up = 0.5 - 0.5 * np.cos(np.pi * np.arange(ramp) / max(ramp, 1))
     return np.concatenate([up, np.ones(length - 2 * ramp), up[::-1]]).astype(np.float32)
+
+
+# --- Recorded curves joined to what is there: one after the other, stretched, held, laid on frames ----------------
+
+FADE: Final = FRAME_HZ
+SMILE: Final = [SHAPE[name] for name in SMILE_CORNERS]
+
+
+def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade: int = FADE) -> Floats:
+    """Random pieces (K, C) one after the other, each crossfaded over `fade` frames, cut to (frames, C)."""
+    usable = [piece for piece in pieces if len(piece) > 2 * fade] or [max(pieces, key=len)]
+    fade = min(fade, min(len(piece) for piece in usable) // 2)
+    total = frames + 2 * fade
+    out = np.zeros((total, usable[0].shape[1]), np.float32)
+    at = 0
+    while at < total:
+        piece = usable[rng.integers(len(usable))]
+        piece = piece[int(rng.integers(0, max(1, (len(piece) - 2 * fade) // 2))) :]
+        piece = piece * edges(len(piece), fade)[:, None]
+        out[at : at + len(piece)] += piece[: total - at]
+        at += len(piece) - fade
+    return out[fade : fade + frames]
+
+
+def stretched(curve: Floats, frames: int) -> Floats:
+    """A curve (K,) or (K, C) played over `frames` frames."""
+    at = np.linspace(0, len(curve) - 1, max(2, frames))
+    if curve.ndim == 1:
+        return np.interp(at, np.arange(len(curve)), curve).astype(np.float32)
+    low = np.minimum(at.astype(int), len(curve) - 2)
+    part = (at - low)[:, None]
+    return np.asarray(curve[low] * (1 - part) + curve[low + 1] * part, np.float32)
+
+
+def held(curve: Floats, frames: int) -> Floats:
+    """A rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
+
+    Longer ones rest at their height, as long smiles do; shorter ones are played faster, to 0.6 of their length at most.
+    """
+    height = curve[:, SMILE].mean(axis=1)
+    peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
+    if frames >= seen:
+        return np.concatenate(
+            [curve[:peak], np.repeat(curve[peak : peak + 1], frames - seen + 1, axis=0), curve[peak + 1 :]]
+        )
+    return stretched(curve, int(len(curve) * max(0.6, frames / seen)))
+
+
+def first_frame(start_s: float) -> int:
+    """The frame that something begins with."""
+    return int(round(start_s * FRAME_HZ))
+
+
+def placed(curve: Floats, start_s: float, frames: int) -> Floats:
+    """Zeros (frames,) or (frames, C) with the curve from `start_s` on."""
+    out = np.zeros((frames, *curve.shape[1:]), np.float32)
+    first = first_frame(start_s)
+    low, high = max(0, first), min(frames, first + len(curve))
+    if high > low:
+        out[low:high] = curve[low - first : high - first]
+    return out
+
+
+def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> ListenerEvent:
+    """Of a curve that was laid with `placed`."""
+    return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
+
+
+def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
+    return pieces[int(rng.integers(len(pieces)))]
+
+
+def over(below: Floats, above: Floats) -> Floats:
+    """Two activations of the same muscles: sums while small, saturates at 1, smooth."""
+    return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)

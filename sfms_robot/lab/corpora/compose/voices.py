@@ -49,7 +49,7 @@ class Voice:
         ends: (P,) samples of `audio` at which a phrase ends.
         mouth: (F, 52) by frame of the recording, or None.
         noise: (m,) magnitude spectrum of its pauses, flat where it has none.
-        recording: (r,) 16 kHz, the recording as it is, RMS of its speech 0.06.
+        recording: (r,) 16 kHz, the whole recording, RMS of its speech 0.06.
     """
 
     name: str
@@ -77,7 +77,7 @@ def split_voices(voices: Sequence[Voice]) -> dict[Split, list[Voice]]:
 
 
 def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
-    """Laughs that were annotated in clips and that nobody speaks into, (n,) 16 kHz each, by part; maybe none.
+    """Return annotated laughs without speech over them, (n,) 16 kHz each, by split; may be empty.
 
     Looks for a table words.csv.gz (clip, start_s, end_s, kind, text) beside the clips. Raises ConfigError when one of
     them is broken.
@@ -99,7 +99,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
 
 
 def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """Speech (n,) with laughs in the spans (K, 2); as it is where there is no laughter to take."""
+    """Return speech (n,) with laughs in the spans (K, 2), or unchanged where no laughter is at hand."""
     out = speech.copy()
     for start_s, end_s in spans_s if laughter else ():
         at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
@@ -119,7 +119,9 @@ def _eased(sound: Floats) -> Floats:
 
 
 def read_voice(file: Path) -> Voice:
-    """A WAV file, with the mouth recorded beside it (FACEGOOD weights, NAME.npz, or a face track) when there is one."""
+    """Read a WAV file, and the mouth recorded with it (FACEGOOD weights, NAME.npz, or a face track) where there is
+    one.
+    """
     audio = read_audio(file)
     active = voice_activity(audio, AUDIO_HZ, _GRAIN / AUDIO_HZ)
     active = np.convolve(active, [1, 1, 1], "same") > 0  # a grain of margin: soft beginnings and endings
@@ -148,7 +150,7 @@ def read_voice(file: Path) -> Voice:
 
 
 def _levelled(speech: Floats) -> Floats:
-    """Slow swings of loudness (somebody further from the microphone) mostly taken out; RMS 0.06."""
+    """Return the sound with slow swings of loudness (distance to the microphone) mostly removed; RMS 0.06."""
     window = AUDIO_HZ // 2
     power = uniform_filter1d(speech.astype(np.float64) ** 2, window, mode="nearest")
     even = speech * (power + 1e-4 * power.max()) ** -0.35

@@ -38,7 +38,7 @@ _YAW_PITCH_ROLL: Final = slice(52, 55)
 
 @dataclass(frozen=True)
 class Faces:
-    """How one edition keeps faces: their ending, their frames (from the header), and their rows (T, D)."""
+    """Face files of one edition: their ending, their frames (from the header), and their rows (T, D)."""
 
     ending: str
     space: str

@@ -54,7 +54,7 @@ def dim_root(folder: Path) -> Path | None:
 
 
 def _listed(place: Path) -> dict[str, str]:
-    """Split of every id; without the list all are train. Raises ConfigError for a list that is none."""
+    """Return the split of every id; without the list all are train. Raises ConfigError for an invalid list."""
     ids = sorted(file.stem for file in place.glob("*.pkl"))
     file = next((base / LIST for base in (place, place.parent) if (base / LIST).is_file()), None)
     if file is None:
@@ -131,7 +131,7 @@ def vico_root(folder: Path) -> Path | None:
 
 
 def _uuids(place: Path) -> dict[str, str]:
-    """Split of every uuid; those without one are train. Raises ConfigError for a list that is none."""
+    """Return the split of every uuid; those without one are train. Raises ConfigError for an invalid list."""
     file = place / "metadata" / "data.csv"
     if not file.is_file():
         found = sorted({path.name.split(".")[0] for path in (place / "features" / "video_feats").glob("*.*.bin")})

@@ -1,1 +1,1 @@
-"""How ARIG learns: state labels, its corpus, losses, trainer, and what it is worth on held-out conversations."""
+"""Training of ARIG: its corpus, losses and trainer."""

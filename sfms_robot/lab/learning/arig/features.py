@@ -1,4 +1,4 @@
-"""What ARIG is trained on, frame by frame: both people's sounds and motions, and the state of the conversation."""
+"""Training data of ARIG, frame by frame: both people's sounds and motions, and the state of the conversation."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledDyad(Dyad):
-    """What the model takes, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
+    """Inputs of the model, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
 
     `control` is (..., N, 0) for a listener without events. `sway` (..., N, S) is the agent's slow motion, where that is
     not in `agent_motion`; S = 0 without.
@@ -75,7 +75,7 @@ def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
         if any((data / scene).glob(f"{split}/*.npz")):
             found[scene] = open_dataset(data / scene, split)
         else:
-            log.warning("%s: no %s, the curriculum goes on without it", data / scene, split)
+            log.warning("%s: no %s, the curriculum continues without it", data / scene, split)
     return found
 
 
@@ -131,9 +131,9 @@ def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> 
 
 
 def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, bool]:
-    """Features (N, A) in half precision, speech (N,), and whether the track is there at all.
+    """Return features (N, A) in half precision, speech (N,), and whether there is a track.
 
-    A user's track of zeros is no microphone; an agent's is a robot that says nothing. wav2vec2 features come with the
+    A user's track of zeros means a missing microphone; an agent's means a silent robot. wav2vec2 features come with the
     data, as features `wav2vec2` and `agent_wav2vec2`, and take the place of the mel rows.
     """
     frames = len(dyad.listener)
@@ -161,9 +161,11 @@ def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
 
 
 def reflection(before: Tensor, after: Tensor) -> Tensor:
-    """Burg's coefficient (C,) of values of mean 0, (M, C) each: how much of one is the other, whichever comes first.
+    """Return Burg's coefficient (C,) of values of mean 0, (M, C) each: the share of one in the other, in either
+    direction.
 
-    Within -1..1: no autoregression with such coefficients grows (J. P. Burg, 1967). What never moves stays as it is.
+    Within -1..1: no autoregression with such coefficients grows (J. P. Burg, 1967). A constant channel has coefficient
+    1.
     """
     power = (before.double().square() + after.double().square()).sum(0)
     found = 2 * (before.double() * after.double()).sum(0) / power.clamp(min=1e-9)
@@ -171,7 +173,7 @@ def reflection(before: Tensor, after: Tensor) -> Tensor:
 
 
 def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | None) -> Tensor:
-    """From standardised motion (M, C) of every dyad, less what is told of events; what is to be drawn of it (N, C).
+    """Fit the steps on standardised motion (M, C) of every dyad without its events; `drawn` (N, C) is the rest to draw.
 
     `remains` (N, C): of `told`; None without events.
     """
@@ -195,7 +197,7 @@ def _pairs(of_dyads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _remains(model: ArigModel, corpus: ArigCorpus) -> Tensor | None:
-    """`event_curves.remains` of every frame but the first of a dyad (N, C); None for a model without events."""
+    """Return `event_curves.remains` of every frame but the first of a dyad (N, C); None for a model without events."""
     control = corpus.frames.control
     if not model.is_told or control is None:
         return None
@@ -204,7 +206,7 @@ def _remains(model: ArigModel, corpus: ArigCorpus) -> Tensor | None:
 
 
 def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) -> None:
-    """How far a face at rest is off what is told of it: (M, C) of every dyad, while no event moves it and no word."""
+    """Return how far a resting face differs from its event curves: (M, C) of every dyad, without events and speech."""
     control, talks = corpus.frames.control, corpus.frames.voiced[:, 0].float()
     if not model.is_told or control is None:
         return
@@ -233,7 +235,7 @@ def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Te
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
-    """How long each of the paper's states lasts, and which there are with which voices, as the model hears them."""
+    """Return how long each of the paper's states lasts, and which states occur with which voices."""
     labels = corpus.frames.states
     labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
     of_dyads = torch.split(labels, list(corpus.lengths))
@@ -251,7 +253,9 @@ def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
 
 
 def _fit_sway(model: ArigModel, corpus: ArigCorpus) -> None:
-    """On those who listen, where there are any: who speaks sways further, and is told from them by nothing here."""
+    """Fit the sway on frames of listening where there are any: speakers sway further, and no input here tells them
+    apart.
+    """
     of_dyads = torch.split(corpus.frames.sway, list(corpus.lengths))
     listening = [slow for slow, scene in zip(of_dyads, corpus.scenes, strict=True) if scene == "listening"]
     mixture, sizes = fit_sway(listening or of_dyads, lateral_channels(model.settings.channels))

@@ -1,8 +1,8 @@
-"""What ARIG is trained on: noise prediction, states, coarse motion; and what a window is put through before.
+"""Losses of ARIG (noise prediction, states, coarse motion), and the augmentation of a window.
 
 loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - motion|^2 (3.4)
 
-Every frame is told the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
+Every frame gets the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
 is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
 sounds within fewer steps. So are weights of groups of channels: by number, (3) is about the mouth.
 """
@@ -74,14 +74,14 @@ def loss_parts(
     previous: Tensor,
     group_weights: config.GroupWeights | None = None,
 ) -> Parts:
-    """Losses of frames 1..N-1.
+    """Return the losses of frames 1..N-1.
 
     Args:
-        told: what the model is told, its past possibly noisy.
+        told: inputs of the model, the past possibly noisy.
         states: (B, N) int64, -1 where not labelled.
-        truth: (B, N, C) motion to be predicted after the past it is told.
+        truth: (B, N, C) motion to be predicted after this past.
         draws: noise levels per frame.
-        previous: (B, N) the states it is told, of which each frame gets the one before.
+        previous: (B, N) the states given to the model; each frame gets the one before.
         group_weights: of `GROUPS` in equation (3); None: every channel counts the same.
     """
     model = student.model
@@ -174,9 +174,9 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
 def _in_a_room(
     sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
 ) -> Tensor:
-    """Sound (B, N, A) of the user without some of what is no speech (voiced (B, N, 1)), or (silent (B, 1)) any sound.
+    """Return sound (B, N, A) of the user with some non-speech (voiced (B, N, 1)) or all of it (silent (B, 1)) removed.
 
-    Silence is what a stream hears of it from its start. Other features than logarithms of power stay as they are.
+    Silence has the features of a stream's start. Features other than logarithms of power are unchanged.
     """
     if model.settings.sound != "mel":
         return sound
@@ -192,10 +192,11 @@ def _in_a_room(
 def _wander(
     b: int, n: int, channels: int, phase: config.ArigPhase, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of steps.
+    """Return noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of
+    steps.
 
-    The slow part goes elsewhere once a second or so, at once or gliding, and of it a tenth is gone a frame later.
-    A glide is a motion that goes on for no reason, as a stream's own may: nothing of its speed is in what comes after.
+    The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
+    the drift of a stream: its speed does not continue in the frames after it.
     """
     size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
     size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
@@ -219,7 +220,9 @@ def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int = len(STATES)) -> Tensor:
-    """(B, N) what the model is told: unlabelled ones count as `waiting`, a share of them is drawn of `count` by lot."""
+    """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
+    `count`.
+    """
     known = torch.where(states < 0, FIRST, states)
     drawn = torch.randint(count, states.shape, generator=generator).to(states.device)
     replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)

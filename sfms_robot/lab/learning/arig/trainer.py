@@ -35,7 +35,7 @@ def train_arig(
 
     Weights are written in 16 bits: a frame differs by less than a hundredth of its spread (a test).
 
-    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on.
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues.
     """
     listener, phase = settings.listener, settings.training
     torch.manual_seed(settings.seed)

@@ -1,7 +1,7 @@
-"""Nods that a hazard makes by itself in a person's place: his meeting, its own nods fed back, once with chance.
+"""Nods drawn from a hazard in a person's place: the person's meeting, with the drawn nods fed back.
 
-Between two nods everything about them is known beforehand, so a stretch is looked at as a whole: the first step whose
-lot falls below its chance is the next nod.
+Between two nods all inputs are known in advance, so a stretch is evaluated as a whole: the first step whose random
+number falls below its probability is the next nod.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ STRETCH: Final = 400  # steps looked at together
 
 @dataclass(frozen=True)
 class Nodding:
-    """Counted over listening time of several people; pairs are (nods, minutes).
+    """Counts over the listening time of several people; pairs are (nods, minutes).
 
     Attributes:
-        listening, addressed, bystander: spoken to by one who looks at him, or by one who does not.
+        listening, addressed, bystander: in all, and while the speaker looks at the listener or does not.
         phrase_end: see `signals.events.phrase_end_counts`.
         intervals_s: from onset to onset, in listening time.
     """

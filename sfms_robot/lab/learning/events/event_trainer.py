@@ -14,15 +14,21 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.corpora.meeting_evidence import MeetingEvidence, meeting_evidence
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
-from sfms_robot.lab.learning.events import logistic
-from sfms_robot.lab.learning.events.labels import Lesson, Looks, lesson, looks_of, minutes, spans_of, steps_of
-from sfms_robot.lab.learning.events.logistic import Logistic
-from sfms_robot.listeners.events.evidence import AT, NUMBERS
+from sfms_robot.lab.evaluation.whole_recordings import counts_in, done_in, heard_in
+from sfms_robot.lab.learning.events.labels import (
+    Lesson,
+    Looks,
+    MeetingEvidence,
+    lesson,
+    looks_of,
+    meeting_evidence,
+    minutes,
+    spans_of,
+    steps_of,
+)
+from sfms_robot.listeners.events.evidence import AT, NUMBERS, Bools, Scene
 from sfms_robot.listeners.events.model import STEP_FRAMES, Hazard
-from sfms_robot.signals.phase import piecewise_linear_basis
 
 Knots = tuple[float, ...]
 Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number
@@ -86,11 +92,11 @@ GROUPS: Final[Mapping[str, Groups]] = {
 
 @dataclass(frozen=True)
 class Student:
-    """One person in one meeting, ready to be taught from: M steps of 80 ms.
+    """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
         evidence: (M, len(EVIDENCE)) as each step begins.
-        listening, others: (N,) frames in which he listens, and in which somebody else speaks.
+        listening, others: (N,) frames in which the person listens, and in which another one speaks.
         lessons: by kind.
     """
 
@@ -102,7 +108,7 @@ class Student:
 
 
 def student(person: Person, rng: np.random.Generator) -> Student:
-    """Evidence and lessons of one person; `rng` draws the events that nobody annotated."""
+    """Return the training rows of one person; `rng` draws the events that were not annotated."""
     meeting = meeting_evidence(person)
     scene = scene_of(meeting)
     spans = spans_of(person, meeting, rng)
@@ -126,12 +132,14 @@ def student(person: Person, rng: np.random.Generator) -> Student:
 
 
 def scene_of(meeting: MeetingEvidence) -> Scene:
-    """As annotators saw it; nobody annotated smiles."""
+    """Return the scene as annotated; smiles were not."""
     return Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
-    """(N,) logarithm of somebody's nods a minute of listening so far, drawn toward people's while it is short."""
+    """Return (N,) the logarithm of a person's nods per minute of listening so far, shrunk toward the mean while it
+    is short.
+    """
     begun = np.searchsorted(np.sort(nods_s[:, 0]), (np.arange(len(listening)) + 1) * FRAME_S - 1e-6)
     listened = np.cumsum(listening) / FRAME_HZ / 60
     return np.asarray(np.log((begun + PRIOR_NODS) / (listened + PRIOR_NODS / PRIOR_PER_MINUTE)))
@@ -193,7 +201,7 @@ def sampled(students: Iterable[Student], kind: str, seed: int) -> tuple[Doubles,
 def teach(students: Sequence[Student], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
     """The hazard of one kind."""
     rows, happens, counts = sampled(students, kind, seed)
-    return logistic.fit(inputs(rows, groups), happens, counts, ridge=ridge)
+    return fit(inputs(rows, groups), happens, counts, ridge=ridge)
 
 
 def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: float) -> Hazard:
@@ -241,7 +249,9 @@ class Ranked:
 
 
 def ranked(students: Iterable[Student], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
-    """How `score`, (M, E) -> (M,), ranks onsets above the other steps; meetings of a person by their onsets."""
+    """Return how well `score`, (M, E) -> (M,), ranks onsets above other steps; meetings of a person weighted by
+    onsets.
+    """
     found: dict[str, list[tuple[float, int]]] = {}
     for one in students:
         given = one.lessons.get(kind)
@@ -261,3 +271,61 @@ def rate_per_minute(students: Iterable[Student], kind: str) -> float:
     pairs = [(len(one.lessons[kind].onsets), minutes(one.lessons[kind].may)) for one in students if kind in one.lessons]
     onsets, time = np.sum(pairs, axis=0) if pairs else (0.0, 0.0)
     return float(onsets / time) if time else 0.0
+
+
+# --- Logistic regression with a ridge, by Newton's method: few inputs, many rows, no options ----------------------
+
+NEWTON_STEPS: Final = 8
+_ROWS: Final = 65_536  # at once
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """log-odds = intercept + inputs @ weights (K,)."""
+
+    intercept: float
+    weights: Doubles
+
+    def log_odds(self, inputs: Floats) -> Doubles:
+        """(N, K) -> (N,)."""
+        return np.asarray(self.intercept + inputs @ self.weights, np.float64)
+
+
+def fit(
+    inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles | None = None, ridge: float = 10.0
+) -> Logistic:
+    """Maximum likelihood of `happens` (N,) 0 or 1, each row counting `counts` (N,) times, less ridge / 2 * |weights|^2.
+
+    `offset` (N,) is added to the log-odds and not fitted. The intercept is free.
+    """
+    rows, columns = inputs.shape
+    share = float((happens * counts).sum() / counts.sum())
+    at = np.r_[np.log(share / (1 - share)), np.zeros(columns)]
+    given = np.zeros(rows) if offset is None else offset
+    penalty = np.r_[0.0, np.full(columns, ridge)]
+    before, fit_before = at, -np.inf
+    for _ in range(NEWTON_STEPS):
+        goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
+        while not goodness >= fit_before:  # too far: whoever starts at the mean may overshoot
+            at = (at + before) / 2
+            goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
+        before, fit_before = at, goodness - 1e-9 * abs(goodness)
+        at = at + np.linalg.solve(bend, slope)
+    return Logistic(float(at[0]), at[1:])
+
+
+def _at(
+    at: Doubles, inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles, penalty: Doubles
+) -> tuple[float, Doubles, Doubles]:
+    """Penalised log-likelihood, its gradient and its negative curvature."""
+    goodness = -0.5 * float(penalty @ at**2)
+    slope, bend = -penalty * at, np.diag(penalty + 1e-9)
+    for start in range(0, len(inputs), _ROWS):
+        part = slice(start, start + _ROWS)
+        x = np.concatenate([np.ones((len(inputs[part]), 1)), inputs[part]], axis=1)
+        odds = np.clip(x @ at + offset[part], -40, 40)
+        chance = 1.0 / (1.0 + np.exp(-odds))
+        goodness += float(counts[part] @ (happens[part] * odds - np.log1p(np.exp(odds))))
+        slope += x.T @ (counts[part] * (happens[part] - chance))
+        bend += x.T @ (x * (counts[part] * chance * (1 - chance))[:, None])
+    return goodness, slope, bend

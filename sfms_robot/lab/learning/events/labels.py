@@ -1,16 +1,16 @@
-"""What people did and when they might have: the events that each hazard is taught, of one person of a meeting.
+"""Labels for the hazards: events of one person of a meeting, and the steps in which they could have happened.
 
     nod, shake, tilt, laugh, mm_hm     as annotated
-    smile, brow_raise                  nobody annotated them: drawn as in composed dyads, from laughs of others, own
+    smile, brow_raise                  not annotated: drawn as in composed dyads, from laughs of others, own
                                        "mm-hm" and nods, and from questions asked; a reaction late
-    gaze_shift                         a look away from somebody who speaks or holds the floor, where annotated
+    gaze_shift                         a look away from a person who speaks or has the floor, where annotated
 
-A hazard is asked every 80 ms; an event belongs to the step in which it begins.
+A hazard is evaluated every 80 ms; an event belongs to the step in which it begins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,8 +18,8 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.corpora.meeting_evidence import MeetingEvidence
-from sfms_robot.lab.evaluation.phrase_timing import near
+from sfms_robot.lab.corpora.compose.composed import Stretch, active
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, near
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
 from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S
 
@@ -50,7 +50,7 @@ def steps_of(mask: Bools) -> Bools:
 
 
 def spans_of(person: Person, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
-    """(K, 2) of everything he did, those that nobody annotated drawn."""
+    """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
     others = person.others_laughs[:, 0]
     smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
     brows = _some(person.asked, BROWS["question"], rng)
@@ -85,13 +85,13 @@ def lesson(spans_s: Doubles, listening: Bools, inside: Doubles | None = None) ->
 
 @dataclass(frozen=True)
 class Looks:
-    """Where somebody's eyes went.
+    """Gaze of one person.
 
     Attributes:
         shifts_s: (K, 2) from each shift to the next.
-        aside: (K,) not to somebody who speaks or holds the floor.
-        at_speaker: (N,) frames in which he looks at such a one.
-        away_s: (J,) instants at which he looks away from one.
+        aside: (K,) True where the target neither speaks nor has the floor.
+        at_speaker: (N,) frames with gaze at a person who speaks or has the floor.
+        away_s: (J,) instants at which the gaze leaves such a person.
     """
 
     shifts_s: Doubles
@@ -101,7 +101,7 @@ class Looks:
 
 
 def looks_of(person: Person, meeting: MeetingEvidence, counts: Bools) -> Looks:
-    """Of somebody whose gaze was annotated; `counts` (N, P) is who speaks or holds the floor (`evidence.counts_in`)."""
+    """Return the gaze of a person with annotations; `counts` (N, P) marks people who speak or have the floor."""
     frames, gaze = len(counts), person.gaze or ()
     target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
     columns = [max(0, meeting.agents.index(where)) if where in meeting.agents else 0 for _, _, where in gaze]
@@ -125,3 +125,70 @@ def per_minute(lessons: Mapping[str, Lesson]) -> float:
     """Events a minute of the time in which they could happen."""
     total = sum(minutes(one.may) for one in lessons.values())
     return sum(len(one.onsets) for one in lessons.values()) / total if total else 0.0
+
+
+# --- A meeting as one of its people lived it, frame by frame: who spoke, who looked at him, who laughed and nodded
+#
+# What `listeners.events.evidence` makes its numbers of, from annotations where a head has a microphone and a camera.
+
+
+@dataclass(frozen=True)
+class MeetingEvidence:
+    """N frames of a meeting; the people are the participant, then the others by letter.
+
+    Attributes:
+        agents: letters of the P people.
+        speaks: (N, P) a word of each is under way.
+        looks: (N, P) each looks at the participant (1) or not (0); NaN where not annotated, and for the participant.
+        laughs: (N,) one of the others laughs. Smiles were not annotated.
+        nods: (N,) one of the others begins to nod.
+        listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
+        spans_s: (K, 2) of the participant's events, by kind.
+    """
+
+    agents: tuple[str, ...]
+    speaks: Bools
+    looks: Doubles
+    laughs: Bools
+    nods: Bools
+    listening: Bools
+    spans_s: Mapping[str, Doubles]
+
+
+def meeting_evidence(person: Person) -> MeetingEvidence:
+    """Of the whole time in which his head was annotated."""
+    whole = Stretch(person, 0.0, int(person.until_s * FRAME_HZ) / FRAME_HZ)
+    others = sorted(set(person.words) - {person.agent})
+    speaks = [active(person.words.get(agent, np.zeros((0, 2))), whole) for agent in (person.agent, *others)]
+    looks = np.full((whole.frames, len(others) + 1), np.nan)
+    for column, agent in enumerate(others, start=1):
+        if agent in person.gaze_known:
+            looks[:, column] = active(_of(person.looked_at, agent), whole)
+    own, talk = active(person.talk, whole), active(person.others, whole)
+    return MeetingEvidence(
+        (person.agent, *others),
+        np.stack(speaks, axis=1),
+        looks,
+        active(person.others_laughs, whole),
+        _beginnings((start for start, _, _ in person.others_nods), whole.frames),
+        listening_mask(talk, FRAME_HZ, own) & ~active(person.unseen, whole),
+        {
+            "nod": person.nods,
+            "shake": person.shakes,
+            "tilt": person.tilts,
+            "laugh": person.laughs,
+            "mm_hm": person.mm_hms,
+        },
+    )
+
+
+def _of(spans: Iterable[tuple[float, float, str]], agent: str) -> Doubles:
+    return np.array([(start, end) for start, end, who in spans if who == agent], np.float64).reshape(-1, 2)
+
+
+def _beginnings(starts_s: Iterable[float], frames: int) -> Bools:
+    """(frames,) something begins in this frame."""
+    out = np.zeros(frames, bool)
+    at = np.floor(np.fromiter(starts_s, np.float64) * FRAME_HZ + 1e-6).astype(np.int64)
+    out[at[(at >= 0) & (at < frames)]] = True
+    return out

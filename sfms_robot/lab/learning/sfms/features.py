@@ -1,4 +1,4 @@
-"""What an SFMS listener is trained on, frame by frame: both motions, the speaker's sound and the place in a phrase."""
+"""Training data of an SFMS listener, frame by frame: both motions, the speaker's sound and the place in a phrase."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from sfms_robot.lab.learning.staged_frames import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.sfms.draw import UNDECIDED
-from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
+from sfms_robot.listeners.sfms.predictor import Context, last_keyframes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
@@ -46,11 +46,11 @@ class SfmsFrames:
     """N frames of dyads.
 
     Attributes:
-        motion: (N, C) listener, in the motion space of the model; what the model draws of it.
-        face: (N, C) speaker, likewise, 0 where unknown; face_known: (N,) bool.
+        motion: (N, C) listener, in the motion space of the model, the part that the model draws.
+        face: (N, C) speaker, in the same space, 0 where unknown; face_known: (N,) bool.
         sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
-        phase: (N, F) where he is in a phrase.
-        control: (N, K) what is told of the listener's events; K = 0 without.
+        phase: (N, F) the speaker's place in a phrase.
+        control: (N, K) control rows of the listener's events; K = 0 without.
         sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
     """
 
@@ -77,8 +77,8 @@ def gather(
 ) -> SfmsCorpus:
     """`corpus.gather` in one motion space.
 
-    `frontend` says what is taken from the sound; None: nothing, and nobody is heard, which is enough for a tokenizer.
-    `settings`: of a listener that may be told of events; None: one that is not.
+    `frontend` extracts features of the sound; None leaves the sound out, which is enough for a tokenizer.
+    `settings`: of a listener that may get events; None: one that does not.
     """
     one = partial(frames_of, space=space, frontend=frontend, settings=settings)
     return dyads.gather({"listening": listened}, window, one, scratch)
@@ -87,8 +87,8 @@ def gather(
 def frames_of(
     dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
 ) -> SfmsFrames:
-    """One dyad. Raises ConfigError for a motion space that cannot be turned into the wanted one, and for a listener
-    that is told of events where the dyad does not say them.
+    """Return the frames of one dyad. Raises ConfigError for a motion space that cannot be converted, and for a listener
+    with events where the dyad has none.
     """
     control = np.zeros((len(dyad.listener), 0), np.float32)
     if settings is not None and settings.events:
@@ -125,7 +125,7 @@ def _control(dyad: Dyad) -> Floats:
 
 
 def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
-    """Sound (N, R, bins) in half precision and phase (N, F): zeros without sound, which then nobody hears."""
+    """Return sound (N, R, bins) in half precision and phase (N, F), zeros without sound."""
     frames = len(dyad.listener)
     if frontend is None:
         return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
@@ -186,10 +186,10 @@ def context(
     louder: Tensor | None = None,
     held: Tensor | None = None,
 ) -> Context:
-    """What the predictor sees at the seam of each window; `tokens` (N, G), those of the future undecided.
+    """Return the predictor's inputs at the seam of each window; `tokens` (N, G), those of the future undecided.
 
-    `louder` (B,): what is added to the sound before it is standardised, for features that are logarithms.
-    `held` (N, G): what stands at a window's first frame, where the last keyframe is held on to (`tokens.held_tokens`).
+    `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
+    `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
     frames, device = corpus.frames, model.motion_mean.device
     index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
@@ -212,3 +212,94 @@ def context(
         tokens=torch.cat([own, undecided], dim=1),
         control=windows(frames.control, starts, past + future).to(device),
     )
+
+
+# --- Motion of a whole corpus as tokens: what phase 2 is trained on -----------------------------------------------
+
+STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
+
+
+@torch.no_grad()
+def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch,
+    so that busy seconds may borrow from quiet ones of the same stretch.
+    """
+    size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
+    masks = []
+    for dyad in torch.split(motion, list(lengths)):
+        if tokenizer.strategy == "penalised":
+            masks.append(tokenizer.place(dyad[None])[0])
+            continue
+        for stretch in torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)):
+            masks.append(tokenizer.place(stretch[None])[0])
+    return torch.cat(masks)
+
+
+def _stretches(frames: int, size: int, least: int) -> list[int]:
+    """Lengths that add up to `frames`, none under `least` unless there is only one."""
+    whole, rest = divmod(frames, size)
+    sizes = [size] * whole
+    if rest and (rest >= least or not sizes):
+        sizes.append(rest)
+    elif rest:
+        sizes[-1] += rest
+    return sizes
+
+
+@torch.no_grad()
+def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
+    """Tokens (N, G) of every listener in the corpus."""
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    mask = place_all(model.tokenizer, motion, corpus.lengths)
+    return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
+
+
+@torch.no_grad()
+def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
+    """Return the tokens (N, G) of each frame of standardised motion (N, C) as a keyframe."""
+    quantizer = model.tokenizer.quantizer
+    return torch.cat([quantizer.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
+
+
+def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:
+    """Of tokens (N, G) of dyads of those lengths: the last keyframe at or before each frame of its dyad, 0 for none."""
+    return torch.cat([last_keyframes(one[None]).tokens[0, ..., 0] for one in torch.split(tokens, list(lengths))])
+
+
+# --- Keyframes that a roll-out misses, and that training therefore has to miss now and then -----------------------
+#
+# Teacher forcing never shows the predictor a face that should have come back and has not: a lid whose opening was not
+# drawn, a nod that has lost its last swing. In a roll-out that happens, and such a face would stay until some later
+# keyframe. So the last keyframes before the first frame to draw are left out now and then, and where what is then shown
+# is off by more than a keyframe costs, the right answer is one at once: the face as it is there.
+
+MISSED_FRAMES = 6  # before the first to draw
+
+
+def without_last_keyframes(
+    tokens: Tensor,
+    dense: Tensor,
+    motion: Tensor,
+    first: Tensor,
+    member: Tensor,
+    costs: Tensor,
+    share: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Tokens (B, T, G) of which a `share` of groups has missed its last keyframes and is put right in frame `first`.
+
+    Args:
+        tokens: what was meant; dense: (B, T, G) what each frame's keyframe would be.
+        motion: (B, T, C) standardised; member: (G, C); costs: (G,) of a keyframe, in squared units of the motion.
+        first: (B,) the first frame to draw, above 0.
+    """
+    b, t, groups = tokens.shape
+    row, frame = torch.arange(b, device=tokens.device)[:, None], torch.arange(t, device=tokens.device)
+    recent = (frame >= first[:, None] - MISSED_FRAMES) & (frame < first[:, None])
+    chosen = torch.rand(b, 1, groups, generator=generator).to(tokens.device) < share
+    left = torch.where(recent[..., None] & chosen, 0, tokens)
+    last = last_keyframes(left).at[row[:, 0], first - 1][..., 0]  # (B, G)
+    off = motion[row, last.clamp(min=0)] - motion[row[:, 0], first][:, None]  # (B, G, C)
+    wrong = (last >= 0) & ((off**2 * member).sum(-1) > costs) & (left != tokens).any(1)
+    left[row[:, 0], first] = dense[row[:, 0], first]
+    return torch.where(wrong[:, None], left, tokens)

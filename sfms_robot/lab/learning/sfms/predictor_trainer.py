@@ -18,12 +18,18 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import windows
 from sfms_robot.lab.learning.job import Job, Run
 from sfms_robot.lab.learning.resume import digest_of
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
-from sfms_robot.lab.learning.sfms.losses import next_tokens
-from sfms_robot.lab.learning.sfms.missed_keyframes import without_last_keyframes
-from sfms_robot.lab.learning.sfms.soft_dtw import keyframe_dtw
+from sfms_robot.lab.learning.sfms.features import (
+    SfmsCorpus,
+    context,
+    fit_sound_scales,
+    gather,
+    held_tokens,
+    keyframe_tokens,
+    tokenise,
+    without_last_keyframes,
+)
+from sfms_robot.lab.learning.sfms.losses import keyframe_dtw, next_tokens
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.lab.learning.sfms.tokens import held_tokens, keyframe_tokens, tokenise
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
@@ -47,11 +53,11 @@ def train_listener(
 ) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
-    How it is sampled is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
+    Sampling is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
 
     `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
-    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` goes on; the weights
+    Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)

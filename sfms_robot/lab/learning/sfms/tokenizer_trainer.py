@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,21 @@ from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import first_frames, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather
-from sfms_robot.lab.learning.sfms.imitation import imitation, lively
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
 from sfms_robot.lab.learning.sfms.losses import masking, reconstruction
-from sfms_robot.lab.learning.sfms.masks import batches, teacher
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
-from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place_learned
+from sfms_robot.listeners.sfms.piecewise_linear import completion_errors
+from sfms_robot.listeners.sfms.placement import (
+    ConditionalScore,
+    ScoreNetwork,
+    Strategy,
+    Tracks,
+    place,
+    place_learned,
+    tracks,
+)
 from sfms_robot.listeners.sfms.quantizer import Codebook
 from sfms_robot.listeners.space import MotionSpace
 
@@ -48,7 +55,7 @@ def train_tokenizer(
     `order`: of the channels in the files, if not the layout's own (`open_dataset`).
 
     Returns the figures of the run and the held-out error. Ctrl-C leaves a checkpoint in `out`, from which
-    `run.resume` goes on; the weights are written when the run is finished.
+    `run.resume` continues; the weights are written when the run is finished.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
@@ -56,7 +63,7 @@ def train_tokenizer(
     dyads = open_for(space.name, data, "train", order)
     if dyads.fps != FRAME_HZ:
         log.warning(
-            "%s has %g frames a second and is learned as it is; streamed, a listener shows %d a second",
+            "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
             data, dyads.fps, FRAME_HZ,
         )  # fmt: skip
     unseen = open_for(space.name, data, "validation", order)
@@ -236,3 +243,170 @@ def reconstruction_error(
     motion = held_out_windows(model, corpus)
     masks = [tokenizer.place(some, keyframes or tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
     return float(window_errors(tokenizer, motion, torch.cat(masks)).mean())
+
+
+# --- What conditional keyframe scores learn from: a teacher that knows how every choice would end -----------------
+#
+# The score network chooses keyframes for some tracks by itself, now and then by chance, and at each state it came
+# through
+# the teacher says, for every frame, the error of the best mask of k keyframes that holds what is chosen and this frame
+# (`exact.completion_errors`). The scores learn to prefer what costs least in the end. Because the states are the
+# network's own, it learns to get out of its own mistakes.
+#
+# Why not equation (13) alone: through Algorithm 1 a score hears only of the draw it took part in, and the loss stalls
+# above evenly placed keyframes. The teacher's error is that of linear interpolation, which the inpainter starts from.
+#
+# Error of linear interpolation over that of the exact masks, recorded faces, unseen takes, one set of keyframes per
+# channel, k = 3, 7, 10: even keyframes 4.3, 11, 15; choices of this network 1.7, 2.0, 1.6; swept over twice 1.16, 1.23,
+# 1.13 (width 32, 2 layers, 1,500 steps of 32 tracks).
+
+FLOOR = 0.05  # added to the least error, in squared deviations of the track: below it nobody sees a difference
+SHARPNESS = 0.1  # temperature of the teacher's preferences
+CANDIDATES = 4  # tracks looked at for one that is learned from
+EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
+
+
+def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torch.Generator) -> Tensor:
+    """Cross-entropy of the scores against the teacher, over all states of one choice of 1..`most` keyframes a track."""
+    n = len(track.curves)
+    k = torch.randint(1, most + 1, (n,), generator=generator).to(track.curves.device)
+    rows, chosen, remaining = states(score, track, k, generator)
+    regret = regrets(track[rows], chosen, k[rows], most)
+    wanted = torch.softmax(-regret / SHARPNESS, dim=1)
+    logits = score(track[rows], chosen, remaining)
+    heard = torch.log_softmax(logits, dim=1).masked_fill(chosen > 0.5, 0.0)
+    return -(wanted * heard).sum(1).mean()
+
+
+@torch.no_grad()
+def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: torch.Generator) -> Tracks:
+    """At most `count` tracks of motion (B, T, C), those that move most likelier: a still one has no best keyframes."""
+    few = -(-CANDIDATES * count // len(member))  # windows that give enough candidates
+    some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device)]
+    found = tracks(some, member, curves)
+    around = (some - some.mean(1, keepdim=True)).square().mean(1) @ member.T  # (B, G)
+    weight = around.float().flatten().clamp(max=1.0).sqrt().cpu() + 0.05
+    rows = torch.multinomial(weight, min(count, len(weight)), generator=generator)
+    return found[rows.to(motion.device)]
+
+
+@torch.no_grad()
+def states(
+    score: ConditionalScore, track: Tracks, k: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Every state (track row, chosen frames (S, T), keyframes to come) that the network's own choices lead through."""
+    n, t, _ = track.curves.shape
+    mask = track.curves.new_zeros(n, t)
+    rows, chosen, remaining = [], [], []
+    for step in range(int(k.max())):
+        here = (step < k).nonzero()[:, 0]
+        rows.append(here)
+        chosen.append(mask[here])
+        remaining.append((k - step)[here])
+        logits = score(track, mask, (k - step).clamp(min=1))
+        noise = -torch.log(-torch.log(_uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
+        drawn = _uniform(n, generator, mask.device) < EXPLORED
+        picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
+        mask = mask.scatter(1, picked, 1.0)
+    return torch.cat(rows), torch.cat(chosen), torch.cat(remaining)
+
+
+@torch.no_grad()
+def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
+    """Return the excess error of each next frame (S, T) over the best one with all k keyframes, as a share of the
+    least.
+    """
+    errors = completion_errors(track.cost, chosen, most)  # (S, most, T)
+    errors = errors[torch.arange(len(k), device=k.device), k - 1]
+    least = errors.amin(1, keepdim=True)
+    return ((errors - least) / (least + FLOOR)).masked_fill(chosen > 0.5, torch.inf)
+
+
+def _uniform(shape: int | tuple[int, int], generator: torch.Generator, device: torch.device) -> Tensor:
+    return torch.rand(shape, generator=generator).to(device)
+
+
+# --- Keyframe masks for training: fresh for every batch, or, where that is slow, from a bank placed beforehand ----
+#
+# Conditional scores (`learned`) learn from the exact masks, and so do the codes and the inpainter beside them: their
+# own
+# masks differ little from their teacher's once they are learned, and need not be placed anew each step.
+
+FEW_GROUPS = 8  # up to so many, exact masks of a batch take less time than its step
+MOST_WINDOWS = 2000  # of which masks are kept; more overlap than that teaches little
+
+Batch = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]  # batch size -> motion (B, T, C), masks (B, T, G)
+
+
+def teacher(strategy: Strategy) -> Strategy:
+    """The placement that a tokenizer of this strategy is trained on."""
+    return "exact" if strategy == "learned" else strategy
+
+
+@dataclass(frozen=True)
+class MaskBank:
+    """Masks (W, T, G) bool of the windows at `starts` (W,)."""
+
+    starts: Tensor
+    masks: Tensor
+
+    def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """First frames (B,) and masks (B, T, G) of some windows."""
+        window = torch.randint(len(self.starts), (size,), generator=generator)
+        return self.starts[window], self.masks[window].float()
+
+
+@torch.no_grad()
+def mask_bank(tokenizer: Tokenizer, motion: Tensor, starts: Tensor, most: int = MOST_WINDOWS) -> MaskBank:
+    """Masks of at most `most` of the windows at `starts`, evenly spread."""
+    kept = starts[:: max(1, -(-len(starts) // min(most, MOST_WINDOWS)))]
+    parts = [_masks(tokenizer, windows(motion, some, tokenizer.window)) > 0.5 for some in torch.split(kept, CHUNK)]
+    return MaskBank(kept, torch.cat(parts))
+
+
+def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
+    """(B, T, G)."""
+    gap = tokenizer.max_gap if tokenizer.strategy == "exact" else None
+    return place(batch, tokenizer.keyframes, teacher(tokenizer.strategy), member=tokenizer.member, max_gap=gap)
+
+
+def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn: int) -> Batch:
+    """Return the draw of every training step: windows of the standardised motion (N, C) with their masks.
+
+    `lengths` are those of the dyads in `motion`, `drawn` the number of windows over the whole training.
+    """
+    starts = first_frames(lengths, tokenizer.window)
+    if teacher(tokenizer.strategy) == "exact" and len(tokenizer.member) > FEW_GROUPS:
+        bank = mask_bank(tokenizer, motion, starts, drawn)
+
+        def look_up(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            first, mask = bank.draw(size, generator)
+            return windows(motion, first, tokenizer.window), mask
+
+        return look_up
+
+    if tokenizer.strategy == "penalised":  # a window is a piece of its dyad, and begins where the last keyframe is held
+        whole = place_all(tokenizer, motion, lengths)
+
+        def pieces(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            first = starts[torch.randint(len(starts), (size,), generator=generator)]
+            mask = windows(whole, first, tokenizer.window)
+            mask[:, 0] = 1.0
+            return windows(motion, first, tokenizer.window), mask
+
+        return pieces
+
+    # A tokenizer that places exactly at run time sees half its masks from long stretches, as the predictor will.
+    stretched = tokenizer.strategy == "exact"
+    long_masks = place_all(tokenizer, motion, lengths) if stretched else None
+
+    def fresh(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        first = starts[torch.randint(len(starts), (size,), generator=generator)]
+        batch = windows(motion, first, tokenizer.window)
+        near = size // 2 if stretched else 0
+        mask = _masks(tokenizer, batch[near:])
+        if long_masks is not None:
+            mask = torch.cat([windows(long_masks, first[:near], tokenizer.window), mask])
+        return batch, mask
+
+    return fresh

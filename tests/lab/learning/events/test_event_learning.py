@@ -14,11 +14,10 @@ from ami_tables import UNTIL_S, words, write_tables
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.compose.ami import Person, phrases
-from sfms_robot.lab.corpora.meeting_evidence import meeting_evidence
 from sfms_robot.lab.evaluation.whole_recordings import Scene, counts_in
-from sfms_robot.lab.learning.events import event_rollout, logistic
+from sfms_robot.lab.learning.events import event_rollout, event_trainer
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
-from sfms_robot.lab.learning.events.labels import lesson, looks_of
+from sfms_robot.lab.learning.events.labels import lesson, looks_of, meeting_evidence
 from sfms_robot.listeners.events.evidence import AT
 from sfms_robot.listeners.events.model import EventModel, HazardBank, load_tables
 
@@ -50,7 +49,7 @@ def test_a_known_hazard_is_recovered():
     rows = rng.normal(size=(60_000, 3)).astype(np.float32)
     truth = np.array([1.0, -0.5, 0.0])
     happens = (rng.random(len(rows)) < 1 / (1 + np.exp(3 - rows @ truth))).astype(float)
-    found = logistic.fit(rows, happens, np.ones(len(rows)))
+    found = event_trainer.fit(rows, happens, np.ones(len(rows)))
     assert found.intercept == pytest.approx(-3, abs=0.06)
     np.testing.assert_allclose(found.weights, truth, atol=0.05)
 
@@ -59,10 +58,10 @@ def test_a_row_that_counts_twice_is_two_rows_and_a_ridge_shrinks():
     rng = np.random.default_rng(1)
     rows = rng.normal(size=(500, 2)).astype(np.float32)
     happens = (rng.random(500) < 0.3).astype(float)
-    twice = logistic.fit(np.r_[rows, rows], np.r_[happens, happens], np.ones(1000), ridge=1.0)
-    counted = logistic.fit(rows, happens, np.full(500, 2.0), ridge=1.0)
+    twice = event_trainer.fit(np.r_[rows, rows], np.r_[happens, happens], np.ones(1000), ridge=1.0)
+    counted = event_trainer.fit(rows, happens, np.full(500, 2.0), ridge=1.0)
     np.testing.assert_allclose(twice.weights, counted.weights, atol=1e-6)
-    assert np.abs(logistic.fit(rows, happens, np.ones(500), ridge=1e4).weights).max() < 0.02
+    assert np.abs(event_trainer.fit(rows, happens, np.ones(500), ridge=1e4).weights).max() < 0.02
 
 
 def test_a_lesson_holds_the_onsets_within_listening_and_no_step_inside():
@@ -149,7 +148,7 @@ def test_counts_of_a_person_are_his_own():
     ("data", "out", "problem"), [("none", "a.yaml", "no such folder"), (".", "gone/a.yaml", "--out")]
 )
 def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     with pytest.raises(ConfigError, match=problem) as raised:
         train_events(tmp_path / data, tmp_path / out, False, 1)
@@ -158,7 +157,7 @@ def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
 
 @pytest.mark.parametrize("kind", ["gaze_shift", "laugh"])
 def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind):
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     write_tables(tmp_path, lacking=kind)
     with pytest.raises(ConfigError, match=f"there is no {kind}") as raised:
@@ -167,7 +166,7 @@ def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind
 
 
 def test_without_people_of_validation_nothing_is_ranked(tmp_path):
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     write_tables(tmp_path)
     found = train_events(tmp_path, tmp_path / "events.yaml", False, 1)
@@ -182,7 +181,7 @@ def test_smiles_last_as_long_as_composed_ones():
 
 
 def test_what_is_saved_is_loaded(tmp_path):
-    from sfms_robot.lab.train.event_training import save
+    from sfms_robot.lab.learning.events.event_training import save
 
     shipped = EventModel.load().tables
     save(tmp_path / "events.yaml", shipped)
@@ -224,7 +223,7 @@ def test_all_meetings_teach_what_a_study_found_in_them():
     Those are the value just as an own nod ends (-0.08 there, some 0.3 here) and, of a silence of over 2 s, two that
     cannot occur here.
     """
-    from sfms_robot.lab.train.event_training import train_events
+    from sfms_robot.lab.learning.events.event_training import train_events
 
     found = train_events(Path(os.environ["SFMS_ROBOT_AMI"]), None, True, seed=1)["nod"]
     assert found["intercept"] == pytest.approx(-7.44, abs=0.12)

@@ -28,12 +28,12 @@ from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.learning.arig import features as arig
 from sfms_robot.lab.learning.arig.losses import Student
 from sfms_robot.lab.learning.arig.trainer import arig_job
-from sfms_robot.lab.learning.gradients import Gradients
 from sfms_robot.lab.learning.job import Job
 from sfms_robot.lab.learning.process_group import ProcessGroup
 from sfms_robot.lab.learning.sfms import features as sfms
 from sfms_robot.lab.learning.sfms.predictor_trainer import listener_job
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_job
+from sfms_robot.lab.learning.training_loop import Gradients
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel

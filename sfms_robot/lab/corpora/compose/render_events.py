@@ -27,16 +27,18 @@ from sfms_robot.frames import (
     Floats,
     ListenerEvent,
 )
-from sfms_robot.lab.corpora.compose.motions import SHAPE, edges, slow
-from sfms_robot.lab.corpora.compose.splicing import (
+from sfms_robot.lab.corpora.compose.motions import (
     FADE,
+    SHAPE,
     SMILE,
+    edges,
     first_frame,
     held,
     laid_event,
     over,
     pick,
     placed,
+    slow,
     stretched,
     tiled,
 )
@@ -61,15 +63,15 @@ def _spans() -> Doubles:
 
 @dataclass(frozen=True)
 class Score:
-    """What happens in `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
+    """Events within `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
 
     Attributes:
         nods, shakes, tilts, laughs, talk, backchannels, mm_hms: the listener's own.
         gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". How
-            far and to which side goes by `signals.event_sizes`, since no robot sits at their table.
+            far and to which side follows `signals.event_sizes`: a robot does not sit at their table.
         shared_laughs: laughs of the others.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
-        mouth: (frames, 52) that belongs to his own recorded voice, or None: a recorded mouth that fits none.
+        mouth: (frames, 52) that belongs to the listener's own recorded voice, or None.
     """
 
     frames: int
@@ -127,7 +129,7 @@ def speaker_motion(
     laughs: Doubles | None = None,
     nods: Doubles | None = None,
 ) -> Floats:
-    """(N, 58) of somebody who speaks with this mouth (N, 52); head and the rest of the face from recordings.
+    """Return motion (N, 58) of a person who speaks with this mouth (N, 52); head and the rest of the face are recorded.
 
     Args:
         attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where anything may be.
@@ -185,7 +187,7 @@ def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
 
 
 def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
-    """The head (N, 6) of somebody who speaks, while he does."""
+    """Return the head (N, 6) of a person who speaks."""
     talks = np.zeros(score.frames, np.float32)
     for start, end in score.talk:
         talks[max(0, first_frame(start)) : max(0, first_frame(end))] = 1
@@ -196,7 +198,7 @@ def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> F
 
 @dataclass(frozen=True)
 class NodHabit:
-    """How one person nods: the usual size [rad, peak to peak], and the pace of the swings."""
+    """Nods of one person: the usual size [rad, peak to peak], and the pace of the swings."""
 
     size_rad: float
     pace_hz: float
@@ -220,7 +222,9 @@ def nod_habit(rng: np.random.Generator) -> NodHabit:
 
 
 def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
-    """How this person makes a nod that is to last about so long: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12 degrees."""
+    """Return swings, rate and size of a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12
+    degrees.
+    """
     swings, lasts_s = sizes.swings(length_s, habit.pace_hz)
     least, _, most = np.deg2rad(sizes.NOD_DEG)
     size = np.clip(habit.size_rad * np.exp(rng.normal(0, sizes.NOD_SPREAD)), least, most)
@@ -307,7 +311,7 @@ def _shifts(targets: Floats) -> list[ListenerEvent]:
 
 
 def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
-    """Where somebody looks who speaks, (N, 2): at the listener or not, as told; at random where nothing is told."""
+    """Return where a speaker looks, (N, 2): at the listener or not as given, at random where not known."""
     at_listener = attention > 0.5
     unknown = np.isnan(attention)
     looks, row = bool(rng.random() < 0.6), 0
@@ -362,7 +366,7 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
 
 
 def smile_s(rng: np.random.Generator) -> float:
-    """How long a smile that answers something is seen."""
+    """Return for how long a smile that answers something is seen."""
     median_s, deviation, least_s, most_s = sizes.SMILE_S
     return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
 

@@ -21,12 +21,11 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.evaluation.sampling_calibration import calibrate, rounds
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.job import Run, Watch, progress_bar, tensorboard, together
 from sfms_robot.lab.learning.process_group import joined, local_rank
 from sfms_robot.lab.learning.resume import checkpoint_file
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.watch import Watch, progress_bar, tensorboard, together
 from sfms_robot.listeners import checkpoint
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -34,13 +33,13 @@ DEVICES = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What the command line says. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
+    """Options of the command line. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
 
     `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an earlier training left in
     `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
 
     Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
-    starts again after one of them died goes on from the checkpoint.
+    starts again after one of them died resumes from the checkpoint.
     """
 
     file: Path
@@ -96,8 +95,8 @@ def _calibrate(settings: config.Training, options: TrainOptions) -> None:
 
 
 def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str) -> Run:
-    """The run as it begins: from the checkpoint, where it was started again. Raises ConfigError where it would be the
-    end of an earlier training: of its own, or of `others` whose files would be replaced.
+    """Return the run, from its checkpoint where it was started again. Raises ConfigError where files of an earlier
+    training of this job or of `others` would be replaced.
     """
     if run.group.restarts:
         return replace(run, resume=checkpoint_file(options.out, job).exists())
@@ -106,7 +105,7 @@ def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str
     run.group.wait()  # nobody has written anything yet
     for file in (options.out / weights, checkpoint_file(options.out, job), *(options.out / name for name in others)):
         if file.exists():
-            raise ConfigError(f"{file} is of an earlier training: --resume goes on with it, --overwrite begins anew")
+            raise ConfigError(f"{file} is of an earlier training: --resume continues it, --overwrite starts again")
     run.group.wait()
     return run
 
@@ -135,7 +134,7 @@ def train_settings(options: TrainOptions, phase: str = "training") -> config.Tra
 
 @contextmanager
 def run_of(options: TrainOptions) -> Iterator[Run]:
-    """How the command line asks for it to be run, with a progress bar where its figures are."""
+    """Yield the run with the settings of the command line, and a progress bar."""
     device = device_of(options.device)
     with ExitStack() as stack:
         if device.type == "cuda":
