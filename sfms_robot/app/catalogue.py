@@ -72,7 +72,7 @@ def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, 
 
     Raises ConfigError without PortAudio.
     """
-    from sfms_robot.sources import microphone
+    from sfms_robot.sources import sound_devices
 
     def option(monitor: bool) -> str:
         return "--play " if direction == "playing" else "--agent-audio device:" if monitor else "--audio mic:"
@@ -86,5 +86,5 @@ def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, 
             "rate_hz": round(device.rate_hz),
             "description": f"{option(device.monitor)}{device.name}",
         }
-        for device in microphone.sound_devices(direction)
+        for device in sound_devices.sound_devices(direction)
     ]

@@ -12,12 +12,11 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.options import SIM, HeadOptions
-from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map
+from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.head import load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
-from sfms_robot.ports import Bus as BusConfig
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
 from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort

@@ -42,7 +42,7 @@ class BusServo:
         return min(max(0.0, self.min_rad), self.max_rad)
 
 
-def counts(name: str, faults: Faults, measured: Mapping[str, float]) -> bool:
+def counts(name: str, faults: Faults, measured: Mapping[str, float | None]) -> bool:
     """Return whether fault `name` is acted upon.
 
     `measured`: by fault, the value that its threshold is compared with. A fault whose value is not known yet counts.

@@ -144,7 +144,7 @@ def test_an_earlier_training_is_not_lost_unasked(done, fails, arguments, tmp_pat
     weights = tmp_path / "out" / "tokenizer.safetensors"
     before = weights.read_bytes()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")
-    assert code == 2 and f"{weights} is of an earlier training: --resume goes on with it, --overwrite" in told
+    assert code == 2 and f"{weights} is of an earlier training: --resume continues with it, --overwrite" in told
     assert weights.read_bytes() == before
     weights.unlink()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")
@@ -187,7 +187,7 @@ def test_ctrl_c_saves_says_how_to_go_on_and_exits_130(arguments, tmp_path):
         running.send_signal(signal.SIGINT)
         told = running.communicate()[1]
     assert running.returncode == 130
-    assert "tokenizer: interrupted after step" in told and "of 1000000" in told and "--resume goes on" in told
+    assert "tokenizer: interrupted after step" in told and "of 1000000" in told and "--resume continues" in told
     assert "Traceback" not in told
     assert not (tmp_path / "out" / "tokenizer.safetensors").exists()
 

@@ -344,6 +344,8 @@ def metrics_server(wanted: str) -> LocalServer:
         def metrics(request: Request) -> Response:
             return Response(generate_latest(_Collector(statistics)), media_type=CONTENT_TYPE_LATEST)
 
+        return [Route("/{path:path}", metrics)]
+
     server = LocalServer("--metrics", routes, host or LOOPBACK, port)
     server.url += "metrics"
     return server

@@ -14,7 +14,6 @@ from typing import Any, Final, Literal, cast
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
 from sfms_robot.app.servo.single_servo import State
 from sfms_robot.config import Faults
-from sfms_robot.config.overlay import Measured
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
 from sfms_robot.servo.policy import counts
@@ -75,7 +74,8 @@ class Wanted:
 
     def lives_with(self, fault: str, state: State) -> bool:
         """Return whether the head's file says that this fault does not count."""
-        return not counts(fault, self.faults, Measured(state.in_unit("voltage"), state.in_unit("temperature")))
+        measured = {"input voltage": state.in_unit("voltage"), "overheating": state.in_unit("temperature")}
+        return not counts(fault, self.faults, measured)
 
 
 @dataclass(frozen=True)

@@ -183,10 +183,11 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         device = port or only_port()
         yield Line(device=device, shown=device, family=family, baud=baud, rate_hz=DEFAULT_RATE_HZ, wanted={})
         return
-    from sfms_robot.app.open_head import HeadOptions, open_wires  # slow to load, and only a head needs it
+    from sfms_robot.app.options import HeadOptions  # slow to load, and only a head needs it
+    from sfms_robot.app.wiring import open_wires
 
     described = load_head(head)
-    where = stack.enter_context(open_wires(described, HeadOptions(head, port or only_port())))
+    where = stack.enter_context(open_wires(described, HeadOptions(head=head, port=port or only_port())))
     if port != SIM:
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, each in where.items():
@@ -220,7 +221,9 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
             model=joint.model,
             model_number=maps[joint.model].model_number,
             faults=head.faults,
-            needs=JointNeeds(int(low), int(high), safety.stored, ids - {joint.id}, bounded),
+            needs=JointNeeds(
+                int(low), int(high), stored=safety.stored, other_ids=ids - {joint.id}, bounded_current=bounded
+            ),
         )
     return found
 

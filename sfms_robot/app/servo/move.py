@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, cast
+from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from sfms_robot.app.open_head import HeadOptions, build_one, open_wires
+from sfms_robot.app.open_head import build_one
+from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Wire
 from sfms_robot.app.servo.single_servo import parse_number, scan
-from sfms_robot.app.wiring import Opened, port_of
+from sfms_robot.app.wiring import Opened, open_wires, port_of
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError, ConfigError, PortError, RobotError, ServoError, TorqueError
-from sfms_robot.frames import Doubles
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import finish
@@ -26,6 +23,7 @@ from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.stored_settings import JointNeeds
 
 SPEED_DEG_S: Final = 20.0
 STEP_S: Final = 0.02
@@ -49,7 +47,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
     _check_mode(seen)
     start = seen.read(present)
     startup = _startup(seen)
-    limits = startup.own_limits(0) or (0, math.ceil(table.ticks_per_revolution) - 1)
+    limits = startup.own_limits() or (0, math.ceil(table.ticks_per_revolution) - 1)
     target = _target(seen, limits, start, to, by)
     step = max(1, math.floor(_ticks(table, SPEED_DEG_S) * STEP_S))
     speed = table.role("moving_speed")
@@ -59,7 +57,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
     goal = start
     try:
         if not stays_on:
-            goal = finish(startup.torque_on(0), lambda pause_s: clock.wait_until(clock.now_s() + pause_s))
+            goal = finish(startup.torque_on(), lambda pause_s: clock.wait_until(clock.now_s() + pause_s))
             stays_on = was_on
         if speed is not None:
             seen.put(speed, _slow(speed))
@@ -82,22 +80,16 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
     return {"id": seen.id, "from": start, "to": target, "reached": reached}
 
 
-class _OneTurn:
-    """Conversion of a servo that is not a joint: it needs nothing beyond one turn."""
-
-    def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
-        return np.zeros(len(angles_rad), dtype=np.int64)
-
-    def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
-        return np.zeros(len(ticks))
-
-
-def _startup(seen: FoundServo) -> Startup[Any]:
-    """Return the startup of a servo that no head's file describes."""
+def _startup(seen: FoundServo) -> Startup:
+    """Return the startup of a servo that no head's file describes; it needs nothing beyond one turn."""
     table, wire = seen.registers(), seen.wire
-    kind: Any = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
-    servo = BusServo("servo", seen.id, load_firmware_map(wire.model or table.model), 0.0, 0.0)
-    return cast("Startup[Any]", kind("servo", wire.link, [servo], [table], _OneTurn(), wire.baud, TRIES))
+    kind = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
+    firmware_map = load_firmware_map(wire.model or table.model)
+    servo = BusServo(joint="servo", id=seen.id, map=firmware_map, min_rad=0.0, max_rad=0.0)
+    startup = kind(servo, table, JointNeeds(0, 0), {})
+    wire.link.tries = TRIES
+    startup.attach(wire.link)
+    return startup
 
 
 def _target(seen: FoundServo, limits: tuple[int, int], start: int, to: str | None, by: str | None) -> int:
@@ -168,7 +160,7 @@ SILENT: Final = "does not answer; torque off was sent"
 def release_head(name: str, port: str, everything: bool = False) -> list[dict[str, Any]]:
     """Take torque off the servos of a head on `port`, as `release`."""
     head = load_head(name)
-    with open_wires(head, HeadOptions(name, port)) as opened:
+    with open_wires(head, HeadOptions(head=name, port=port)) as opened:
         return release(head, opened, RealClock(), everything)
 
 

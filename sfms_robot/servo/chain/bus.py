@@ -27,11 +27,10 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import Faults
+from sfms_robot.config import BusConfig, Faults
 from sfms_robot.errors import BusError, PacketError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.ports import Bus as BusConfig
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
 from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member

@@ -167,8 +167,7 @@ class Startup(ABC):
         A servo that stands outside its own limits is moved inside first, at `SPEED_DEG_S`, which takes its time. Raises
         ServoError, with torque off, for one that does not arrive, or has no speed register.
         """
-        names = limit_names(self.table) or ()
-        limits = self._limits({name: self.value(self.table[name]) for name in names})
+        limits = self.own_limits()
         yield 0.0
         present = self.value(self._field("present_position"))  # from here on without a pause
         if limits is not None and not _inside(present, limits):
@@ -293,8 +292,12 @@ class Startup(ABC):
         yield from self._write(field, target)
         return True
 
+    def own_limits(self) -> tuple[int, int] | None:
+        """Return the position limits stored in the servo, ticks; None if it has none or they do not count."""
+        return self._limits({name: self.value(self.table[name]) for name in limit_names(self.table) or ()})
+
     def _limits(self, values: Mapping[str, int]) -> tuple[int, int] | None:
-        """Return the position limits stored in a servo, ticks; None if it has none or they do not count."""
+        """Return `own_limits` of registers that have been read."""
         names = limit_names(self.table)
         if names is None or not limits_count(self.table, self._needs):
             return None

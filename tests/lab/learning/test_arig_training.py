@@ -111,7 +111,7 @@ def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path
             signal.raise_signal(signal.SIGINT)
 
     train_arig(settings(steps=6), data, tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt, match="--resume goes on"):
+    with pytest.raises(KeyboardInterrupt, match="--resume continues"):
         train_arig(settings(steps=6), data, tmp_path / "parts", Run(watch=stop))
     train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
     whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
@@ -148,7 +148,7 @@ def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data,
     shutil.copytree(data / "validation", tmp_path / "validation")
     whole = settings(steps=2, stages=[{"share": 1.0, "speaking": 1.0, "listening": 1.0}])
     assert train_arig(whole, tmp_path, tmp_path / "out")["steps"] == 2
-    assert "no train, the curriculum goes on without it" in caplog.text
+    assert "no train, the curriculum continues without it" in caplog.text
     with pytest.raises(ConfigError, match="a stage draws from speaking alone, the data have listening"):
         train_arig(settings(steps=2), tmp_path, tmp_path / "out2")
 

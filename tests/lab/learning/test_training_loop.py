@@ -77,7 +77,7 @@ def left_alone(tmp_path_factory):
 @pytest.mark.parametrize("stops", [[k] for k in range(1, 12)] + [[2, 5, 6]])
 def test_interrupted_anywhere_and_resumed_equals_left_alone(left_alone, tmp_path, stops):
     for stop in stops:
-        with pytest.raises(KeyboardInterrupt, match=f"after step {stop} of 12.*--resume goes on"):
+        with pytest.raises(KeyboardInterrupt, match=f"after step {stop} of 12.*--resume continues"):
             fit(toy(evaluate_every=3), tmp_path, Run(resume=stop != stops[0], watch=interrupt_after(stop)))
         torch.manual_seed(99)  # another process would not have these random numbers
     job = toy(evaluate_every=3)
@@ -212,7 +212,7 @@ def test_beginning_anew_over_an_unfinished_run_is_warned_of(tmp_path, caplog):
     with pytest.raises(KeyboardInterrupt):
         fit(toy(), tmp_path, Run(watch=interrupt_after(4)))
     fit(toy(), tmp_path)
-    assert "was at step 4, begins anew; --resume would have gone on" in caplog.text
+    assert "was at step 4, starts again; --resume would have continued" in caplog.text
     caplog.clear()
     fit(toy(), tmp_path)  # a finished one may be trained again without a word
     assert not caplog.text

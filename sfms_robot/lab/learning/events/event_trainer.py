@@ -15,7 +15,7 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.whole_recordings import counts_in, done_in, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
 from sfms_robot.lab.learning.events.labels import (
     Lesson,
     Looks,
@@ -27,8 +27,9 @@ from sfms_robot.lab.learning.events.labels import (
     spans_of,
     steps_of,
 )
-from sfms_robot.listeners.events.evidence import AT, NUMBERS, Bools, Scene
+from sfms_robot.listeners.events.evidence import AT, NUMBERS
 from sfms_robot.listeners.events.model import STEP_FRAMES, Hazard
+from sfms_robot.signals.phase import piecewise_linear_basis
 
 Knots = tuple[float, ...]
 Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number
