@@ -122,7 +122,7 @@ class Startup(ABC):
     Attributes:
         table: a protocol whose servos report their firmware replaces it by that of another layout.
         can_reboot: whether the protocol has an instruction for it.
-        unlimited: registers of speed and acceleration, in which 0 is no limit.
+        unlimited: registers of speed and acceleration, in which 0 means unlimited.
     """
 
     can_reboot: ClassVar[bool]
