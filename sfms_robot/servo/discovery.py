@@ -66,10 +66,10 @@ class Holder:
     command: str
 
 
-def _pyserial_ports() -> Iterable[Any]:
+def _pyserial_ports() -> Iterator[Any]:
     from serial.tools.list_ports import comports
 
-    return comports()
+    yield from comports()
 
 
 def list_ports(

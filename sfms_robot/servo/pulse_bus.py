@@ -152,9 +152,11 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _read_pulses(self, wire: RateLimitedPort) -> bool:
         """Read the pulses that the board sends; return whether it reported them."""
         pulses = self._board.read_pulses(wire.exchange, [output.channel for output in self._outputs])
-        for output in self._outputs if pulses is not None else ():
+        if pulses is None:
+            return False
+        for output in self._outputs:
             output.pulse = pulses[output.channel]
-        return pulses is not None
+        return True
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
