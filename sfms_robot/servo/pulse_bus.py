@@ -5,9 +5,8 @@ A hobby servo does not report its position, so this bus reports none, and does n
 1. Torque cannot come on without a jump: a servo moves to the first pulse as fast as it can. So `enable` needs the
    user's confirmation, and switches on one channel at a time, with the pulse that the board sends already, else the
    last goal, else the rest pose. Between channels it waits for as long as the slowest servo may take.
-2. A line may be slower than the loop: 24 channels take a fifth of a second at 9600 baud. Goals that come while the
-   line is busy replace one another, and the newest is sent when it is free. Only what changed is sent, and one other
-   channel in turn, so that a lost command is repeated in the end.
+2. A line may be slower than the loop: 24 channels take 0.2 s at 9600 baud. Of the goals that come while it is busy the
+   newest is sent. Only what changed is sent, and one other channel in turn, so that a lost command is repeated.
 3. Once a second the board is asked for its status; a later poll reads the answer. A silent board gets no goals, and
    channels that it switched off meanwhile come on again one at a time, as at the start.
 4. Torque off is a latch: from `torque_off` or `stop` until the next `enable` or `resume` no pulse is sent, whichever
@@ -152,11 +151,10 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _read_pulses(self, wire: RateLimitedPort) -> bool:
         """Read the pulses that the board sends; return whether it reported them."""
         pulses = self._board.read_pulses(wire.exchange, [output.channel for output in self._outputs])
-        if pulses is None:
-            return False
-        for output in self._outputs:
-            output.pulse = pulses[output.channel]
-        return True
+        if pulses is not None:
+            for output in self._outputs:
+                output.pulse = pulses[output.channel]
+        return pulses is not None
 
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
@@ -324,7 +322,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def end_pulses(self, channels: Sequence[int]) -> bool:
         """Open the port, end the pulses of `channels` and close it; return whether the board confirmed it.
 
-        For a bus that is not connected, whatever the board does. Raises PortError, BusError.
+        For a bus that is not connected. Raises PortError, BusError.
         """
         self._link = wire = self._open()
         try:
