@@ -126,7 +126,7 @@ class Telemetry:
         self.seen_s[at] = now_s
         if where == self.block:
             for key, row, unit in self._columns:
-                self.extra[row, at] = _signed(self._fields[key], rows[key]) * unit[at]
+                self.extra[row][at] = _signed(self._fields[key], rows[key]) * unit[at]
 
     def take_current(self, index: int, field: Field, data: bytes) -> None:
         """Decode an answer to a read of `currents[index]`."""
