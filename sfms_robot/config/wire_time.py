@@ -1,4 +1,4 @@
-"""How many bytes a request and its answers put on the wire, in every family, and how long bytes take.
+"""Bytes of a request and its answers on the wire, in every family, and the time that bytes take.
 
 The highest rate of a bus, the time of a poll and the doctor's budget use these counts. Tests compare them with the
 bytes between the buses and emulated servos. The bytes of a board depend on the goals (channels side by side, digits of

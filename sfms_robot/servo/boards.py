@@ -5,7 +5,7 @@ Pololu Maestro (User's Guide, pololu.com/docs/0J40, sections 4.a, 4.e, 5.d and 5
 1. Get Errors (A1) clears the errors, and shows that the board is there. One in the serial mode "UART, detect baud rate"
    ignores all bytes before the baud indication byte AA, which is sent only if the board does not answer: a board that
    runs may take AA alone for a protocol error.
-2. Any error sends the channels to their home; the factory setting of that is no pulses at all. So all goals are sent
+2. Any error sends the channels to their home; from the factory that means pulses off. So all goals are sent
    again after an error.
 3. A board may have "Enable CRC" on, which nothing on the wire reports, so the head's file says it (`crc`). A board that
    expects a CRC and gets none waits for it and never answers; one that gets a CRC it does not expect has answered
@@ -37,6 +37,8 @@ _CHUNK: Final = 4096
 _CURE: Final = "for this bus in the head's file, or change 'Enable CRC' in Pololu's Maestro Control Center"
 _CRC_TRIES: Final = 2  # the first may be spent on what the board still waits for
 _MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
+_SLOW_RAD_S: Final = 3.5  # a slow hobby servo under load: 0.3 s for 60 degrees
+_LONGEST_TRAVEL_S: Final = 0.7  # no joint delays `enable` for longer
 _PULSE_FRAME_S: Final = 0.02  # an SSC-32 sends a pulse this often: lines within need not be drawn
 _LONGEST_LINE_S: Final = 0.5
 
@@ -117,6 +119,32 @@ class BoardStatus(NamedTuple):
     faults: str = ""
     lasting: bool = False  # the fault is in the board, not only in the bytes it received
     went_home: bool = False  # it has switched its channels off, or to wherever its home is
+
+
+class Output:
+    """The state of one channel of a board.
+
+    Attributes:
+        releases: torque off switches it off; otherwise its joint holds.
+        enabled: it gets goals.
+        waiting: enabled, but off: it comes on when it is its turn.
+        resting: switched off by `release`, or by torque off until it is switched on again.
+        pulse: ticks of the pulse that the board sent when it was last asked, 0 for none.
+        sent: ticks last sent.
+        arrived: its pulse came on again since the last reading.
+    """
+
+    def __init__(self, index: int, servo: BusServo) -> None:
+        self.index = index
+        self.channel = servo.id
+        self.servo = servo
+        self.releases = servo.safety.stop == "release"
+        # A slow servo takes this long through the joint's range.
+        self.travel_s = min((servo.max_rad - servo.min_rad) / _SLOW_RAD_S, _LONGEST_TRAVEL_S)
+        self.enabled = self.waiting = self.resting = self.arrived = False
+        self.pulse = 0
+        self.sent: int | None = None
+        self.fault: str | None = None
 
 
 class Board(ABC):

@@ -1,4 +1,4 @@
-"""What all buses share: checking goals, losing the port and finding it again; and the bus of joints without servos.
+"""Parts that all buses share: checking goals, losing the port and finding it again; and a bus without servos.
 
 A port that fails is closed and opened again a few times a second, by the name of its adapter. Meanwhile nothing is sent
 and nothing is raised. A bus on which no servo has answered for `reconnect_s` has failed.

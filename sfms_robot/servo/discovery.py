@@ -12,7 +12,7 @@ import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from sfms_robot.errors import ConfigError, PortError
@@ -66,28 +66,19 @@ class Holder:
     command: str
 
 
-class ListedPort(Protocol):
-    """The attributes of pyserial's `ListPortInfo` that are read here."""
-
-    device: str
-    vid: int | None
-    pid: int | None
-    serial_number: str | None
-    description: str | None
-
-
-def pyserial_ports() -> Iterable[ListedPort]:
-    """Return pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows."""
+def _pyserial_ports() -> Iterator[Any]:
     from serial.tools.list_ports import comports
 
-    ports: Iterable[ListedPort] = comports()
-    return ports
+    yield from comports()
 
 
 def list_ports(
-    dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[ListedPort]] = pyserial_ports
+    dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[Any]] = _pyserial_ports
 ) -> list[SerialDevice]:
-    """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware."""
+    """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware.
+
+    `listed`: returns pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows.
+    """
     paths = {os.path.realpath(path) for pattern in _PATTERNS for path in dev.glob(pattern)}
     found = {path: describe(path, dev, sys) for path in paths}
     for port in listed():
@@ -159,8 +150,8 @@ def _has_double(port: SerialDevice, sys: Path) -> bool:
     return (port.vendor, port.product, port.serial) in (_usb_facts(usb)[:3] for usb in others)
 
 
-def _completed(device: SerialDevice, port: ListedPort) -> SerialDevice:
-    """Add what pyserial knows if /sys has nothing: macOS and Windows have no /sys."""
+def _completed(device: SerialDevice, port: Any) -> SerialDevice:
+    """Add what pyserial knows (its `ListPortInfo`) if /sys has nothing: macOS and Windows have no /sys."""
     said = None if port.description == "n/a" else port.description or None
     return replace(
         device,

@@ -1,7 +1,7 @@
-"""What a joint's servo may do, and which of its faults and loads are acted upon. No wire is needed to decide that.
+"""Limits of a joint's servo, and the faults and loads that are acted upon. Decided without a wire.
 
 A servo reports faults as bits. Not all of them matter: a head that runs at 7.2 V has the voltage fault set all the
-time. So the head's file may mask a fault, or let it count only outside a threshold of its own.
+time. So the head's file may mask a fault, or set a threshold outside which it counts.
 """
 
 from __future__ import annotations

@@ -2,16 +2,13 @@
 
 A hobby servo does not report its position, so this bus reports none, and does not invent any. What follows:
 
-1. Torque cannot come on without a jump: a servo moves to the first pulse as fast as it can. So `enable` is refused
-   until the user has confirmed that, logs it, and switches on one channel at a time: with the pulse that the board
-   sends already, else with the last goal, else with the rest pose. Between channels it waits for as long as the slowest
-   servo may take.
-2. A line may be slower than the loop: 24 channels take a fifth of a second at 9600 baud. Goals that come while the
-   line is busy replace one another, and the newest is sent when it is free. Only what changed is sent, and one other
-   channel in turn, so that a lost command is repeated in the end.
-3. Once a second the board is asked for its status, without waiting for the answer, which a later poll reads. A problem
-   that it reports becomes a fault. A board that is silent gets no goals, and channels that it switched off meanwhile
-   come on again one at a time, as at the start.
+1. Torque cannot come on without a jump: a servo moves to the first pulse as fast as it can. So `enable` needs the
+   user's confirmation, and switches on one channel at a time, with the pulse that the board sends already, else the
+   last goal, else the rest pose. Between channels it waits for as long as the slowest servo may take.
+2. A line may be slower than the loop: 24 channels take 0.2 s at 9600 baud. Of the goals that come while it is busy the
+   newest is sent. Only what changed is sent, and one other channel in turn, so that a lost command is repeated.
+3. Once a second the board is asked for its status; a later poll reads the answer. A silent board gets no goals, and
+   channels that it switched off meanwhile come on again one at a time, as at the start.
 4. Torque off is a latch: from `torque_off` or `stop` until the next `enable` or `resume` no pulse is sent, whichever
    thread was about to, and a board that was away is switched off as soon as it is back.
 """
@@ -20,17 +17,18 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import BusConfig
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import BusError, ConfigError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.servo.boards import Board, Maestro, RateLimitedPort, Ssc32, board_of, pulses_beyond
+from sfms_robot.ports import Bus as BusConfig
+from sfms_robot.servo.boards import Board, Maestro, Output, RateLimitedPort, Ssc32, board_of, pulses_beyond
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -38,8 +36,6 @@ from sfms_robot.servo.port import Port
 log = logging.getLogger(__name__)
 
 _CAPABILITIES: Final = frozenset({"torque"})  # pulses can be switched off, nothing more
-_SLOW_RAD_S: Final = 3.5  # a slow hobby servo under load: 0.3 s for 60 degrees
-_LONGEST_TRAVEL_S: Final = 0.7  # no joint delays `enable` for longer
 _TRAVEL_PARTS: Final = 14  # of that wait; after each, the latch is checked
 _STATUS_EVERY_S: Final = 1.0
 _SILENT_AFTER: Final = 3  # requests without an answer
@@ -84,8 +80,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         reconnect_s = config.reconnect_s if config is not None else RECONNECT_S
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
-        self._channels = [servo.id for servo in servos]
-        self._released = frozenset(servo.id for servo in servos if servo.safety.stop == "release")  # by `torque_off`
         self._confirmed = confirmed
         self._lowest = np.array([servo.min_rad for servo in servos])
         self._highest = np.array([servo.max_rad for servo in servos])
@@ -101,31 +95,23 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._warned = False  # that servos jump
         self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
-        self._latched = False  # by `torque_off`: nothing is sent until `enable` or `resume`
         self._forget()
 
     def _forget(self) -> None:
         """Reset what holds for one connection only."""
-        self._enabled: list[int] = []
-        self._pulses: dict[int, int] = {}  # channel -> ticks of pulses that the board sent when last asked
-        self._sent: dict[int, int] = {}  # channel -> ticks last sent
+        self._outputs = [Output(index, servo) for index, servo in enumerate(self._servos)]
+        self._latched = False  # by `torque_off`: nothing is sent until `enable` or `resume`
+        self._off_due = False  # torque off is to be sent again by the next poll
         self._pending = False  # goals that have not been sent yet
-        self._refresh_index = 0  # of the enabled, the one that is sent though unchanged
+        self._refresh_index = 0  # of the outputs that are on, the one that is sent though unchanged
         self._sent_at_s = -math.inf
         self._status_due_s: float | None = None  # when to ask the board next
         self._unanswered = 0
-        self._switched_off: list[int] = []  # enabled, but the board has switched them off
-        self._next_on_s = -math.inf  # when the next of them may come on
-        self._faults: dict[int, str] = {}
-        self._resting: frozenset[int] = frozenset()  # channels that `release` has switched off
-        self._off_due = False  # torque off is to be sent again by the next poll
-        self._arrived: list[int] = []  # whose pulses came on again since the last reading
+        self._next_on_s = -math.inf  # when the next waiting output may come on
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
         return dict.fromkeys(self.joints, _CAPABILITIES)
-
-    # --- start --------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
         """Open the port and find the board, pulses left unchanged.
@@ -134,14 +120,14 @@ class PulseBus(WireBus[RateLimitedPort]):
         """
         wire = self._open()
         self._forget()
-        self._latched, self._powered = False, frozenset()
+        self._powered = frozenset()
         try:
             present = self._present(wire)
             if misfit := self._board.misfit(wire.exchange, present):
                 raise self._absent(wire, f"the {self.model} {misfit}")
             if not present:
                 raise self._absent(wire)
-            self._pulses = self._board.read_pulses(wire.exchange, self._channels) or {}
+            self._read_pulses(wire)
         except BaseException:
             wire.port.close()
             raise
@@ -162,71 +148,74 @@ class PulseBus(WireBus[RateLimitedPort]):
         answer = wire.exchange(self._board.status_request(restarted), self._board.status_length)
         return answer is not None and self._board.decode_status(answer) is not None
 
+    def _read_pulses(self, wire: RateLimitedPort) -> bool:
+        """Read the pulses that the board sends; return whether it reported them."""
+        pulses = self._board.read_pulses(wire.exchange, [output.channel for output in self._outputs])
+        if pulses is not None:
+            for output in self._outputs:
+                output.pulse = pulses[output.channel]
+        return pulses is not None
+
     def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
 
-        Blocks for 0.7 s a joint, and a few answers of the board. Raises ConfigError unless the user has confirmed that
-        joints may jump; BusError if the board does not answer before or after, or if `torque_off` came meanwhile: then
-        no pulse is on.
+        Blocks for 0.7 s a joint, and a few answers. Raises ConfigError unless the user has confirmed that joints may
+        jump; BusError if the board does not answer, or if `torque_off` came meanwhile: then no pulse is on.
         """
         wire = self._connected()
         self._unlatch()
-        self._warn_of_jumps(joints)
-        if not self._present(wire):
-            raise self._absent(wire)
-        held = [self._switch_on(wire, self.joints.index(joint)) for joint in joints]
-        if not self._present(wire):
-            raise self._absent(wire)
-        self._check_latch()
-        return np.array(held)
-
-    def _unlatch(self) -> None:
-        """Allow goals again; channels stay off until each is switched on."""
-        if self._latched:
-            self._resting |= self._released
-        self._latched = self._off_due = False
-
-    def _check_latch(self) -> None:
-        if self._latched:
-            self._enabled = []
-            raise BusError(f"bus {self.name!r}: torque was switched off while joints came on")
-
-    def _warn_of_jumps(self, joints: Sequence[str]) -> None:
         if not self._confirmed:
             raise ConfigError(
                 f"bus {self.name!r}: servos on a {self.model} report no position and jump to {', '.join(joints)} "
                 "at rest when they come on; confirm it with --yes"
             )
         if not self._warned:
-            log.warning(
-                "bus %r: servos on a %s report no position; each jumps to its first pose: keep clear",
-                self.name, self.model,
-            )  # fmt: skip
+            warning = "bus %r: servos on a %s report no position; each jumps to its first pose: keep clear"
+            log.warning(warning, self.name, self.model)
             self._warned = True
+        if not self._present(wire):
+            raise self._absent(wire)
+        held = [self._switch_on(wire, output) for output in map(self._output, joints)]
+        if not self._present(wire):
+            raise self._absent(wire)
+        self._check_latch()
+        return np.array(held)
 
-    def _switch_on(self, wire: RateLimitedPort, index: int) -> float:
+    def _output(self, joint: str) -> Output:
+        return self._outputs[self.joints.index(joint)]
+
+    def _unlatch(self) -> None:
+        """Allow goals again; outputs stay off until each is switched on."""
+        if self._latched:
+            for output in self._outputs:
+                output.resting |= output.releases
+        self._latched = self._off_due = False
+
+    def _check_latch(self) -> None:
+        if self._latched:
+            for output in self._outputs:
+                output.enabled = False
+            raise BusError(f"bus {self.name!r}: torque was switched off while joints came on")
+
+    def _switch_on(self, wire: RateLimitedPort, output: Output) -> float:
         """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` comes."""
-        servo, new = self._servos[index], index not in self._enabled
-        self._powered |= {servo.id}
-        self._resting -= {servo.id}
-        pulse = self._pulses.get(servo.id, 0)
-        if pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
+        new, index = not output.enabled, output.index
+        self._powered |= {output.channel}
+        output.resting = False
+        if output.pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
             ticks = self._ticks.copy()
-            ticks[index] = pulse
+            ticks[index] = output.pulse
             angles = np.clip(self._conversion.to_rad(ticks), self._lowest, self._highest)
             self._ticks = self._conversion.to_ticks(angles)
-        self._send(wire, {servo.id: int(self._ticks[index])})
-        if new and pulse != self._ticks[index]:
-            start_s, travel_s = wire.port.now_s(), _travel_s(servo)
+        self._send(wire, [output])
+        if new and output.pulse != self._ticks[index]:
+            start_s = wire.port.now_s()
             for part in range(_TRAVEL_PARTS):
                 if not self._latched:
-                    wire.wait(start_s + travel_s * (part + 1) / _TRAVEL_PARTS)
-        if index not in self._enabled:
-            self._enabled.append(index)
+                    wire.wait(start_s + output.travel_s * (part + 1) / _TRAVEL_PARTS)
+        output.enabled = True
         self._check_latch()
-        if index in self._switched_off:
-            self._switched_off.remove(index)
-        self._faults.pop(index, None)
+        output.waiting, output.fault = False, None
         return float(self._conversion.to_rad(self._ticks)[index])
 
     # --- torque off ---------------------------------------------------------------------------------------------
@@ -234,68 +223,57 @@ class PulseBus(WireBus[RateLimitedPort]):
     @property
     def _off(self) -> list[int]:
         """Return the channels that have to be off now."""
-        return sorted(self._resting | self._released if self._latched else self._resting)
+        off = [each.channel for each in self._outputs if each.resting or (self._latched and each.releases)]
+        return sorted(off)
 
     def release(self, joints: Sequence[str]) -> None:
         """End the pulses of `joints` now; the others continue. The next `poll` repeats it. From any thread."""
-        indices = {self.joints.index(joint) for joint in joints}
-        if not indices:
-            return
-        channels = {self._channels[index] for index in indices}
-        self._resting, self._off_due = self._resting | channels, True
-        self._enabled = [index for index in self._enabled if index not in indices]
-        self._switched_off = [index for index in self._switched_off if index not in indices]
-        self._forget_pulses(channels)
-        self._send_off()
+        for output in map(self._output, joints):
+            output.resting, output.enabled, output.waiting, output.pulse, output.sent = True, False, False, 0, None
+            self._off_due = True
+        if self._off_due:
+            self._send_off(self._off)
 
     def torque_off(self, policy: StopPolicy) -> None:
         """End the pulses now, except of joints whose safety says hold; send no goal until `enable` or `resume`.
 
-        From any thread or signal handler, any time. Never raises, waits for no answer; blocks while bytes are handed
-        to the port and, if that was lost, while it is opened. A board that is away is switched off by `poll` when it
-        is back. With the policy "hold" nothing happens.
+        From any thread or signal handler. Never raises, waits for no answer; blocks while bytes are handed to the port
+        and, if that was lost, while it is opened. A board that is away is switched off by `poll` when it is back.
         """
         if policy == "hold":
             return
         self._latched = True  # first of all
-        self._switched_off = []
-        self._forget_pulses(self._released)
-        self._sent = {}
-        self._send_off()
+        for output in self._outputs:
+            output.waiting, output.sent = False, None
+            if output.releases:
+                output.pulse = 0
+        self._send_off(self._off)
 
     def resume(self, joints: Sequence[str]) -> None:
         """Switch pulses on again, one channel at a time, at the last goal, to which the servo jumps."""
         off = self._off
-        back = [i for i in map(self.joints.index, joints) if self._channels[i] in off and i not in self._switched_off]
-        self._switched_off = [*self._switched_off, *back]  # first: no goal is sent to them yet
-        self._enabled = [*self._enabled, *(i for i in back if i not in self._enabled)]
+        back = [output for output in map(self._output, joints) if output.channel in off and not output.waiting]
+        for output in back:
+            output.waiting = output.enabled = True  # first: no goal is sent to them yet
         self._unlatch()
-        self._resting -= {self._channels[i] for i in back}
+        for output in back:
+            output.resting = False
 
-    def _forget_pulses(self, channels: Collection[int]) -> None:
-        self._pulses, self._sent = (
-            {channel: ticks for channel, ticks in sent.items() if channel not in channels}
-            for sent in (self._pulses, self._sent)
-        )
-
-    def _send_off(self, restarted: bool = False) -> None:
+    def _send_off(self, channels: Sequence[int], restarted: bool = False) -> None:
         """Send torque off over the open port, else over one opened for this: the bus's own may be in use."""
-        channels, wire = self._off, self._link
+        wire = self._link
         if not channels or (wire is None and self._lost_s is None):
             return
         if wire is not None:
             data = self._board.encode_off(channels, restarted or self._silent)
             if self._attempt(lambda: wire.send(data)) is not None:
                 return
-        self._off_due |= self._attempt(lambda: self._send_off_anew(channels)) is None
-
-    def _send_off_anew(self, channels: Sequence[int]) -> bool:
-        wire = self._open()
         try:
-            wire.send(self._board.encode_off(channels, restarted=True))
-            return True
-        finally:
-            wire.port.close()
+            with closing(self._open_port()) as port:
+                port.write(self._board.encode_off(channels, restarted=True))
+        except RobotError as error:
+            self._count_error(error)
+            self._off_due = True
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """Send torque off, ask the board whether its pulses are off, and repeat it; refuse goals. Never raises.
@@ -303,7 +281,9 @@ class PulseBus(WireBus[RateLimitedPort]):
         Blocks for `within_s` at most; bytes sent before may take part of that to leave. From one thread at a time.
         """
         self.torque_off(policy)
-        self._enabled, self._switched_off, self._pending = [], [], False
+        for output in self._outputs:
+            output.enabled = output.waiting = False
+        self._pending = False
         if policy == "hold" or not self._off or (self._link is None and self._lost_s is None):
             return
         wire = self._link or self._open_again()
@@ -312,7 +292,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             if wire is None:
                 break
             try:
-                if self._confirm_off(wire, until_s):
+                if self._confirm_off(wire, self._off, until_s):
                     return
                 break
             except BusError as error:
@@ -320,45 +300,36 @@ class PulseBus(WireBus[RateLimitedPort]):
                 wire = self._open_again()
         log.warning("bus %r: the %s does not confirm that its pulses are off", self.name, self.model)
 
-    def _confirm_off(self, wire: RateLimitedPort, until_s: float, restarted: bool = False) -> bool:
+    def _confirm_off(
+        self, wire: RateLimitedPort, channels: Sequence[int], until_s: float, restarted: bool = False
+    ) -> bool:
         """Ask the board whether its pulses are off, and send torque off again; return whether it confirms it."""
         for _ in range(4 * _TRIES):  # each costs a mute board's patience
             wire.wait(min(wire.busy_until_s, until_s))
             if wire.port.now_s() >= until_s:
                 break
-            on = self._still_on(wire)
+            pulses = self._board.read_pulses(wire.exchange, channels)
+            on = {channel for channel, ticks in (pulses or {}).items() if ticks}
+            # A board that cannot report its pulses confirms by any answer; a lost answer of another one does not.
+            if pulses is None and (self._board.reports_pulses or not self._answers(wire, restarted=True)):
+                on = set(channels)
             self._powered &= on
             if not on:
                 return True
-            self._send_off(restarted)
+            self._send_off(channels, restarted)
         return False
-
-    def _still_on(self, wire: RateLimitedPort) -> set[int]:
-        """Return the channels whose pulses are not confirmed off: none if a board that cannot report them answers."""
-        channels = self._off
-        pulses = self._board.read_pulses(wire.exchange, channels)
-        if pulses is None:
-            off = not self._board.reports_pulses and self._answers(wire, restarted=True)
-            return set() if off else set(channels)
-        return {channel for channel, ticks in pulses.items() if ticks}
 
     def end_pulses(self, channels: Sequence[int]) -> bool:
         """Open the port, end the pulses of `channels` and close it; return whether the board confirmed it.
 
-        For a bus that is not connected, whatever the board does. Raises PortError, BusError.
+        For a bus that is not connected. Raises PortError, BusError.
         """
-        self._resting = frozenset(channels)
         self._link = wire = self._open()
         try:
-            wire.send(self._board.encode_off(self._off, restarted=False))
-            return self._confirm_off(wire, wire.busy_until_s + _STOP_S, restarted=True)
+            wire.send(self._board.encode_off(channels, restarted=False))
+            return self._confirm_off(wire, channels, wire.busy_until_s + _STOP_S, restarted=True)
         finally:
             self.close()
-
-    def close(self) -> None:
-        """Close the port. Idempotent."""
-        self._enabled = []
-        super().close()
 
     # --- every tick ---------------------------------------------------------------------------------------------
 
@@ -368,10 +339,11 @@ class PulseBus(WireBus[RateLimitedPort]):
         Raises ValueError, with nothing sent, before `enable` and after `stop`, for a goal that is not finite, or one
         out of range. While the port is gone, and after `torque_off`, nothing is sent and nothing is raised.
         """
-        self._check(bool(self._enabled or self._resting))
+        self._check(any(output.enabled or output.resting for output in self._outputs))
         if self._latched:
             return
-        self._ticks = self._goals.ticks(goals_rad, np.array(self._enabled, np.intp))
+        enabled = [output.index for output in self._outputs if output.enabled]
+        self._ticks = self._goals.ticks(goals_rad, np.array(enabled, np.intp))
         self._pending = True
         try:
             self._counts["deferred"] += not self._flush()
@@ -380,11 +352,11 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _readings(self, now_s: float) -> Mapping[str, Reading]:
         """Return faults of the board, and which pulses have come on again; no positions."""
-        arrived, self._arrived = self._arrived, []
-        return {
-            joint: Reading(None, float("inf"), self._faults.get(index), rejoined=index in arrived)
-            for index, joint in enumerate(self.joints)
-        }
+        readings = {}
+        for output in self._outputs:
+            readings[output.servo.joint] = Reading(None, math.inf, output.fault, rejoined=output.arrived)
+            output.arrived = False
+        return readings
 
     def _ask(self, wire: RateLimitedPort, now_s: float) -> bool:
         """Ask for the status once a second if the line is free; return whether there was an answer to that."""
@@ -403,8 +375,13 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._counts["retries"] += self._unanswered > 0
             self._counts["reads"] += 1
             wire.request(self._board.status_request(self._silent), self._board.status_length)
-        if self._switched_off and now_s >= self._next_on_s and not self._silent:
-            self._switch_on_again(self._switched_off.pop(0), now_s)
+        waiting = next((output for output in self._outputs if output.waiting), None)
+        if waiting is not None and now_s >= self._next_on_s and not self._silent:
+            if waiting.fault == _TORQUE_LOST:
+                log.warning("%s (channel %d) has lost its pulses", waiting.servo.joint, waiting.channel)
+            waiting.waiting, waiting.arrived, waiting.fault = False, True, None
+            self._next_on_s = now_s + waiting.travel_s
+            self._pending = True
         if self._pending:
             self._flush()
         return answered
@@ -413,7 +390,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         """Return the counters of the report."""
         return {
             **self._counts,
-            "silent": sorted(self._channels) if self._silent else [],
+            "silent": sorted(output.channel for output in self._outputs if self._silent),
             "faults": list(self._fault_log),
             "stored_warnings": [],
             **self._unconfirmed(self._latched),
@@ -425,39 +402,45 @@ class PulseBus(WireBus[RateLimitedPort]):
         if wire is None or self._silent or not wire.free:
             return False
         self._pending = False
-        on = [index for index in self._enabled if index not in self._switched_off]
+        on = [output for output in self._outputs if output.enabled and not output.waiting]
         if not on:
             return True
         self._refresh_index = (self._refresh_index + 1) % len(on)
-        again = self._channels[on[self._refresh_index]]
-        wanted = {self._channels[i]: int(self._ticks[i]) for i in on}
-        self._send(wire, {c: ticks for c, ticks in wanted.items() if self._sent.get(c) != ticks or c == again})
+        again = on[self._refresh_index]
+        self._send(wire, [each for each in on if each is again or each.sent != self._ticks[each.index]])
         self._counts["writes"] += 1
         return True
 
-    def _send(self, wire: RateLimitedPort, ticks: Mapping[int, int]) -> None:
+    def _send(self, wire: RateLimitedPort, outputs: Sequence[Output]) -> None:
         """Send goals, unless torque is off; if it was switched off while these bytes left, send torque off again."""
-        ticks = {channel: each for channel, each in ticks.items() if channel not in self._resting}
-        if self._latched or not ticks:
+        outputs = [output for output in outputs if not output.resting]
+        if self._latched or not outputs:
             return
-        interval_s = max(wire.port.now_s(), wire.busy_until_s) - self._sent_at_s if self._sent else 0.0
+        ticks = {output.channel: int(self._ticks[output.index]) for output in outputs}
+        first = all(output.sent is None for output in self._outputs)
+        interval_s = 0.0 if first else max(wire.port.now_s(), wire.busy_until_s) - self._sent_at_s
         self._sent_at_s = wire.send(self._board.encode_goals(ticks, interval_s))
-        self._sent.update(ticks)
-        if self._latched or self._resting & ticks.keys():
-            self._forget_pulses(ticks.keys() & set(self._off))
-            self._send_off()
-
-    # --- the port and the board ---------------------------------------------------------------------------------
+        for output in outputs:
+            output.sent = ticks[output.channel]
+        off = self._off
+        if not ticks.keys().isdisjoint(off):
+            for output in outputs:
+                output.sent = None
+            self._send_off(off)
 
     def _left(self) -> None:
         self._unanswered = _SILENT_AFTER
-        self._report_fault(range(len(self.joints)), _NO_ANSWER)
+        self._report_fault(self._outputs, _NO_ANSWER)
 
     def _returned(self, wire: RateLimitedPort, now_s: float) -> None:
         self._status_due_s = now_s  # the board is asked before it gets any goal
-        self._off_due = bool(self._resting)
+        self._send_off_again()
+
+    def _send_off_again(self) -> None:
+        """Send torque off again after the board, or the port, was away: now if it is latched, else by a poll."""
+        self._off_due |= any(output.resting for output in self._outputs)
         if self._latched:
-            self._send_off()
+            self._send_off(self._off)
 
     @property
     def _silent(self) -> bool:
@@ -470,56 +453,39 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._counts["errors"] += 1
             self._unanswered += 1
             if self._unanswered == _SILENT_AFTER:
+                self._report_fault(self._outputs, _NO_ANSWER)
                 log.warning("bus %r: the %s is silent", self.name, self.model)
-                self._report_fault(range(len(self.joints)), _NO_ANSWER)
             return False
         was_silent, self._unanswered = self._silent, 0
-        self._faults = {index: text for index, text in self._faults.items() if text == _TORQUE_LOST}
+        for output in self._outputs:
+            if output.fault != _TORQUE_LOST:
+                output.fault = None
+            if was_silent or status.went_home:
+                output.sent = None  # what the board does now is not what was sent
         if was_silent:
             self._counts["reconnects"] += 1
             log.warning("bus %r: the %s answers again", self.name, self.model)
-            self._find_switched_off(wire, now_s)
+            # Channels that the board switched off during the silence, if it reports them, come on again in turn.
+            if self._read_pulses(wire) and not self._latched:
+                for output in self._outputs:
+                    output.waiting = output.enabled and not output.pulse
+                self._next_on_s = now_s
+                self._report_fault([output for output in self._outputs if output.waiting], _TORQUE_LOST)
         if was_silent or status.went_home:
-            self._sent = {}  # what the board does now is not what was sent
-            self._off_due |= bool(self._resting)
-            if self._latched:
-                self._send_off()
+            self._send_off_again()
         if status.faults:
             self._counts["errors"] += not status.lasting
-            self._report_fault(range(len(self.joints)), status.faults, shown=status.lasting)
+            self._report_fault(self._outputs, status.faults, shown=status.lasting)
         return True
 
-    def _find_switched_off(self, wire: RateLimitedPort, now_s: float) -> None:
-        """Find the channels that the board switched off during a silence, if it reports them: each comes on again."""
-        pulses = self._board.read_pulses(wire.exchange, self._channels)
-        if pulses is None or self._latched:
-            return
-        self._pulses = pulses
-        self._switched_off = [index for index in self._enabled if not pulses.get(self._channels[index])]
-        self._next_on_s = now_s
-        self._report_fault(self._switched_off, _TORQUE_LOST)
-
-    def _switch_on_again(self, index: int, now_s: float) -> None:
-        servo = self._servos[index]
-        if self._faults.pop(index, None) == _TORQUE_LOST:
-            log.warning("%s (channel %d) has lost its pulses and comes on again", servo.joint, servo.id)
-        self._arrived.append(index)
-        self._next_on_s = now_s + _travel_s(servo)
-        self._pending = True
-
-    def _report_fault(self, indices: Sequence[int], fault: str, shown: bool = True) -> None:
-        """Record a fault of some joints; `shown` puts it into their readings, too."""
-        if shown:
-            self._faults |= dict.fromkeys(indices, fault)
+    def _report_fault(self, outputs: Sequence[Output], fault: str, shown: bool = True) -> None:
+        """Record a fault of some outputs; `shown` puts it into their readings, too."""
+        for output in outputs if shown else ():
+            output.fault = fault
         named = f"{self.name}: {fault}"
-        if indices and named not in self._fault_log:
+        if outputs and named not in self._fault_log:
             log.warning("bus %r: the %s reports: %s", self.name, self.model, fault)
             self._fault_log[named] = None
-
-
-def _travel_s(servo: BusServo) -> float:
-    """Return how long a slow servo takes through the joint's range, `_LONGEST_TRAVEL_S` at most."""
-    return min((servo.max_rad - servo.min_rad) / _SLOW_RAD_S, _LONGEST_TRAVEL_S)
 
 
 class MaestroBus(PulseBus):

@@ -33,7 +33,7 @@ _SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: o
 
 @dataclass(frozen=True)
 class JointNeeds:
-    """What a joint requires of the servo that moves it.
+    """The requirements of a joint on the servo that moves it.
 
     Attributes:
         low_ticks, high_ticks: first and last goal of the joint.

@@ -103,8 +103,8 @@ FAULTS = (
     # startup
     Fault(
         "servo/chain/startup.py",
-        'self._write(index, self._field(index, "goal_position"), goal)',
-        'self._write(index, self._field(index, "goal_position"), 0)',
+        'self._write(self._field("goal_position"), goal)',
+        'self._write(self._field("goal_position"), 0)',
         WIRE,
     ),
     Fault(

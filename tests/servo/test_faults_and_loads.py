@@ -31,66 +31,67 @@ def register(rig, servo, name):
 
 @pytest.mark.parametrize("policy", ["limp", "hold", "reduce", "reboot_and_ease_in"])
 def test_fault_stops_one_joint_and_no_other(make_rig, policy):
-    with three(make_rig, safety=Safety(on_fault=policy)) as rig:
-        held = rig.hold()
-        rig.ticks(held, 10)
-        rig.chain.fault(2, OVERLOAD)
-        readings = rig.ticks(held + 0.3, 30)
-        assert readings["joint2"].fault == "overload" or policy == "reboot_and_ease_in"
-        assert readings["joint1"].fault is None and readings["joint3"].fault is None
-        assert rig.bus.statistics()["faults"] == ["joint2: overload"]
-        rig.ticks(held + 0.3, 30)
-        assert rig.chain.state(1)["position"] == pytest.approx(2048 + 0.3 / RAD_PER_TICK, abs=3)
+    rig = three(make_rig, safety=Safety(on_fault=policy))
+    held = rig.hold()
+    rig.ticks(held, 10)
+    rig.fault(2, OVERLOAD)
+    readings = rig.ticks(held + 0.3, 30)
+    assert readings["joint2"].fault == "overload" or policy == "reboot_and_ease_in"
+    assert readings["joint1"].fault is None and readings["joint3"].fault is None
+    assert rig.bus.statistics()["faults"] == ["joint2: overload"]
+    rig.ticks(held + 0.3, 30)
+    assert rig.state(1)["position"] == pytest.approx(2048 + 0.3 / RAD_PER_TICK, abs=3)
 
 
 def test_servo_that_is_rebooted_waits_where_it_stands(make_rig):
-    with three(make_rig, safety=Safety(on_fault="reboot_and_ease_in")) as rig:
-        held = rig.hold()
-        rig.ticks(held, 10)
-        rig.chain.fault(2, OVERLOAD)
-        seconds, readings = rig.until(held + 0.4, lambda r: r["joint2"].rejoined, 2.0)
-        assert 0.3 < seconds < 1.5 and readings["joint2"].fault is None
-        assert register(rig, 2, "hardware_error_status") == 0 and register(rig, 2, "torque_enable") == 1
-        readings = rig.ticks(held + 0.4, 30)
-        assert readings["joint2"].position_rad == pytest.approx(held[1], abs=2 * RAD_PER_TICK)
+    rig = three(make_rig, safety=Safety(on_fault="reboot_and_ease_in"))
+    held = rig.hold()
+    rig.ticks(held, 10)
+    rig.fault(2, OVERLOAD)
+    seconds, readings = rig.until(held + 0.4, lambda r: r["joint2"].rejoined, 2.0)
+    assert 0.3 < seconds < 1.5 and readings["joint2"].fault is None
+    assert register(rig, 2, "hardware_error_status") == 0 and register(rig, 2, "torque_enable") == 1
+    readings = rig.ticks(held + 0.4, 30)
+    assert readings["joint2"].position_rad == pytest.approx(held[1], abs=2 * RAD_PER_TICK)
 
 
 def test_servo_that_fails_again_and_again_is_left_alone(make_rig):
-    with three(make_rig, safety=Safety(on_fault="reboot_and_ease_in")) as rig:
-        held = rig.hold()
-        rig.ticks(held, 10)
-        back = 0
-        for _ in range(6):
-            rig.chain.fault(2, OVERLOAD)
-            for _ in range(200):
-                back += rig.ticks(held, 1)["joint2"].rejoined
-        assert 1 <= back <= 3
-        assert rig.ticks(held, 1)["joint1"].age_s == 0.0
+    rig = three(make_rig, safety=Safety(on_fault="reboot_and_ease_in"))
+    held = rig.hold()
+    rig.ticks(held, 10)
+    back = 0
+    for _ in range(6):
+        rig.fault(2, OVERLOAD)
+        for _ in range(200):
+            back += rig.ticks(held, 1)["joint2"].rejoined
+    assert 1 <= back <= 3
+    assert rig.ticks(held, 1)["joint1"].age_s == 0.0
 
 
 def test_masked_fault_is_reported_by_nobody_and_acted_upon_by_nobody(make_rig, caplog):
-    with caplog.at_level(logging.INFO), three(make_rig, faults=Faults(mask=("input voltage",))) as rig:
-        for servo in (1, 2, 3):
-            rig.chain.fault(servo, VOLTAGE)
-        rig.bus.connect()
-        rig.bus.close()
+    caplog.set_level(logging.INFO)
+    rig = three(make_rig, faults=Faults(mask=("input voltage",)))
+    for servo in (1, 2, 3):
+        rig.fault(servo, VOLTAGE)
+    rig.bus.connect()
+    rig.bus.close()
     allowed = [r for r in caplog.records if "which this head's configuration allows" in r.message]
     assert len(allowed) == 3
     assert rig.bus.statistics()["faults"] == []
 
 
 def test_masked_fault_does_not_hide_another(make_rig):
-    with three(make_rig, faults=Faults(mask=("input voltage",))) as rig:
-        held = rig.hold()
-        rig.ticks(held, 5)
-        rig.chain.fault(2, VOLTAGE & 0)  # nothing yet
-        rig.chain.fault(2, 1 << 4)
-        readings = rig.ticks(held, 10)
-        assert readings["joint2"].fault == "electrical shock"
-        rig.chain.fault(2, OVERLOAD)
-        readings = rig.ticks(held, 30)
-        assert readings["joint2"].fault == "electrical shock, overload"
-        assert rig.bus.statistics()["faults"] == ["joint2: electrical shock", "joint2: electrical shock, overload"]
+    rig = three(make_rig, faults=Faults(mask=("input voltage",)))
+    held = rig.hold()
+    rig.ticks(held, 5)
+    rig.fault(2, VOLTAGE & 0)  # nothing yet
+    rig.fault(2, 1 << 4)
+    readings = rig.ticks(held, 10)
+    assert readings["joint2"].fault == "electrical shock"
+    rig.fault(2, OVERLOAD)
+    readings = rig.ticks(held, 30)
+    assert readings["joint2"].fault == "electrical shock, overload"
+    assert rig.bus.statistics()["faults"] == ["joint2: electrical shock", "joint2: electrical shock, overload"]
 
 
 @given(st.floats(0.0, 30.0))
@@ -103,12 +104,12 @@ def test_threshold_decides_by_what_is_measured(voltage_V):
 def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_rig):
     faults = Faults(thresholds={"input voltage": Threshold(min=4.5, max=7.8)})
     at_7V2 = [EmulatedServo(i, supply_v=7.2, registers={"shutdown": 52}) for i in (1, 2)]
-    with make_rig(at_7V2, faults=faults) as rig:
-        held = rig.hold()
-        readings = rig.ticks(held, 60)
-        assert readings["joint1"].extra["voltage_V"] == pytest.approx(7.2)
-        assert [r.fault for r in readings.values()] == [None, None]
-        assert rig.bus.statistics()["faults"] == []
+    rig = make_rig(at_7V2, faults=faults)
+    held = rig.hold()
+    readings = rig.ticks(held, 60)
+    assert readings["joint1"].extra["voltage_V"] == pytest.approx(7.2)
+    assert [r.fault for r in readings.values()] == [None, None]
+    assert rig.bus.statistics()["faults"] == []
 
 
 def jaw(**safety):
@@ -144,43 +145,43 @@ def test_every_servo_with_a_current_sensor_has_a_pinch_rule():
 
 def test_pinched_joint_goes_limp_and_comes_back_later(make_rig):
     gentle = Safety(pinch=LoadRule(current_mA=200, for_s=0.2))
-    with three(make_rig, safety=gentle) as rig:
-        held = rig.hold()
-        rig.ticks(held, 10)
-        rig.chain.inject("load:2=0.5")
-        seconds, _ = rig.until(held, lambda r: rig.chain.state(2)["torque"] == 0, 2.0)
-        assert seconds < 1.0
-        assert any(fault.startswith("joint2: pinched") for fault in rig.bus.statistics()["faults"])
-        rig.chain.clear_faults()
-        seconds, readings = rig.until(held, lambda r: r["joint2"].rejoined, 5.0)
-        assert seconds > 2.0
-        assert rig.bus.statistics()["supply_peak_mA"] > 200
+    rig = three(make_rig, safety=gentle)
+    held = rig.hold()
+    rig.ticks(held, 10)
+    rig.servo(2).plant.stuck = True
+    seconds, _ = rig.until(held + 0.3, lambda r: rig.state(2)["torque"] == 0, 2.0)
+    assert seconds < 1.0
+    assert any(fault.startswith("joint2: pinched") for fault in rig.bus.statistics()["faults"])
+    rig.servo(2).plant.stuck = False
+    seconds, readings = rig.until(held, lambda r: r["joint2"].rejoined, 5.0)
+    assert seconds > 2.0
+    assert rig.bus.statistics()["supply_peak_mA"] > 200
 
 
 def test_current_limit_is_the_servos_own_job(make_rig):
-    with three(make_rig, safety=Safety(current_limit_mA=300)) as rig:
-        held = rig.hold()
-        rig.ticks(held, 3)
-        assert register(rig, 1, "operating_mode") == 5 and register(rig, 1, "goal_current") == 300
-        assert rig.ticks(held + 0.2, 100)["joint1"].position_rad == pytest.approx(0.2, abs=3 * RAD_PER_TICK)
+    rig = three(make_rig, safety=Safety(current_limit_mA=300))
+    held = rig.hold()
+    rig.ticks(held, 3)
+    assert register(rig, 1, "operating_mode") == 5 and register(rig, 1, "goal_current") == 300
+    assert rig.ticks(held + 0.2, 100)["joint1"].position_rad == pytest.approx(0.2, abs=3 * RAD_PER_TICK)
 
 
 def test_gains_are_set_before_torque_and_again_after_a_restart(make_rig):
-    with three(make_rig, safety=Safety(registers={"position_p_gain": 600})) as rig:
-        held = rig.hold()
-        rig.ticks(held, 3)
-        assert register(rig, 2, "position_p_gain") == 600
-        rig.bus._link.reboot(2)
-        rig.until(held, lambda r: r["joint2"].rejoined, 2.0)
-        assert register(rig, 2, "position_p_gain") == 600
+    rig = three(make_rig, safety=Safety(registers={"position_p_gain": 600}))
+    held = rig.hold()
+    rig.ticks(held, 3)
+    assert register(rig, 2, "position_p_gain") == 600
+    rig.bus._link.reboot(2)
+    rig.until(held, lambda r: r["joint2"].rejoined, 2.0)
+    assert register(rig, 2, "position_p_gain") == 600
 
 
 def test_torque_is_limited_where_current_cannot_be_and_halved_by_a_fault(make_rig):
     servos = [EmulatedServo(1, "xl430-w250")]
     safety = Safety(torque_limit_percent=50, on_fault="reduce")
-    with make_rig(servos, firmware_map=load_firmware_map("xl430-w250"), safety=safety) as rig:
-        rig.ticks(rig.hold(), 3)
-        assert register(rig, 1, "goal_pwm") == 442
-        rig.chain.fault(1, VOLTAGE)  # which its shutdown mask leaves out
-        rig.ticks(np.zeros(1), 20)
-        assert register(rig, 1, "goal_pwm") == 221
+    rig = make_rig(servos, firmware_map=load_firmware_map("xl430-w250"), safety=safety)
+    rig.ticks(rig.hold(), 3)
+    assert register(rig, 1, "goal_pwm") == 442
+    rig.fault(1, VOLTAGE)  # which its shutdown mask leaves out
+    rig.ticks(np.zeros(1), 20)
+    assert register(rig, 1, "goal_pwm") == 221

@@ -139,14 +139,14 @@ def test_returning_to_given_up_when_it_refuses_again_and_again(member, way):
     for _ in range(rules.ATTEMPTS + 1):
         run(member, now_s)
         now_s += rules.REFUSED_S
-    assert member.state is State.GIVEN_UP and member.fault == "left alone" and member.torque_wanted is False
+    assert member.state is State.GIVEN_UP and member.fault == "left alone" and member.to_release
 
 
 @pytest.mark.parametrize("before", [state for state in State if state is not State.OFF])
 def test_every_state_but_off_to_released_and_back_by_enable(member, before):
     member.state = before
     member.released()
-    assert member.state is State.RELEASED and member.torque_wanted is False and not member.gets_goals
+    assert member.state is State.RELEASED and not member.gets_goals
     assert member.to_release and member.job is None and not member.waits
     member.take_torque(False, 1.0)
     assert not member.to_release and member.fault is None
@@ -310,7 +310,7 @@ def test_online_to_returning_when_it_is_distrusted(member):
 def test_from_any_state_to_off_by_stop(member, state):
     member.state = state
     member.stopped()
-    assert member.state is State.OFF and member.job is None and member.torque_wanted is None
+    assert member.state is State.OFF and member.job is None and not member.to_release
 
 
 def test_port_that_is_gone_makes_all_silent_but_those_that_are_out(way):

@@ -1,6 +1,5 @@
 """Servos found outside their own stored limits, as those of a sagged head, come in gently or stay without torque."""
 
-import logging
 import math
 
 import pytest
@@ -200,48 +199,47 @@ def sagged(make_rig):
 
 
 def test_enable_waits_for_it_and_says_so(make_rig, caplog):
-    with sagged(make_rig) as rig, caplog.at_level(logging.WARNING):
-        held = rig.hold()
-        assert rig.chain.state(2)["position"] >= STORED["min_position_limit"]
-        assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
-        readings = rig.ticks(held, 20)
-        assert readings["joint2"].fault is None
-        assert readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
+    rig = sagged(make_rig)
+    held = rig.hold()
+    assert rig.state(2)["position"] >= STORED["min_position_limit"]
+    assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
+    readings = rig.ticks(held, 20)
+    assert readings["joint2"].fault is None
+    assert readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
 
 
 def test_torque_off_from_outside_ends_enable_with_torque_off(make_rig):
-    with sagged(make_rig) as rig:
-        rig.bus.connect()
-        plain = rig.clock.wait_until
+    rig = sagged(make_rig)
+    rig.bus.connect()
+    plain = rig.clock.wait_until
 
-        def wait_until(time_s):
-            plain(time_s)
-            if rig.clock.t > 0.3:
-                rig.bus.torque_off("release")
+    def wait_until(time_s):
+        plain(time_s)
+        if rig.clock.t > 0.3:
+            rig.bus.torque_off("release")
 
-        rig.clock.wait_until = wait_until
-        with pytest.raises(BusError, match="torque off was asked for while joint2 was being enabled"):
-            rig.bus.enable(rig.bus.joints)
-        rig.bus.stop("release")
-        rig.chain.time_is(rig.clock.t)
-        assert not any(rig.chain.state(i)["torque"] for i in (1, 2))
-        assert rig.chain.state(2)["position"] < STORED["min_position_limit"]
+    rig.clock.wait_until = wait_until
+    with pytest.raises(BusError, match="torque off was asked for while joint2 was being enabled"):
+        rig.bus.enable(rig.bus.joints)
+    rig.bus.stop("release")
+    assert not any(rig.state(i)["torque"] for i in (1, 2))
+    assert rig.state(2)["position"] < STORED["min_position_limit"]
 
 
 def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_rig):
-    with sagged(make_rig) as rig:
-        held = rig.hold()
-        rig.chain.supply(0.0)
-        rig.ticks(held, 60)
-        rig.chain.turn(2, SAGGED)
-        rig.chain.supply(5.0)
-        _, readings = rig.until(held, lambda each: each["joint2"].rejoined, 8.0)
-        assert rig.chain.state(2)["position"] >= STORED["min_position_limit"]
+    rig = sagged(make_rig)
+    held = rig.hold()
+    rig.supply(0.0)
+    rig.ticks(held, 60)
+    rig.servo(2).turn(SAGGED, rig.clock.t)
+    rig.supply(5.0)
+    _, readings = rig.until(held, lambda each: each["joint2"].rejoined, 8.0)
+    assert rig.state(2)["position"] >= STORED["min_position_limit"]
 
 
 def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(make_rig, caplog):
-    with make_rig([EmulatedServo(1, start_ticks=4000)]) as rig, caplog.at_level(logging.WARNING):
-        held = rig.hold()
+    rig = make_rig([EmulatedServo(1, start_ticks=4000)])
+    held = rig.hold()
     (line,) = caplog.messages
     assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line
     assert "held there and led in" in line and "head calibrate" in line and "\n" not in line

@@ -134,13 +134,6 @@ def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_lim
         assert each.register not in rig.found()
 
 
-@pytest.mark.parametrize("model", ["ax-12a", "mx-28-1.0", "xl-320"])
-def test_wheel_mode_is_ended(model):
-    rig = Rig(model, {"registers": {"cw_angle_limit": 0, "ccw_angle_limit": 0}})
-    rig.start_up()
-    assert (rig.held("cw_angle_limit"), rig.held("ccw_angle_limit")) == (0, rig.table["ccw_angle_limit"].high)
-
-
 # --- zero and direction -----------------------------------------------------------------------------------------
 
 
@@ -209,17 +202,6 @@ def test_a_secondary_id_that_is_another_servo_of_the_head_is_refused():
     rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 77}})
     rig.start_up()
     assert rig.found()["secondary_id"].then == "told"
-
-
-@pytest.mark.parametrize("model", ["xl330-m288", "ax-12a", "sts3215"])
-def test_a_shutdown_mask_without_its_protections_is_told(model):
-    name = "unloading_condition" if model == "sts3215" else "shutdown"
-    rig = Rig(model, {"registers": {name: 0}})
-    rig.start_up()
-    assert rig.held(name) == 0
-    told = rig.found()[name]
-    assert told.then == "told" and "overload" in told.why and "overheating" in told.why
-    assert told.wanted and Rig(model, {"registers": {name: told.wanted}}).found().get(name) is None
 
 
 @pytest.mark.parametrize("model", MODELS)

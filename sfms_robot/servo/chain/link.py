@@ -346,7 +346,7 @@ class PingReplies(NamedTuple):
 def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> PingReplies:
     """Ping one id and count what comes until there was no byte for `silence_s`; `protocol` is 2, or 1 (Feetech too).
 
-    Two servos with one id answer together, so the ping brings two answers, or bytes that are no answer, which a link
+    Two servos with one id answer together, so the ping brings two answers, or bytes that belong to none, which a link
     drops. Two servos of one model that answer in the very same instant look like one: only a wire with a single servo
     on it is certain.
     """

@@ -71,7 +71,7 @@ ONLINE: Final = State.ONLINE  # through the class each is a call, for every serv
 REDUCED: Final = State.REDUCED
 REJOINING: Final = State.REJOINING
 _DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
-_POWERED: Final = _DRIVEN | {State.FAULTY, State.REJOINING}  # torque is wanted, and was seen
+POWERED: Final = _DRIVEN | {State.FAULTY, State.REJOINING}  # torque is wanted, and was seen
 _LIMP: Final = frozenset({State.LIMP, State.GIVEN_UP, State.RELEASED})  # torque off is wanted
 _COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
 
@@ -142,13 +142,6 @@ class Member:
     def gets_goals(self) -> bool:
         """Return whether goals are sent to it."""
         return self.state in _DRIVEN and self.torque_seen is True
-
-    @property
-    def torque_wanted(self) -> bool | None:
-        """Return whether it should have torque; None before `enable` and on its way back."""
-        if self.state in _POWERED:
-            return True
-        return False if self.state in _LIMP else None
 
     @property
     def to_release(self) -> bool:
@@ -299,7 +292,7 @@ class Member:
             self._named = names
         if new:
             self._report(", ".join(names))
-            if self.state in _POWERED:
+            if self.state in POWERED:
                 self._act(self.servo.safety.on_fault, now_s, LIMP_S if self._eases_in else math.inf)
 
     def take_current(self, current_mA: float, now_s: float) -> None:
@@ -324,7 +317,7 @@ class Member:
                 self._trouble = None
         elif self.state is State.SILENT and not on and self.identified:
             self._report(TORQUE_LOST)  # it was away because it restarted
-        elif self.state in _POWERED and not on:
+        elif self.state in POWERED and not on:
             if self._named:
                 self._release(math.inf)  # its own protection took the torque, and it reports why
             else:

@@ -273,35 +273,28 @@ class Protocol1Startup(Startup):
         if lock is not None:
             self._link.write(servo, lock.address, lock.to_bytes(1))
 
-    def prepare(self) -> Steps[int]:
+    def _read_state(self) -> Steps[dict[str, int]]:
         level = self._field("status_level")
         if self.value(level) != level.high:
             self._acknowledge()
         yield 0.0
-        now = yield from self._snapshot(self.table.size)
-        now = yield from self._release_outside(now)
-        for name, target in self._settings(now).items():
-            if name == self._name("torque_limit") and not now[name]:
-                continue  # a torque limit of 0 is a shutdown, and stays until the goal is the present position
-            yield from self._set(now, name, target)
-        return 0
+        return (yield from self._snapshot())
 
-    def bring_back(self, reboot: bool) -> Steps[int]:
-        number = self.table["model_number"]
-        self.recognise(Found(self.value(number), None))
-        yield 0.0
-        yield from self.prepare()
-        return (yield from self.torque_on())
+    def _find_again(self, reboot: bool) -> Steps[None]:
+        self.recognise(Found(self.value(self.table["model_number"]), None))
+        yield from ()
 
-    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
-        """Return position mode, no delay, no speed limit, and all of its torque unless the head's file says less."""
-        settings = self._corrections(now)
-        settings[self._name("return_delay")] = 0
-        limit = self.table.role("torque_limit")
+    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+        defaults, limit = {self._name("return_delay"): 0}, self.table.role("torque_limit")
         if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
-            settings[limit.name] = now["max_torque"]
-        settings |= self.wanted()
-        return {name: target for name, target in settings.items() if name in now}
+            defaults[limit.name] = now["max_torque"]
+        return defaults
+
+    def _set(self, now: Mapping[str, int], name: str, target: int) -> Steps[bool]:
+        """Write a register, but no torque limit of 0: that is a shutdown, and stays until torque is switched on."""
+        if name == self._name("torque_limit") and not now[name]:
+            return False
+        return (yield from super()._set(now, name, target))
 
     def _restore_torque(self) -> Steps[None]:
         """Restore the torque limit, which a shutdown sets to 0, also when torque is switched on again."""

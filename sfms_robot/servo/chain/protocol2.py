@@ -40,7 +40,6 @@ _LONGEST_FAST: Final = dxl2.MAX_PACKET + 4096  # bytes after which a fast answer
 
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
 _REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
-_AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers that startup reads
 
 
 class Dynamixel2Link(RegisterLink):
@@ -213,50 +212,31 @@ class Dynamixel2Startup(Startup):
             except ConfigError as error:
                 raise self._error(f"has firmware {found.firmware}: {error}") from error
 
-    def prepare(self) -> Steps[int]:
-        table = self.table
-        if (level := table.role("status_level")) is not None:
+    def _read_state(self) -> Steps[dict[str, int]]:
+        if (level := self.table.role("status_level")) is not None:
             # Status return level 2, unconfirmed: at level 0 a servo answers pings and nothing else.
             self._link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
-        now = yield from self._clear_turns((yield from self._state()))
-        now = yield from self._release_outside(now)
-        for name, target in self._settings(now).items():
-            if name not in now:
-                now[name] = self.value(table[name])
-                yield 0.0
-            written = yield from self._set(now, name, target)
-            if written and name == self._name("operating_mode"):
-                now = yield from self._state()  # another mode resets gains, profile and goals
-        error = table.role("error_status")
-        return now[error.name] if error is not None else 0
+        return (yield from self._clear_turns((yield from self._snapshot())))
 
-    def bring_back(self, reboot: bool) -> Steps[int]:
-        servo = self.servo.id
+    def _find_again(self, reboot: bool) -> Steps[None]:
         if reboot:
-            answer = self._link.reboot(servo)
+            answer = self._link.reboot(self.servo.id)
             if answer is None:
                 raise Silent(self._about("does not answer to a reboot"))
             if refusal := self._link.refusal(answer):
                 raise self._error(f"refuses to reboot: {refusal}")
             yield _REBOOT_S
-        found = self._link.ping(servo)
+        found = self.ping()
         if found is None:
             raise Silent(self._about("does not answer to a ping"))
         self.recognise(found)
-        yield 0.0
-        yield from self.prepare()
-        return (yield from self.torque_on())
 
-    def _settings(self, now: Mapping[str, int]) -> dict[str, int]:
-        """Return register values before torque; the mode comes first, since it resets others."""
-        settings = self._corrections(now)
-        settings["drive_mode"] = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
-        settings[self._name("return_delay")] = 0
-        settings["bus_watchdog"] = 0
+    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+        drive_mode = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
+        defaults = {"drive_mode": drive_mode, self._name("return_delay"): 0, "bus_watchdog": 0}
         if "pwm_limit" in now:  # an earlier run may have left less
-            settings["goal_pwm"] = now["pwm_limit"]
-        settings |= self.wanted()
-        return {name: target for name, target in settings.items() if name in self.table.fields}
+            defaults["goal_pwm"] = now["pwm_limit"]
+        return defaults
 
     def _clear_turns(self, now: dict[str, int]) -> Steps[dict[str, int]]:
         """Let a servo that was turned by hand past its one turn forget whole turns (CLEAR), at rest without torque.
@@ -276,11 +256,6 @@ class Dynamixel2Startup(Startup):
         yield 0.0
         log.warning("%s", self._about(f"was turned past one turn: {now[present.name]} now reads {cleared}"))
         return {**now, present.name: cleared}
-
-    def _state(self) -> Steps[dict[str, int]]:
-        """Return the values of all registers up to those that report the present."""
-        fields = [field for role in _AT_REST if (field := self.table.role(role)) is not None]
-        return (yield from self._snapshot(max(field.address + field.size for field in fields)))
 
 
 class Dynamixel2Bus(ChainBus):

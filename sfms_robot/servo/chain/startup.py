@@ -40,7 +40,7 @@ from sfms_robot.errors import BusError, ServoError
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Steps, finish, verified_write
 from sfms_robot.servo.policy import BusServo, torque_limit
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field, Table, span_of
 from sfms_robot.servo.stored_settings import (
     Contradiction,
     JointNeeds,
@@ -60,6 +60,7 @@ _RAMP_S: Final = 0.25  # to `SPEED_DEG_S`
 _SLACK_S: Final = 1.0  # beyond twice the time that the way should take
 _LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its limits
 _STILL_TICKS: Final = 1  # between two looks: it stands
+_AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers of 2.0 that are read
 _BY_TIME: Final = 0x04  # drive mode bit 2: the profile registers are durations
 _ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _DEG_S: Final = {"rpm": 6.0, "deg_per_s": 1.0}
@@ -122,7 +123,7 @@ class Startup(ABC):
     Attributes:
         table: a protocol whose servos report their firmware replaces it by that of another layout.
         can_reboot: whether the protocol has an instruction for it.
-        unlimited: registers of speed and acceleration, in which 0 is no limit.
+        unlimited: registers of speed and acceleration, in which 0 means unlimited.
     """
 
     can_reboot: ClassVar[bool]
@@ -148,18 +149,45 @@ class Startup(ABC):
         self._link = link
 
     @abstractmethod
+    def _read_state(self) -> Steps[dict[str, int]]:
+        """Make the servo answer, and return the values of its registers, at least those up to present position."""
+
+    @abstractmethod
+    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+        """Return register values before torque, in any head; `now`: their values."""
+
+    @abstractmethod
+    def _find_again(self, reboot: bool) -> Steps[None]:
+        """Identify a servo that was away. Raises Silent, ServoError."""
+
     def prepare(self) -> Steps[int]:
         """Verify what is stored, write settings, and return the latched faults. Torque is left unchanged.
 
         Raises ServoError for a stored value that contradicts the head's file.
         """
+        now = yield from self._release_outside((yield from self._read_state()))
+        settings = {**self._corrections(now), **self._defaults(now), **self.wanted()}  # the mode first
+        for name, target in settings.items():
+            if (field := self.table.fields.get(name)) is None:
+                continue
+            if name not in now:
+                now[name] = self.value(field)
+                yield 0.0
+            written = yield from self._set(now, name, target)
+            if written and self.table.protocol == 2 and name == self._name("operating_mode"):
+                now = yield from self._snapshot()  # another mode resets gains, profile and goals
+        error = self.table.role("error_status") if self.table.protocol == 2 else None
+        return now[error.name] if error is not None else 0
 
-    @abstractmethod
     def bring_back(self, reboot: bool) -> Steps[int]:
         """Start up a servo that was away: same model, settings, torque on; return the position held, in ticks.
 
         Raises Silent, and ServoError as `prepare` and `torque_on`.
         """
+        yield from self._find_again(reboot)
+        yield 0.0
+        yield from self.prepare()
+        return (yield from self.torque_on())
 
     def torque_on(self) -> Steps[int]:
         """Write goal := present, read it back, switch torque on, read it back; return the position held, in ticks.
@@ -332,16 +360,17 @@ class Startup(ABC):
             wanted = f"the head says {table.model} ({table.model_number})"
             raise self._error(f"is model number {found.model_number}, {wanted}")
 
-    def _snapshot(self, end: int) -> Steps[dict[str, int]]:
-        """Return the values of all registers below address `end`, in as few reads as possible."""
-        memory = bytearray()
+    def _snapshot(self) -> Steps[dict[str, int]]:
+        """Return the values of the registers, in as few reads as possible; of 2.0 those up to `_AT_REST`."""
+        end, memory = self.table.size, bytearray()
+        if self.table.protocol == 2:
+            fields = [field for role in _AT_REST if (field := self.table.role(role)) is not None]
+            end = sum(span_of(fields))
         for start in range(0, end, LONGEST_READ):
             memory += self._read("its registers", start, min(LONGEST_READ, end - start))
             yield 0.0
-        fields = self.table.fields.values()
-        return {
-            each.name: each.from_bytes(memory[each.address :]) for each in fields if each.address + each.size <= end
-        }
+        inside = (each for each in self.table.fields.values() if each.address + each.size <= end)
+        return {each.name: each.from_bytes(memory[each.address :]) for each in inside}
 
     def value(self, field: Field) -> int:
         """Return the value of one register. Raises Silent, ServoError if it is refused."""

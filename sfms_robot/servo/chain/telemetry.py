@@ -61,19 +61,14 @@ class Telemetry:
         present, self.goal, self.torque = (_needed(bus, tables, role) for role in _NEEDED)
         self.error = common(bus, tables, "error_status") if protocol == 2 else None
         common(bus, tables, "bus_watchdog")
-        self._fields = {"position": present}
         loads = [_load(table) for table in tables]
-        if loads[0] is not None and all(_alike(load, loads[0]) for load in loads):
-            self._fields["load"] = loads[0]
-        for key, role in _ROLES.items():
-            first = tables[0].role(role)
-            if first is not None and all(_alike(table.role(role), first) for table in tables):
-                self._fields[key] = first
+        shared = {"load": _shared(loads)}
+        shared |= {key: _shared([table.role(role) for table in tables]) for key, role in _ROLES.items()}
+        self._fields = {"position": present} | {key: field for key, field in shared.items() if field is not None}
         self.position: Block = (present.address, present.size)
         self.block = span_of([*self._fields.values()])
-        self.currents = [_apart(table, self._fields.get("load")) for table in tables]
-        current = self.currents[0]
-        if current is not None and all(_alike(each, current) for each in self.currents):
+        self.currents = [_apart(table, shared["load"]) for table in tables]
+        if (current := _shared(self.currents)) is not None:
             wider = span_of([*self._fields.values(), current])
             if wider[1] - self.block[1] <= _REACH:
                 self._fields["current"], self.block = current, wider
@@ -131,7 +126,7 @@ class Telemetry:
         self.seen_s[at] = now_s
         if where == self.block:
             for key, row, unit in self._columns:
-                self.extra[row, at] = _signed(self._fields[key], rows[key]) * unit[at]
+                self.extra[row][at] = _signed(self._fields[key], rows[key]) * unit[at]
 
     def take_current(self, index: int, field: Field, data: bytes) -> None:
         """Decode an answer to a read of `currents[index]`."""
@@ -217,6 +212,11 @@ def _alike(field: Field | None, other: Field | None) -> bool:
     return (field and (field[1:4], field.sign, field.byte_order)) == (
         other and (other[1:4], other.sign, other.byte_order)
     )
+
+
+def _shared(fields: Sequence[Field | None]) -> Field | None:
+    """Return the register that all servos have with the same address and form; None if there is none."""
+    return fields[0] if all(_alike(field, fields[0]) for field in fields) else None
 
 
 def _load(table: Table) -> Field | None:

@@ -12,7 +12,7 @@ Parameters, by the manual's names (words low byte first):
     ACTION, REBOOT    none                          status: no data
     FACTORY RESET     FF all, 01 all but the id, 02 all but id and baud rate
     CLEAR             01 44 58 4C 22                present position back into one turn
-    SYNC WRITE        address (2), length (2), then id, data of each; sent to id FE, nobody answers
+    SYNC WRITE        address (2), length (2), then id, data of each; sent to id FE, none answers
     SYNC READ         address (2), length (2), then ids; sent to id FE, one status of each, in that order
     FAST SYNC READ    the same; one status from id FE: ERROR, ID, data, CRC of each
 
@@ -35,22 +35,23 @@ from fastcrc.crc16 import umts
 
 from sfms_robot.errors import PacketError
 
+# Instructions, e-manual "Instruction"; 55 marks what a servo sends.
 PING: Final = 0x01
 READ: Final = 0x02
 WRITE: Final = 0x03
-REG_WRITE: Final = 0x04
+REG_WRITE: Final = 0x04  # kept in the servo until ACTION
 ACTION: Final = 0x05
 FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
-CLEAR: Final = 0x10
+CLEAR: Final = 0x10  # with the key 44 58 4C 22
 STATUS: Final = 0x55
 SYNC_READ: Final = 0x82
 SYNC_WRITE: Final = 0x83
-FAST_SYNC_READ: Final = 0x8A
+FAST_SYNC_READ: Final = 0x8A  # from a firmware on that differs by model
 BULK_READ: Final = 0x92
 BULK_WRITE: Final = 0x93
 
-# Error byte of a status packet (byte 8).
+# Error byte of a status packet (byte 8): e-manual "Status Packet: Error".
 ALERT: Final = 0x80  # bit 7: the hardware error status is not 0; says nothing about the request
 ERRORS: Final = {
     1: "result fail",
@@ -67,13 +68,13 @@ DATA_LENGTH_ERROR: Final = 5
 DATA_LIMIT_ERROR: Final = 6
 ACCESS_ERROR: Final = 7
 
-BROADCAST: Final = 0xFE
+BROADCAST: Final = 0xFE  # "Packet ID": ids are 0 to 252 (FC); FD and FF are reserved
 MAX_ID: Final = 252
 MAX_PACKET: Final = 1024  # bytes; a longer claim is noise, and this bounds what a reader holds
 STATUS_OVERHEAD: Final = 11  # bytes of a status packet without its data
 
-_HEADER: Final = b"\xff\xff\xfd\x00"
-_LOOKALIKE: Final = b"\xff\xff\xfd"
+_HEADER: Final = b"\xff\xff\xfd\x00"  # "Header" and "Reserved"
+_LOOKALIKE: Final = b"\xff\xff\xfd"  # inside a packet; byte stuffing makes it the next one
 _STUFFED: Final = b"\xff\xff\xfd\xfd"
 
 
@@ -121,13 +122,14 @@ def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, i
     `data` begins with the header. If a device is silent the packet stops short: the devices in front of the gap are
     returned, each proved by the crc it sent, and none behind it.
     """
+    # FF FF FD 00 FE LEN LEN 55, then of each device ERROR ID data CRC CRC: 4 bytes and the data
     if not data.startswith(_HEADER + bytes([BROADCAST])) or data[7:8] != bytes([STATUS]):
         return []
     data, size = bytes(data), length + 4
     ends = range(8 + size, len(data) + 1, size)
     whole = bool(ends) and _proved(data[: ends[-1]])  # the last crc is over everything
     out = []
-    for end in ends:
+    for end in ends:  # behind the crc of one device
         if not whole and not _proved(data[:end]):
             break
         out.append((data[end - size + 1], data[end - size], data[end - size + 2 : end - 2]))
@@ -174,7 +176,7 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
         if crc16(buffer[: total - 2]) != buffer[total - 2] | buffer[total - 1] << 8:
             del buffer[0]
             continue
-        body = bytes(buffer[7 : total - 2])
+        body = bytes(buffer[7 : total - 2])  # instruction, then parameters
         if body[0] == STATUS and len(body) < 2:
             del buffer[0]
             continue

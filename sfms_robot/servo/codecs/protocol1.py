@@ -39,7 +39,7 @@ from typing import Final, NamedTuple
 
 from sfms_robot.errors import PacketError
 
-# Instructions: e-manual "Instruction Packet"; Feetech manual section 1.3.
+# Instructions: e-manual "Instruction"; the last three are Feetech's.
 PING: Final = 0x01
 READ: Final = 0x02
 WRITE: Final = 0x03

@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from timed import timed
 
 from sfms_robot.config import LoadRule, Safety
-from sfms_robot.servo.chain.member import NEAR, State
+from sfms_robot.servo.chain.member import NEAR, POWERED, State
 
 COUNT = 4
 IDS = st.integers(1, COUNT)
@@ -36,7 +36,7 @@ class Troubles(RuleBasedStateMachine):
     def tick(self, n, towards):
         for _ in range(n):
             self.goals += np.clip(towards - self.goals, -STEP_RAD, STEP_RAD)
-            trusted = {m.id for m in self.rig.bus._members if m.torque_wanted and m.torque_seen}
+            trusted = {m.id for m in self.rig.bus._members if m.state in POWERED and m.torque_seen}
             self.mark = len(self.rig.port.sent)
             readings = self.rig.tick(self.goals)
             self.look_at_goals(trusted)

@@ -1,3 +1,5 @@
+"""Goals of a bus."""
+
 import numpy as np
 import pytest
 from emulated_port import Straight, bus_servo

@@ -33,29 +33,29 @@ class OldFirmware(WrappedPort):
 
 @pytest.mark.parametrize("fast_read", ["auto", "on"])
 def test_servos_without_fast_sync_read_are_read_plainly_from_then_on(make_rig, fast_read, caplog):
-    with caplog.at_level(logging.WARNING), make_rig([EmulatedServo(i) for i in range(1, 6)]) as rig:
-        port = OldFirmware(rig.port())
-        maps = [load_firmware_map("xl330-m288")] * rig.count
-        rig.bus = bus_of(maps, range(1, rig.count + 1), lambda: port, fast_read=fast_read)
-        held = rig.hold()
-        for _ in range(60):
-            assert all(r.age_s == 0.0 for r in rig.ticks(held, 1).values())
-        tried = port.fast
-        rig.ticks(held, 60)
-        assert port.fast == tried <= 6
-        assert ("fast sync read is not answered" in caplog.text) == (fast_read == "on")
+    rig = make_rig([EmulatedServo(i) for i in range(1, 6)])
+    port = OldFirmware(rig.open_port())
+    maps = [load_firmware_map("xl330-m288")] * rig.count
+    rig.bus = bus_of(maps, range(1, rig.count + 1), lambda: port, fast_read=fast_read)
+    held = rig.hold()
+    for _ in range(60):
+        assert all(r.age_s == 0.0 for r in rig.ticks(held, 1).values())
+    tried = port.fast
+    rig.ticks(held, 60)
+    assert port.fast == tried <= 6
+    assert ("fast sync read is not answered" in caplog.text) == (fast_read == "on")
 
 
 def test_slow_wire_brings_positions_every_tick_and_the_rest_in_turn(make_rig):
-    with make_rig([EmulatedServo(i, start_ticks=2048) for i in range(1, 29)]) as rig:
-        held = rig.hold()
-        rig.chain.supply(5.5)
-        seen = []
-        for _ in range(28):
-            readings = rig.ticks(held, 1)
-            assert all(r.age_s == 0.0 for r in readings.values())
-            seen.append(sum(r.extra["voltage_V"] > 5.3 for r in readings.values()))
-        assert 0 < seen[0] < 14 and seen[-1] == 28
+    rig = make_rig([EmulatedServo(i, start_ticks=2048) for i in range(1, 29)])
+    held = rig.hold()
+    rig.supply(5.5)
+    seen = []
+    for _ in range(28):
+        readings = rig.ticks(held, 1)
+        assert all(r.age_s == 0.0 for r in readings.values())
+        seen.append(sum(r.extra["voltage_V"] > 5.3 for r in readings.values()))
+    assert 0 < seen[0] < 14 and seen[-1] == 28
 
 
 @given(st.integers(1, 60), st.floats(1e-5, 1e-3), st.floats(0.001, 0.05))

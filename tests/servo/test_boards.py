@@ -1,3 +1,5 @@
+"""A port that knows when its bytes have left, and how long an answer may take."""
+
 from emulated_port import EmulatedPort, Says
 
 from sfms_robot.servo.boards import RateLimitedPort
