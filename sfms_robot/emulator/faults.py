@@ -18,13 +18,10 @@ import random
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
-
-if TYPE_CHECKING:
-    from sfms_robot.emulator.emulated_wire import Reply
 
 
 class Kind(NamedTuple):
@@ -175,20 +172,20 @@ class Faults:
                 self._faults.remove(fault)
             yield time_s, fault, began
 
-    def spoil(self, packet: Reply, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
-        """Return the packets that arrive for a reply, or with `way` `TO_SERVOS` for one write of the host.
+    def spoil(self, servos: Sequence[int], data: bytes, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
+        """Return the packets that arrive for a reply of `servos`, or with `way` `TO_SERVOS` for one write of the host.
 
         Each is (bytes, seconds late); none when it is lost.
         """
-        out = [(packet.data, 0.0)]
+        out = [(data, 0.0)]
         for fault in self._faults:
-            if not fault.kind.startswith(way) or not fault.meets(packet.servos, now_s):
+            if not fault.kind.startswith(way) or not fault.meets(servos, now_s):
                 continue
             kind = fault.kind.removeprefix(way)
             if kind == "delay":
-                out = [(data, late_s + fault.value) for data, late_s in out]
+                out = [(each, late_s + fault.value) for each, late_s in out]
             elif kind in _SPOILERS and self._random.random() < fault.value:
-                out = [(spoilt, late_s) for data, late_s in out for spoilt in _SPOILERS[kind](data, self._random)]
+                out = [(spoilt, late_s) for each, late_s in out for spoilt in _SPOILERS[kind](each, self._random)]
         return out
 
     def echoes(self, now_s: float) -> bool:

@@ -77,7 +77,7 @@ def test_watching_ends_after_the_samples_asked_for(run):
     ("words", "code", "problem"),
     [
         (("read", "1", "goal_postion"), 2, "present_position"),
-        (("read", "300", "led"), 2, "0..252"),
+        (("read", "254", "led"), 2, "0..252"),
         (("read", "one", "led"), 2, "list of ids"),
         (("ping", "9-1"), 2, "list of ids"),
         (("write", "1", "led", "2"), 2, "raw 0..1"),
