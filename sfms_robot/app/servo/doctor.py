@@ -49,12 +49,13 @@ from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.boards.rate_limit import RateLimitedPort
 from sfms_robot.servo.chain.dynamixel2_link import Dynamixel2Link
+from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import family_named, servo_families
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.stored_settings import JointNeeds
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
@@ -206,23 +207,25 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
+    """Return the servos of a bus as the head's file describes them, by id."""
     from sfms_robot.app.wiring import calibration_of, firmware_maps
 
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    maps, ranges = firmware_maps(joints), calibration_of(joints)
-    ids = frozenset(joint.id for joint in joints.values())
-    found = {}
-    for (name, joint), low, high in zip(joints.items(), ranges.low_ticks, ranges.high_ticks, strict=True):
-        safety = head.safety_of(name)
-        bounded = safety.current_limit_mA is not None
-        found[joint.id] = Wanted(
-            joint=name,
-            model=joint.model,
-            model_number=maps[joint.model].model_number,
+    maps = firmware_maps(joints)
+    servos = [
+        BusServo(name, joint.id, maps[joint.model], joint.min_rad, joint.max_rad, head.safety_of(name))
+        for name, joint in joints.items()
+    ]
+    return {
+        servo.id: Wanted(
+            joint=servo.joint,
+            model=joints[servo.joint].model,
+            model_number=servo.map.model_number,
             faults=head.faults,
-            needs=JointNeeds(int(low), int(high), safety.stored, ids - {joint.id}, bounded),
+            needs=needs,
         )
-    return found
+        for servo, needs in zip(servos, needs_of(servos, calibration_of(joints)), strict=True)
+    }
 
 
 # --- a chain of servos ----------------------------------------------------------------------------------------------
