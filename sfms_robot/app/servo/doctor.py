@@ -256,7 +256,7 @@ def _look(
         except ServoError as error:
             level = seen.table.role("status_level") if seen.table else None
             cure = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
-            findings.append(Finding("error", f"id {seen.id}", str(error), cure, seen.id))
+            findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
     findings += judge_duplicate_ids(double)
     for state in states:
         findings += judge_servo(state, line.wanted.get(state.seen.id), command)
