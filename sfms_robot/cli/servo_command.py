@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import wraps
@@ -50,7 +50,9 @@ class Wiring:
     port: Annotated[
         str | None, typer.Option("--port", help="Serial device, or 'sim'. Default: the only one there is.")
     ] = None
-    baud: Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: at all.")] = None
+    baud: Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: every rate.")] = (
+        None
+    )
     family: Annotated[Family, typer.Option("--family", help="The protocol of the servos.")] = Family.dynamixel2
     head: Annotated[str, typer.Option("--head", help="The head whose servos --port sim emulates.")] = "face28"
     model: Annotated[
@@ -58,13 +60,11 @@ class Wiring:
     ] = None
     json: JsonOption = False
 
-    @contextmanager
-    def open(self) -> Iterator[Wire]:
-        """Open the wire to the servos."""
+    def open(self) -> AbstractContextManager[Wire]:
+        """Return the wire to the servos, open inside a `with` block."""
         from sfms_robot.app.servo.serial_line import open_wire
 
-        with open_wire(self.port, self.family.value, self.baud, self.head, self.model) as wire:
-            yield wire
+        return open_wire(self.port, self.family.value, self.baud, self.head, self.model)
 
 
 def on_wire(command: Callable[..., None]) -> Callable[..., None]:
@@ -79,7 +79,7 @@ def on_wire(command: Callable[..., None]) -> Callable[..., None]:
 
     seen = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *shared)]
     run.__dict__.pop("__wrapped__")  # or its signature would be looked at instead
-    run.__signature__ = inspect.Signature(seen)  # type: ignore[attr-defined]
+    run.__dict__["__signature__"] = inspect.Signature(seen)
     run.__annotations__ = {each.name: each.annotation for each in seen}
     return run
 
@@ -192,7 +192,7 @@ def doctor(
         None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
     ),
     head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
-    baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: at all."),
+    baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: every rate."),
     family: Family | None = typer.Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
     fix: bool = typer.Option(
         False, "--fix", help="Mend stored values, in the servos or in the head's file; asks before each."

@@ -16,9 +16,16 @@ from rich.text import Text
 from sfms_robot.cli.show import screen
 
 _SHORT = {
-    "model_number": "number", "firmware": "fw", "voltage_V": "V", "temperature_degC": "degC", "position_deg": "deg",
-    "return_delay_us": "delay us", "current_mA": "mA", "load_percent": "load %", "before": "was",
-}  # fmt: skip
+    "model_number": "number",
+    "firmware": "fw",
+    "voltage_V": "V",
+    "temperature_degC": "degC",
+    "position_deg": "deg",
+    "return_delay_us": "delay us",
+    "current_mA": "mA",
+    "load_percent": "load %",
+    "before": "was",
+}
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
@@ -51,9 +58,13 @@ def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
     """Show a progress bar on stderr where that is a terminal; yield the function that moves it."""
     console = Console(stderr=True)
     progress = Progress(
-        TextColumn(text), BarColumn(), TextColumn("{task.percentage:.0f} %  {task.description}"),
-        console=console, transient=True, disable=hidden or not console.is_terminal,
-    )  # fmt: skip
+        TextColumn(text),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %  {task.description}"),
+        console=console,
+        transient=True,
+        disable=hidden or not console.is_terminal,
+    )
     with progress:
         task = progress.add_task("", total=None)
         yield lambda done, total, what: progress.update(task, completed=done, total=total, description=what)
@@ -76,8 +87,18 @@ def _bus(bus: Mapping[str, Any]) -> Iterator[RenderableType]:
     if any(known):
         yield Text("adapter: " + ", ".join(str(each).strip() for each in known if each))
     if bus["servos"]:
-        columns = ("id", "joint", "model", "firmware", "baud", "voltage_V", "temperature_degC", "return_delay_us",
-                   "torque", "faults")  # fmt: skip
+        columns = (
+            "id",
+            "joint",
+            "model",
+            "firmware",
+            "baud",
+            "voltage_V",
+            "temperature_degC",
+            "return_delay_us",
+            "torque",
+            "faults",
+        )
         yield _table([{key: row[key] for key in columns} for row in bus["servos"]])
     if bus["budget"]:
         yield from _budget(bus)

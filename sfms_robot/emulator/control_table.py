@@ -137,11 +137,16 @@ class Mode(Enum):
 POSITIONING: Final = frozenset({Mode.JOINT, Mode.MULTI_TURN, Mode.CURRENT_POSITION, Mode.STEP})
 _MODES: Final = {  # family, register -> value -> mode
     ("dynamixel", "operating_mode"): {
-        0: Mode.CURRENT, 1: Mode.WHEEL, 3: Mode.JOINT, 4: Mode.MULTI_TURN, 5: Mode.CURRENT_POSITION, 16: Mode.PWM,
+        0: Mode.CURRENT,
+        1: Mode.WHEEL,
+        3: Mode.JOINT,
+        4: Mode.MULTI_TURN,
+        5: Mode.CURRENT_POSITION,
+        16: Mode.PWM,
     },
     ("dynamixel", "control_mode"): {1: Mode.WHEEL, 2: Mode.JOINT},
     ("feetech", "operating_mode"): {0: Mode.JOINT, 1: Mode.WHEEL, 2: Mode.PWM, 3: Mode.STEP},
-}  # fmt: skip
+}
 
 
 def angle_limits(memory: ControlTable) -> tuple[int, int]:

@@ -138,7 +138,7 @@ class EmulatedWire:
         through_s = self._occupy(now_s, len(data), baud)
         if self._faults.echoes(now_s):
             self._post(Reply((), data), through_s, 0.0)
-        for spoilt, late_s in self._faults.spoil(Reply((), data), now_s, TO_SERVOS):
+        for spoilt, late_s in self._faults.spoil((), data, now_s, TO_SERVOS):
             # Bytes do not overtake one another.
             self._inbox.append((max([now_s + late_s, *(each[0] for each in self._inbox)]), spoilt, baud))
         self.advance(now_s)
@@ -154,7 +154,7 @@ class EmulatedWire:
                 for reply in device.replies(data, baud, now_s):
                     start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
                     due_s = self._occupy(start_s, len(reply.data), baud)
-                    for spoilt, late_s in self._faults.spoil(reply, now_s):
+                    for spoilt, late_s in self._faults.spoil(reply.servos, reply.data, now_s):
                         self._post(reply._replace(data=spoilt), due_s, late_s)
 
     def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:

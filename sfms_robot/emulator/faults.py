@@ -18,13 +18,10 @@ import random
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
-
-if TYPE_CHECKING:
-    from sfms_robot.emulator.emulated_wire import Reply
 
 
 class Kind(NamedTuple):
@@ -67,7 +64,7 @@ _SPEC: Final = re.compile(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fault:
     """One fault. `ids` None: all servos. `text` is the spec as it was given."""
 
@@ -116,7 +113,7 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
         raise refuse(f"is out of range: {kind.meaning} of {name}", [f"{kind.low:g}..{kind.high:g}"])
     if end_s <= start_s:
         raise refuse(f"ends at {end_s:g} s, before it starts")
-    return Fault(name, ids, start_s, end_s, value, text.strip())
+    return Fault(kind=name, ids=ids, start_s=start_s, end_s=end_s, value=value, text=text.strip())
 
 
 def parse_ids(text: str) -> list[int]:
@@ -145,18 +142,20 @@ class Faults:
     def add(self, fault: Fault) -> None:
         """Add a fault."""
         self._faults.append(fault)
-        for time_s, began in ((fault.start_s, True), (fault.end_s, False)):
-            if time_s < math.inf:
-                self._count += 1
-                heapq.heappush(self._edges, (time_s, self._count, began, fault))
+        self._add_edge(fault.start_s, True, fault)
+        self._add_edge(fault.end_s, False, fault)
+
+    def _add_edge(self, time_s: float, began: bool, fault: Fault) -> None:
+        if time_s < math.inf:
+            self._count += 1
+            heapq.heappush(self._edges, (time_s, self._count, began, fault))
 
     def clear(self, now_s: float) -> None:
         """Remove all faults. Those that have begun end at `now_s`."""
         begun = [fault for fault in self._faults if fault.start_s <= now_s < fault.end_s]
         self._faults, self._edges = [], []
         for fault in begun:
-            self._count += 1
-            heapq.heappush(self._edges, (now_s, self._count, False, fault))
+            self._add_edge(now_s, False, fault)
 
     def texts(self, now_s: float) -> list[str]:
         """Return the specs of faults that last or are to come."""
@@ -175,20 +174,20 @@ class Faults:
                 self._faults.remove(fault)
             yield time_s, fault, began
 
-    def spoil(self, packet: Reply, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
-        """Return the packets that arrive for a reply, or with `way` `TO_SERVOS` for one write of the host.
+    def spoil(self, servos: Sequence[int], data: bytes, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
+        """Return the packets that arrive for a reply of `servos`, or with `way` `TO_SERVOS` for one write of the host.
 
         Each is (bytes, seconds late); none when it is lost.
         """
-        out = [(packet.data, 0.0)]
+        out = [(data, 0.0)]
         for fault in self._faults:
-            if not fault.kind.startswith(way) or not fault.meets(packet.servos, now_s):
+            if not fault.kind.startswith(way) or not fault.meets(servos, now_s):
                 continue
             kind = fault.kind.removeprefix(way)
             if kind == "delay":
-                out = [(data, late_s + fault.value) for data, late_s in out]
+                out = [(each, late_s + fault.value) for each, late_s in out]
             elif kind in _SPOILERS and self._random.random() < fault.value:
-                out = [(spoilt, late_s) for data, late_s in out for spoilt in _SPOILERS[kind](data, self._random)]
+                out = [(spoilt, late_s) for each, late_s in out for spoilt in _SPOILERS[kind](each, self._random)]
         return out
 
     def echoes(self, now_s: float) -> bool:

@@ -12,7 +12,7 @@ and their times, never on how often it is read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Final, NamedTuple
 
 STEP_S: Final = 0.002
@@ -59,6 +59,7 @@ class Plant:
     """
 
     position: float
+    _: KW_ONLY
     speed: float = 0.0
     acceleration: float = 0.0
     reference: float = 0.0

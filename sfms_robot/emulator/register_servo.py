@@ -50,9 +50,20 @@ _NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
 USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
 _SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # up to this highest supply [V] -> usual supply [V]
 _MEASURED: Final = (  # roles and registers that are worked out whenever they are read
-    "present_position", "present_speed", "present_current", "present_load", "present_pwm", "voltage", "temperature",
-    "error_status", "moving", "moving_status", "realtime_tick", "velocity_trajectory", "position_trajectory",
-)  # fmt: skip
+    "present_position",
+    "present_speed",
+    "present_current",
+    "present_load",
+    "present_pwm",
+    "voltage",
+    "temperature",
+    "error_status",
+    "moving",
+    "moving_status",
+    "realtime_tick",
+    "velocity_trajectory",
+    "position_trajectory",
+)
 _PENDING: Final = ("registered_instruction", "registered", "async_write_flag")  # 1 from REG WRITE to ACTION
 
 

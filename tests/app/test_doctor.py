@@ -11,17 +11,7 @@ import typer
 
 from sfms_robot.app.servo.diagnosis import (
     Command,
-    Finding,
     Wanted,
-    grouped,
-    ids_text,
-    judge_adapter,
-    judge_duplicate_ids,
-    judge_opening,
-    judge_port,
-    judge_rate,
-    udev_rule,
-    wire_budget,
 )
 from sfms_robot.app.servo.doctor import Line, examine, examine_line
 from sfms_robot.app.servo.serial_line import Wire
@@ -31,23 +21,12 @@ from sfms_robot.config import Faults, Threshold, load_firmware_map, map_files
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
-from sfms_robot.servo.discovery import Holder, SerialDevice
 from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.port import SerialPort, VirtualTimePort
 from sfms_robot.servo.stored_settings import JointNeeds
 
 BAUD = 1_000_000
 COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
-
-
-def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
-    words = "write 19 return_delay_time 0"
-    assert COMMAND.servo(words, BAUD).endswith("--port /dev/ttyUSB0 --baud 1000000")
-    assert Command("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
-    assert Command("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
-    assert Command("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
-    two = Command("/dev/a", "feetech", "my face", "face=/dev/a,neck=/dev/b")
-    assert two.fix == "sfms-robot doctor --port face=/dev/a,neck=/dev/b --head 'my face' --fix"
 
 
 class Patient:
@@ -369,27 +348,6 @@ def test_a_port_that_somebody_holds_ends_in_three():
     assert report["exit_code"] == 3 and len(report["findings"]) >= 1
 
 
-def test_permissions_holders_and_latency_come_with_what_to_type():
-    denied = list(judge_port("/dev/ttyUSB0", "no permission to open it", "dialout", []))
-    assert denied[0].severity == "error" and denied[0].fix.startswith("sudo usermod -aG dialout $USER")
-    busy = list(judge_opening("/dev/ttyUSB0", "/dev/ttyUSB0: is held", [Holder(42, "python wizard.py")]))
-    assert busy[0].fix == "kill 42" and "wizard.py" in busy[0].problem
-    slow = SerialDevice("/dev/ttyUSB0", latency_ms=16, latency_file="/sys/bus/usb-serial/devices/ttyUSB0/latency_timer")
-    (finding,) = judge_adapter(slow, [])
-    assert finding.fix.startswith("echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer ")
-    assert list(judge_adapter(SerialDevice("/dev/ttyUSB0", latency_ms=1), [])) == []
-
-
-def test_a_udev_rule_names_the_adapter_and_sets_its_latency_timer():
-    ftdi = SerialDevice(
-        "/dev/ttyUSB0", vendor="0403", product="6014", serial="FT4TFS1T", driver="ftdi_sio", latency_file="/sys/x"
-    )
-    timer, name = udev_rule(ftdi).splitlines()
-    assert 'DRIVER=="ftdi_sio"' in timer and 'ATTR{latency_timer}="1"' in timer
-    assert 'ATTRS{serial}=="FT4TFS1T"' in name and 'SYMLINK+="servos-FT4TFS1T"' in name
-    assert udev_rule(SerialDevice("/dev/ttyS0")) is None
-
-
 # --- what servos have stored ------------------------------------------------------------------------------------
 
 
@@ -445,38 +403,6 @@ def test_without_a_head_an_offset_contradicts_nothing_and_is_left_alone():
 
 
 # --- the budget and the wording ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("wire", "blamed"),
-    [
-        ({"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}, "baud"),
-        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 16.0}, "adapter latency"),
-        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 1.0}, "return delay"),
-    ],
-)
-def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
-    budget = wire_budget("dynamixel2", 25, **wire, read_bytes=4)
-    (finding,) = judge_rate(budget, 100.0, False, COMMAND)
-    assert finding.severity == "warning" and f"({blamed} takes most)" in finding.problem
-
-
-def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
-    budget = wire_budget("dynamixel2", 28, 1_000_000, 500.0, 1.0, read_bytes=4)
-    assert next(judge_rate(budget, 100.0, True, COMMAND)).severity == "note"
-    assert next(judge_rate(budget, 100.0, False, COMMAND)).severity == "warning"
-
-
-def test_findings_alike_are_one_and_the_worst_come_first():
-    notes = [Finding("note", f"id {i}", "slow", "do {id}", i) for i in (3, 1, 2)]
-    out = grouped([*notes, *judge_duplicate_ids([7])])
-    assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
-    assert out[1].fix == "do 1-3"
-
-
-@pytest.mark.parametrize("ids", [[1], [1, 2, 3], [1, 3, 5], [9, 1, 2, 12, 11]])
-def test_ids_are_written_as_the_commands_take_them(ids):
-    assert checked_ids(ids_text(ids)) == sorted(ids)
 
 
 def test_every_command_that_is_proposed_is_one_that_the_program_has():

@@ -13,7 +13,7 @@ from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
-from sfms_robot.runtime.clock import RealClock, VirtualClock
+from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.stored_settings import JointNeeds, unique_turn
 
 GEAR = "ratio: 3.0\n    min_deg: -80\n    max_deg: 80"  # 2048 +- 2731 ticks
@@ -99,5 +99,5 @@ def test_its_emulated_servo_hangs_where_its_turn_is_certain(tmp_path, end_deg):
 
 def test_the_doctor_wants_its_mode(tmp_path):
     geared(tmp_path)
-    report = examine("sim", str(tmp_path / "geared"), None, None, RealClock())
+    report = examine("sim", str(tmp_path / "geared"), None, None)
     assert any("operating_mode is 3, wanted 4" in each["problem"] for each in report["findings"])

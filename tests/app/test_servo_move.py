@@ -33,6 +33,11 @@ class Watched:
         self.chain.time_is(self.clock.now_s())
         self.seen.append((self.clock.now_s(), self.chain.state(1)["position"]))
 
+    def fastest_deg_s(self, table):
+        steps = zip(self.seen, self.seen[1:], strict=False)
+        speeds = [abs(b - a) / (t - s) for (s, a), (t, b) in steps if t > s]
+        return max(speeds, default=0.0) * 360.0 / table.ticks_per_revolution
+
 
 def at(model, **more):
     return EmulatedServo(1, model, start_ticks=load_firmware_map(model).center_ticks, **more)
@@ -50,10 +55,7 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
         result = move(seen, None, str(by))
         assert abs(result["reached"] - (table.center_ticks + by)) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)
-        degrees = 360.0 / table.ticks_per_revolution
-        steps = zip(watched.seen, watched.seen[1:], strict=False)
-        speeds = [abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s]
-        assert max(speeds, default=0.0) <= 2.5 * SPEED_DEG_S
+        assert watched.fastest_deg_s(table) <= 2.5 * SPEED_DEG_S
 
 
 def test_a_servo_that_held_goes_on_holding():
@@ -112,9 +114,7 @@ def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, cap
         result = move(seen, str(table.center_ticks), None)
         assert abs(result["reached"] - table.center_ticks) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)
-        degrees = 360.0 / table.ticks_per_revolution
-        steps = zip(watched.seen, watched.seen[1:], strict=False)
-        assert max(abs(b - a) * degrees / (t - s) for (s, a), (t, b) in steps if t > s) <= 2.5 * SPEED_DEG_S
+        assert watched.fastest_deg_s(table) <= 2.5 * SPEED_DEG_S
     assert f"stands at {servo.start_ticks}, outside its own limits {first}.." in caplog.text
     assert "moving it inside at 20 deg/s" in caplog.text
 

@@ -5,14 +5,19 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire
+from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire, protocol_hint
 from sfms_robot.app.servo.single_servo import (
     checked_ids,
+    differences,
+    dump,
     factory_reset,
+    load_dump,
     parse_value,
     read_all,
     read_registers,
     reboot,
+    restore,
+    save_dump,
     scan,
     set_baud,
     set_id,
@@ -368,3 +373,89 @@ def test_an_unknown_family_lists_the_known_ones():
     with pytest.raises(ConfigError, match="dynamixel3.*dynamixel2, dynamixel1, feetech"):
         with open_wire("sim", "dynamixel3", None, "face28"):
             pass
+
+
+# --- dump and restore -------------------------------------------------------------------------------------------
+
+SET = {
+    "xl330-m288": ("dynamixel2", {"homing_offset": 120, "min_position_limit": 900, "current_limit": 800}),
+    "ax-12a": ("dynamixel1", {"cw_angle_limit": 200, "ccw_angle_limit": 800}),
+    "sts3215": ("feetech", {"homing_offset": -40, "max_position_limit": 3000}),
+}
+
+
+def new(servo, model, **registers):
+    return EmulatedServo(servo, model, start_ticks=load_firmware_map(model).center_ticks, registers=registers)
+
+
+@pytest.mark.parametrize("model", SET)
+def test_a_new_servo_becomes_the_old_one_and_keeps_its_own_id(model, tmp_path):
+    family, registers = SET[model]
+    with wire_on(new(1, model, **registers), new(2, model), family=family) as (wire, _):
+        save_dump(dump([wire.find(1)]), tmp_path / "servos.yaml")
+        (was,) = load_dump(tmp_path / "servos.yaml").servos
+        assert (was.id, was.model) == (1, model)
+        assert {name for name, *_ in differences(wire.find(2), was)} == set(registers)
+        rows = restore(wire.find(2), was, yes)
+        assert {row["register"]: row["raw"] for row in rows} == registers
+        assert differences(wire.find(2), was) == []
+
+
+def test_id_and_rate_come_along_only_when_asked_for(tmp_path):
+    with wire_on(EmulatedServo(5, baud=57_600)) as (wire, _):
+        kept = dump([wire.find(5)]).servos[0]
+    with wire_on(EmulatedServo(1)) as (wire, _):
+        assert restore(wire.find(1), kept, yes) == []
+        restore(wire.find(1), kept, yes, identity=True)
+        assert (wire.find(5).id, wire.baud) == (5, 57_600)
+
+
+def test_another_model_is_refused():
+    with wire_on(EmulatedServo(1), EmulatedServo(2, "xl330-m077")) as (wire, _):
+        kept = dump([wire.find(1)]).servos[0]
+        with pytest.raises(ConfigError, match="is not the model of the file"):
+            restore(wire.find(2), kept, yes)
+
+
+def test_nothing_is_written_unasked_or_under_torque():
+    with wire_on(EmulatedServo(1, registers={"homing_offset": 120}), EmulatedServo(2)) as (wire, _):
+        kept = dump([wire.find(1)]).servos[0]
+        with pytest.raises(ConfigError, match="not confirmed"):
+            restore(wire.find(2), kept, no)
+        put(wire, 2, "torque_enable", 1)
+        with pytest.raises(ServoError, match="has torque on"):
+            restore(wire.find(2), kept, yes)
+        assert [name for name, *_ in differences(wire.find(2), kept)] == ["homing_offset"]
+
+
+def test_a_file_that_is_there_is_not_overwritten(tmp_path):
+    file = tmp_path / "servos.yaml"
+    file.write_text("precious")
+    with wire_on(EmulatedServo(1)) as (wire, _):
+        with pytest.raises(ConfigError, match="is there already"):
+            save_dump(dump([wire.find(1)]), file)
+    assert file.read_text() == "precious"
+
+
+# --- another protocol -------------------------------------------------------------------------------------------
+
+SPOKEN = {"xl330-m288": "dynamixel2", "ax-12a": "dynamixel1", "sts3215": "feetech"}
+ASKED = ("dynamixel2", "dynamixel1", "feetech")
+
+
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize(("model", "baud"), [("xl330-m288", 57_600), ("ax-12a", 1_000_000), ("sts3215", 1_000_000)])
+def test_servos_of_another_protocol_are_named(model, baud, asked):
+    servos = [EmulatedServo(i, model, baud, load_firmware_map(model).center_ticks) for i in (1,)]
+    with wire_on(*servos, family=asked) as (wire, _):
+        before, began_s = wire.baud, wire.clock.now_s()
+        hint = protocol_hint(wire)
+        spoken = SPOKEN[model]
+        assert ("" if spoken == asked else f"--family {spoken}") in hint and bool(hint) == (spoken != asked)
+        assert wire.baud == before and wire.clock.now_s() - began_s < 3.0
+
+
+def test_an_empty_wire_gives_no_hint():
+    with wire_on(EmulatedServo(1, baud=4_000_000)) as (wire, chain):
+        chain.kill(1)
+        assert protocol_hint(wire) == ""

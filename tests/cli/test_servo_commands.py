@@ -10,6 +10,7 @@ import typer
 
 import sfms_robot
 from sfms_robot.cli.main import app
+from sfms_robot.cli.show_servo import print_table
 from sfms_robot.emulator.launch import EmulatedServo, launch
 
 
@@ -77,7 +78,7 @@ def test_watching_ends_after_the_samples_asked_for(run):
     ("words", "code", "problem"),
     [
         (("read", "1", "goal_postion"), 2, "present_position"),
-        (("read", "300", "led"), 2, "0..252"),
+        (("read", "254", "led"), 2, "0..252"),
         (("read", "one", "led"), 2, "list of ids"),
         (("ping", "9-1"), 2, "list of ids"),
         (("write", "1", "led", "2"), 2, "raw 0..1"),
@@ -131,3 +132,27 @@ def test_every_command_on_the_page_for_makers_is_one_that_the_program_has():
         while hasattr(command, "commands"):
             command = command.commands[words.pop(0)]
         command.make_context("sfms-robot", words)
+
+
+# --- tables: no row is cut, wherever it goes --------------------------------------------------------------------
+
+ROWS = [
+    {"id": 11, "joint": "a_joint_with_quite_a_long_name", "model": "xl330-m288", "faults": "input voltage, overload"},
+    {"id": 12, "joint": "a_second_joint", "model": "xl330-m288", "faults": "overheating, " * 8},
+]
+
+
+def test_what_reads_a_pipe_finds_whole_rows(capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    print_table(ROWS)
+    rows = capsys.readouterr().out.splitlines()
+    for row in ROWS:
+        assert any(all(str(value).strip() in line for value in row.values()) for line in rows)
+
+
+def test_a_narrow_terminal_folds_texts_and_keeps_numbers(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "50")
+    print_table(ROWS)
+    told = capsys.readouterr().out
+    assert "…" not in told and max(map(len, told.splitlines())) <= 50
+    assert "11" in told and "12" in told and told.count("overheating") >= 8

@@ -5,11 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.emulated_wire import Reply
 from sfms_robot.emulator.faults import KINDS, TO_SERVOS, Faults, parse_fault
 from sfms_robot.errors import ConfigError
 
-REPLY = Reply((3,), bytes(range(40)))
+SENDER, REPLY = (3,), bytes(range(40))
 
 
 @pytest.mark.parametrize(
@@ -64,40 +63,40 @@ def test_any_text_is_a_fault_or_a_config_error(text):
         return
 
 
-def spoilt(*specs: str, reply: Reply = REPLY, now_s: float = 0.0, seed: int = 0):
-    return Faults([parse_fault(spec) for spec in specs], seed).spoil(reply, now_s)
+def spoilt(*specs: str, servos=SENDER, now_s: float = 0.0, seed: int = 0):
+    return Faults([parse_fault(spec) for spec in specs], seed).spoil(servos, REPLY, now_s)
 
 
 def test_what_becomes_of_a_reply():
-    assert spoilt() == [(REPLY.data, 0.0)]
+    assert spoilt() == [(REPLY, 0.0)]
     assert spoilt("drop") == []
-    assert spoilt("duplicate") == [(REPLY.data, 0.0)] * 2
-    assert spoilt("delay=0.01") == [(REPLY.data, 0.01)]
+    assert spoilt("duplicate") == [(REPLY, 0.0)] * 2
+    assert spoilt("delay=0.01") == [(REPLY, 0.01)]
     [(short, _)] = spoilt("truncate")
-    assert REPLY.data.startswith(short) and len(short) < 40
+    assert REPLY.startswith(short) and len(short) < 40
     [(wrong, _)] = spoilt("corrupt")
-    assert len(wrong) == 40 and sum(a != b for a, b in zip(wrong, REPLY.data, strict=True)) == 1
-    assert spoilt("duplicate", "delay=0.01", "drop:4") == [(REPLY.data, 0.01)] * 2
+    assert len(wrong) == 40 and sum(a != b for a, b in zip(wrong, REPLY, strict=True)) == 1
+    assert spoilt("duplicate", "delay=0.01", "drop:4") == [(REPLY, 0.01)] * 2
 
 
 def test_faults_of_requests_and_of_replies_stay_apart():
     faults = Faults(map(parse_fault, ("request-drop", "request-delay=0.01", "drop:3")))
-    assert faults.spoil(REPLY, 0.0) == [] and faults.spoil(Reply((4,), b"x"), 0.0) == [(b"x", 0.0)]
-    assert faults.spoil(Reply((), b"x"), 0.0, TO_SERVOS) == []
+    assert faults.spoil(SENDER, REPLY, 0.0) == [] and faults.spoil((4,), b"x", 0.0) == [(b"x", 0.0)]
+    assert faults.spoil((), b"x", 0.0, TO_SERVOS) == []
     late = Faults(map(parse_fault, ("request-delay=0.01", "request-corrupt", "delay", "drop")))
-    [(wrong, late_s)] = late.spoil(REPLY, 0.0, TO_SERVOS)
-    assert late_s == 0.01 and sum(a != b for a, b in zip(wrong, REPLY.data, strict=True)) == 1
+    [(wrong, late_s)] = late.spoil(SENDER, REPLY, 0.0, TO_SERVOS)
+    assert late_s == 0.01 and sum(a != b for a, b in zip(wrong, REPLY, strict=True)) == 1
 
 
 def test_fault_is_only_there_in_its_time_and_for_its_ids():
     assert spoilt("drop@1-2", now_s=0.9) and not spoilt("drop@1-2", now_s=1.0) and spoilt("drop@1-2", now_s=2.0)
-    assert spoilt("drop:4") and not spoilt("drop:3") and not spoilt("drop:4", reply=Reply((1, 4), b"x"))
+    assert spoilt("drop:4") and not spoilt("drop:3") and not spoilt("drop:4", servos=(1, 4))
 
 
 def test_one_seed_throws_the_same_dice():
     def run(seed):
         faults = Faults([parse_fault("drop=0.5"), parse_fault("corrupt=0.5")], seed)
-        return [faults.spoil(REPLY, 0.01 * k) for k in range(200)]
+        return [faults.spoil(SENDER, REPLY, 0.01 * k) for k in range(200)]
 
     assert run(1) == run(1) != run(2)
     assert 60 < sum(not replies for replies in run(1)) < 140
@@ -116,4 +115,4 @@ def test_clearing_lets_go_what_goes_on():
     assert len(list(faults.edges(1.0))) == 2
     faults.clear(1.0)
     assert [(f.kind, began) for _, f, began in faults.edges(1.0)] == [("stuck", False), ("drop", False)]
-    assert faults.spoil(REPLY, 6.0) == [(REPLY.data, 0.0)] and faults.texts(6.0) == []
+    assert faults.spoil(SENDER, REPLY, 6.0) == [(REPLY, 0.0)] and faults.texts(6.0) == []

@@ -10,15 +10,11 @@ import pytest
 import serial
 from virtual_time import Time
 
-from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.servo.registers import Table
 
 POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
 BAUD = 1_000_000
@@ -255,24 +251,6 @@ def test_emulator_needs_no_heavy_library():
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
     assert "sfms_robot.emulator.servo_chains" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}
-
-
-@pytest.mark.parametrize(
-    ("model", "name", "value"),
-    [("ax-12a", "return_delay_time", 7), ("mx-28-1.0", "ccw_angle_limit", 3000), ("sts3215", "homing_offset", -30),
-     ("scs0009", "max_position_limit", 900)],
-)  # fmt: skip
-def test_what_somebody_stored_is_there_in_the_older_families_too(model, name, value):
-    table = Table.of(load_firmware_map(model))
-    servo = EmulatedServo(1, model, start_ticks=table.center_ticks, registers={name: value}, supply_v=20.0)
-    with launch([servo], virtual=True) as chain:
-        port = VirtualTimePort(chain.device, chain.control, servo.baud, VirtualClock())
-        link = {"dynamixel": Dynamixel1Link, "feetech": FeetechLink}[table.family](port, servo.baud, 0.003)
-        answer = link.read(1, table[name].address, table[name].size)
-        link.port.close()
-        assert table[name].from_bytes(answer.data) == value
-        assert "voltage" in table.status_fault_names(answer.error)
-        assert round(chain.state(1)["position"]) == table.center_ticks
 
 
 def test_link_of_an_emulator_that_was_killed_is_taken_away(tmp_path):

@@ -171,12 +171,6 @@ def test_sts_is_calibrated_where_it_stands(how):
     assert device.servo(1).plant.position == 3100
 
 
-def test_stored_registers_are_there_at_the_start():
-    device = chain_of("sts3215", registers={"homing_offset": 100, "lock": 1}, supply_v=6.0)
-    assert (get(device, 1, "homing_offset"), get(device, 1, "present_voltage")) == (100, 60)
-    assert get(device, 1, "present_position") == 2048  # where its position stands, offset and all
-
-
 def test_profile_speed_and_acceleration_are_kept():
     device = chain_of("sts3215")
     put(device, 1, "goal_velocity", 100)

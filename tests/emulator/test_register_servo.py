@@ -41,6 +41,23 @@ def test_a_loss_of_supply_is_silence_and_then_a_start_without_torque_and_turns(m
     assert bench.get("present_position") == 700 and bench.servo.state(1.0)["position"] == pytest.approx(700)
 
 
+STORED = {
+    "xl330-m288": {"homing_offset": 500},
+    "ax-12a": {"return_delay_time": 7},
+    "mx-28-1.0": {"ccw_angle_limit": 3000},
+    "sts3215": {"homing_offset": -30},
+    "scs0009": {"max_position_limit": 900},
+}
+
+
+@pytest.mark.parametrize("model", STORED)
+def test_stored_values_and_the_supply_are_there_at_the_start(model):
+    bench = ServoBench(model, supply_v=20.0, **STORED[model])
+    assert {name: bench.get(name) for name in STORED[model]} == STORED[model] and bench.get("voltage") == 200
+    assert bench.get("present_position") == bench.table.center_ticks  # a homing offset counted in
+    assert "voltage" in bench.servo.state(0.0)["faults"]
+
+
 @given(st.sampled_from(FAMILIES), st.integers(0, 255), st.binary(min_size=1, max_size=12))
 def test_any_write_is_survived(model, address, data):
     servo = ServoBench(model).servo

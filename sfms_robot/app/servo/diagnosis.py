@@ -7,7 +7,7 @@ good to know or is corrected by the run itself.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from shlex import quote
 from typing import Any, Final, Literal, cast
 
@@ -49,6 +49,7 @@ class Finding:
     about: str
     problem: str
     fix: str = ""
+    _: KW_ONLY
     servo: int | None = None
 
     def plain(self) -> dict[str, Any]:
@@ -195,15 +196,15 @@ def judge_presence(
             if want.model_number is not None and seen.model_number not in (None, want.model_number):
                 said = f"the head says {want.model} ({want.model_number})"
                 fix = "two cables swapped, or the head's file names the wrong model or id"
-                yield Finding("error", about, f"{seen.model} ({seen.model_number}) answers, {said}", fix, servo)
+                yield Finding("error", about, f"{seen.model} ({seen.model_number}) answers, {said}", fix, servo=servo)
         elif servo in elsewhere:
             rate = elsewhere[servo].baud
             fix = command.servo(f"set-baud {{id}} {baud}", rate)
-            yield Finding("error", about, f"set to {rate} baud, the head says {baud}", fix, servo)
+            yield Finding("error", about, f"set to {rate} baud, the head says {baud}", fix, servo=servo)
         else:
             look, change = command.servo("scan"), command.servo("set-id OLD NEW")
             fix = f"check its cable; if it has another id: {look}, then {change}"
-            yield Finding("error", about, "no answer, at any rate", fix, servo)
+            yield Finding("error", about, "no answer, at any rate", fix, servo=servo)
     for servo, seen in sorted({**elsewhere, **here}.items()):
         if wanted and servo not in wanted:
             problem = f"{seen.model} at {seen.baud} baud is not in the head's file"
@@ -215,7 +216,7 @@ def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
     for servo in ids:
         problem = "two servos seem to answer to this id (or the wire is disturbed)"
         fix = f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW"
-        yield Finding("error", f"id {servo}", problem, fix, servo)
+        yield Finding("error", f"id {servo}", problem, fix, servo=servo)
 
 
 # --- one servo --------------------------------------------------------------------------------------------------
@@ -238,7 +239,7 @@ def judge_servo(state: State, want: Wanted | None, command: Command) -> Iterator
         _stored(state, want, command),
     ):
         for severity, problem, fix in judged:
-            yield Finding(severity, about, problem, fix, seen.id)
+            yield Finding(severity, about, problem, fix, servo=seen.id)
 
 
 def _firmware(seen: FoundServo, table: Table) -> Judged:

@@ -49,12 +49,13 @@ from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.boards import RateLimitedPort
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
+from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import family_named, servo_families
+from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
-from sfms_robot.servo.stored_settings import JointNeeds
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_RATE_HZ: Final = 100.0
@@ -207,25 +208,32 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
 
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
+    """Return the servos of a bus as the head's file describes them, by id."""
     from sfms_robot.app.wiring import calibration_of, firmware_maps
 
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    maps, ranges = firmware_maps(joints), calibration_of(joints)
-    ids = frozenset(joint.id for joint in joints.values())
-    found = {}
-    for (name, joint), low, high in zip(joints.items(), ranges.low_ticks, ranges.high_ticks, strict=True):
-        safety = head.safety_of(name)
-        bounded = safety.current_limit_mA is not None
-        found[joint.id] = Wanted(
+    maps = firmware_maps(joints)
+    servos = [
+        BusServo(
             joint=name,
-            model=joint.model,
-            model_number=maps[joint.model].model_number,
-            faults=head.faults,
-            needs=JointNeeds(
-                int(low), int(high), stored=safety.stored, other_ids=ids - {joint.id}, bounded_current=bounded
-            ),
+            id=joint.id,
+            map=maps[joint.model],
+            min_rad=joint.min_rad,
+            max_rad=joint.max_rad,
+            safety=head.safety_of(name),
         )
-    return found
+        for name, joint in joints.items()
+    ]
+    return {
+        servo.id: Wanted(
+            joint=servo.joint,
+            model=joints[servo.joint].model,
+            model_number=servo.map.model_number,
+            faults=head.faults,
+            needs=needs,
+        )
+        for servo, needs in zip(servos, needs_of(servos, calibration_of(joints)), strict=True)
+    }
 
 
 # --- a chain of servos ----------------------------------------------------------------------------------------------
@@ -256,7 +264,7 @@ def _look(
         except ServoError as error:
             level = seen.table.role("status_level") if seen.table else None
             cure = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
-            findings.append(Finding("error", f"id {seen.id}", str(error), cure, seen.id))
+            findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
     findings += judge_duplicate_ids(double)
     for state in states:
         findings += judge_servo(state, line.wanted.get(state.seen.id), command)

@@ -30,9 +30,15 @@ _STEP_S: Final = 0.1
 _RESETS: Final = {"all": 0xFF, "keep-id": 1, "keep-id-and-baud": 2}
 _LONGEST: Final = 128  # bytes of one read
 _WATCHED: Final = (
-    "torque_enable", "error_status", "present_position", "present_speed", "present_load", "present_current", "voltage",
+    "torque_enable",
+    "error_status",
+    "present_position",
+    "present_speed",
+    "present_load",
+    "present_current",
+    "voltage",
     "temperature",
-)  # fmt: skip
+)
 
 
 def no_progress(done: int, total: int, what: str) -> None:

@@ -1,0 +1,141 @@
+"""Findings without a wire: what to type, and the wire budget against packets and figures of real chains."""
+
+from dataclasses import asdict
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sfms_robot.app.servo.diagnosis import (
+    Command,
+    Finding,
+    grouped,
+    ids_text,
+    judge_adapter,
+    judge_duplicate_ids,
+    judge_opening,
+    judge_port,
+    judge_rate,
+    udev_rule,
+    wire_budget,
+)
+from sfms_robot.app.servo.single_servo import checked_ids
+from sfms_robot.servo.codecs import dxl2
+from sfms_robot.servo.discovery import Holder, SerialDevice
+
+BAUD = 1_000_000
+COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
+FACTORY = {"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}
+TUNED = {"baud": 1_000_000, "return_delay_us": 0.0, "latency_ms": 1.0}
+
+
+@given(servos=st.integers(1, 40), read=st.integers(1, 20), write=st.sampled_from([2, 4]))
+def test_bytes_are_those_of_the_packets(servos, read, write):
+    ids = bytes(range(1, servos + 1))
+    head = bytes([116, 0, write, 0])
+    goals = dxl2.encode_instruction(
+        dxl2.BROADCAST, dxl2.SYNC_WRITE, head + b"".join(bytes([i]) + bytes(write) for i in ids)
+    )
+    ask = dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_READ, bytes([132, 0, read, 0]) + ids)
+    answers = servos * len(dxl2.encode_status(1, 0, bytes(read)))
+    fast = len(dxl2.encode_fast_status([(i, 0, bytes(read)) for i in ids]))
+    budget = wire_budget("dynamixel2", servos, **TUNED, read_bytes=read, write_bytes=write)
+    assert budget.write_only.bytes == len(goals)
+    assert budget.plain.bytes == len(goals) + len(ask) + answers
+    assert budget.fast.bytes == len(goals) + len(ask) + fast
+
+
+@pytest.mark.parametrize(
+    ("servos", "wire", "ms"),
+    [
+        (9, FACTORY, 58.2),
+        (25, FACTORY, 124.5),
+        (9, {**FACTORY, "baud": 1_000_000}, 22.7),
+        (25, {**FACTORY, "baud": 1_000_000}, 34.0),
+        (9, TUNED, 3.2),
+        (25, TUNED, 6.5),
+    ],
+)
+def test_figures_of_a_sync_read_and_a_sync_write_of_four_bytes(servos, wire, ms):
+    assert wire_budget("dynamixel2", servos, **wire, read_bytes=4).plain.ms == pytest.approx(ms, abs=0.06)
+
+
+def test_fast_sync_read_spares_the_return_delays_and_most_of_the_headers():
+    for servos, ms in ((9, 2.6), (25, 4.9)):
+        budget = wire_budget("dynamixel2", servos, **TUNED, read_bytes=4)
+        assert budget.fast.ms == pytest.approx(ms, abs=0.05) and budget.fast.hz > budget.plain.hz
+
+
+def test_single_reads_pay_the_adapter_once_per_servo():
+    slow = wire_budget("dynamixel1", 9, 1_000_000, 500.0, 16.0, read_bytes=2, write_bytes=2)
+    assert slow.plain.ms == pytest.approx(150, abs=0.5) and slow.fast is None
+    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2, together=False).plain.ms > 9 * 16
+    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2).plain.ms < 18
+
+
+def test_budget_is_rounded_and_complete():
+    plain = asdict(wire_budget("dynamixel2", 28, **TUNED, read_bytes=10))
+    assert plain["plain"]["bytes"] == 14 + 28 * 5 + 14 + 28 + 28 * 21 and plain["fast"]["hz"] > plain["plain"]["hz"]
+
+
+def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
+    words = "write 19 return_delay_time 0"
+    assert COMMAND.servo(words, BAUD).endswith("--port /dev/ttyUSB0 --baud 1000000")
+    assert Command("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
+    assert Command("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
+    assert Command("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
+    two = Command("/dev/a", "feetech", "my face", "face=/dev/a,neck=/dev/b")
+    assert two.fix == "sfms-robot doctor --port face=/dev/a,neck=/dev/b --head 'my face' --fix"
+
+
+def test_permissions_holders_and_latency_come_with_what_to_type():
+    denied = list(judge_port("/dev/ttyUSB0", "no permission to open it", "dialout", []))
+    assert denied[0].severity == "error" and denied[0].fix.startswith("sudo usermod -aG dialout $USER")
+    busy = list(judge_opening("/dev/ttyUSB0", "/dev/ttyUSB0: is held", [Holder(42, "python wizard.py")]))
+    assert busy[0].fix == "kill 42" and "wizard.py" in busy[0].problem
+    slow = SerialDevice("/dev/ttyUSB0", latency_ms=16, latency_file="/sys/bus/usb-serial/devices/ttyUSB0/latency_timer")
+    (finding,) = judge_adapter(slow, [])
+    assert finding.fix.startswith("echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer ")
+    assert list(judge_adapter(SerialDevice("/dev/ttyUSB0", latency_ms=1), [])) == []
+
+
+def test_a_udev_rule_names_the_adapter_and_sets_its_latency_timer():
+    ftdi = SerialDevice(
+        "/dev/ttyUSB0", vendor="0403", product="6014", serial="FT4TFS1T", driver="ftdi_sio", latency_file="/sys/x"
+    )
+    timer, name = udev_rule(ftdi).splitlines()
+    assert 'DRIVER=="ftdi_sio"' in timer and 'ATTR{latency_timer}="1"' in timer
+    assert 'ATTRS{serial}=="FT4TFS1T"' in name and 'SYMLINK+="servos-FT4TFS1T"' in name
+    assert udev_rule(SerialDevice("/dev/ttyS0")) is None
+
+
+@pytest.mark.parametrize(
+    ("wire", "blamed"),
+    [
+        ({"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}, "baud"),
+        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 16.0}, "adapter latency"),
+        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 1.0}, "return delay"),
+    ],
+)
+def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
+    budget = wire_budget("dynamixel2", 25, **wire, read_bytes=4)
+    (finding,) = judge_rate(budget, 100.0, False, COMMAND)
+    assert finding.severity == "warning" and f"({blamed} takes most)" in finding.problem
+
+
+def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
+    budget = wire_budget("dynamixel2", 28, 1_000_000, 500.0, 1.0, read_bytes=4)
+    assert next(judge_rate(budget, 100.0, True, COMMAND)).severity == "note"
+    assert next(judge_rate(budget, 100.0, False, COMMAND)).severity == "warning"
+
+
+def test_findings_alike_are_one_and_the_worst_come_first():
+    notes = [Finding("note", f"id {i}", "slow", "do {id}", servo=i) for i in (3, 1, 2)]
+    out = grouped([*notes, *judge_duplicate_ids([7])])
+    assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
+    assert out[1].fix == "do 1-3"
+
+
+@pytest.mark.parametrize("ids", [[1], [1, 2, 3], [1, 3, 5], [9, 1, 2, 12, 11]])
+def test_ids_are_written_as_the_commands_take_them(ids):
+    assert checked_ids(ids_text(ids)) == sorted(ids)
