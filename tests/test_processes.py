@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections import deque
 from pathlib import Path
 
 import pytest
@@ -160,16 +159,13 @@ def test_messages_are_answered_and_the_last_one_is_the_exit_code(start):
 
 
 def test_messages_that_are_not_fetched_are_dropped_oldest_first_and_signs_of_life_are_no_messages(start):
+    came = []
+    start(counts, take=came.append).reader.join()
+    assert came == [*range(50), Ended(0)]
     child = start(counts, most=10)
     child.reader.join()
     assert [child.receive() for _ in range(10)] == [*range(41, 50), Ended(0)]
     assert child.dropped == 50 + 1 - 10 and child.receive() is None
-
-
-def test_a_callback_receives_each_message_and_the_end(start):
-    came = deque()
-    start(counts, take=came.append).reader.join()
-    assert [*came] == [*range(50), Ended(0)]
 
 
 @pytest.mark.parametrize("end", [lambda child: child.close(CLOSE_S), Child.kill])
@@ -288,7 +284,7 @@ def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
     assert waiting.supervised.restarts == 0
 
 
-def test_pauses_double_up_to_the_longest_and_begin_again_after_steady_running():
+def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_row_are_logged_once(caplog):
     limits = LIMITS["source"]
     watched, paused_s = Watched(limits), []
     for _ in range(2000):  # days without a camera
@@ -296,18 +292,10 @@ def test_pauses_double_up_to_the_longest_and_begin_again_after_steady_running():
         paused_s.append(watched.until(lambda child: child.phase == "starting"))
     assert paused_s[:6] == [0.5, 1.0, 2.0, 4.0, 8.0, 8.0] and set(paused_s[6:]) == {limits.longest_pause_s}
     watched.supervised.enter("running")
+    assert [each.getMessage() for each in caplog.records] == ["test: gone; restarting", "test: running again"]
     assert watched.until(lambda child: child.phase_s > limits.steady_s + 0.2, alive=True)
     watched.supervised.fail("gone")
     assert watched.until(lambda child: child.phase == "starting") == limits.pause_s
-
-
-def test_failures_in_a_row_are_logged_once_and_once_when_it_runs_again(caplog):
-    watched = Watched(LIMITS["source"])
-    for _ in range(3):
-        watched.supervised.fail("gone")
-        watched.until(lambda child: child.phase == "starting")
-    watched.supervised.enter("running")
-    assert [each.getMessage() for each in caplog.records] == ["test: gone; restarting", "test: running again"]
 
 
 def test_a_process_that_cannot_be_started_counts_as_another_failure():

@@ -70,7 +70,7 @@ class Figures:
         deadline_s: promised from a frame to its plan.
         heads: streams at this moment.
         most_heads: number of heads that could be answered in time; None where all are admitted.
-        misses: plans later than the deadline.
+        deadline_misses: plans later than the deadline.
         delays_s, batch_sizes: of the last plans, and of the last batches.
         cost_scale: by how much batches take longer than measured at the start; None where that was not measured.
         cpu_s: processor time of its process.
@@ -83,11 +83,11 @@ class Figures:
     heads: int = 0
     most_heads: int | None = None
     plans: int = 0
-    misses: int = 0
+    deadline_misses: int = 0
     batches: int = 0
     steps: int = 0
-    skipped: int = 0
-    lost: int = 0
+    skipped_frames: int = 0
+    lost_frames: int = 0
     refused: int = 0
     malformed: int = 0
     delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
@@ -96,32 +96,34 @@ class Figures:
     cpu_s: float = 0.0
 
 
+_COUNTS: Final = (
+    "heads",
+    "plans",
+    "deadline_misses",
+    "batches",
+    "steps",
+    "skipped_frames",
+    "lost_frames",
+    "refused",
+    "malformed",
+)
+
+
 def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
     """Return the statistics of `serve`; `parts` are the processes of one server, one at least."""
     first = parts[0]
-
-    def total(name: str) -> int:
-        return sum(getattr(each, name) for each in parts)
-
+    counts = {name: sum(getattr(each, name) for each in parts) for name in _COUNTS}
     scales = [each.cost_scale for each in parts if each.cost_scale is not None]
     return {
         "server": first.server,
         "listener": first.listener,
         "hop": first.hop,
         "processes": len(parts),
-        "heads": total("heads"),
-        "most_heads": None if first.most_heads is None else total("most_heads"),
-        "plans": total("plans"),
+        **counts,
+        "most_heads": None if first.most_heads is None else sum(each.most_heads or 0 for each in parts),
         "deadline_ms": first.deadline_s * 1e3,
-        "deadline_misses": total("misses"),
         "delay_ms": _spread([delay_s * 1e3 for each in parts for delay_s in each.delays_s]),
-        "batches": total("batches"),
         "batch_size": _spread([size for each in parts for size in each.batch_sizes]),
-        "steps": total("steps"),
-        "skipped_frames": total("skipped"),
-        "lost_frames": total("lost"),
-        "refused": total("refused"),
-        "malformed": total("malformed"),
         "cost_scale": round(max(scales), 3) if scales else None,
         "cpu_s": round(sum(each.cpu_s for each in parts), 3),
     }
@@ -306,7 +308,7 @@ class StreamServer:
             gap = sent.number - stream.expected
             if gap < 0:
                 return []  # it came late, and an empty one has taken its place; or twice
-            self.counts.lost += gap
+            self.counts.lost_frames += gap
             for back in range(min(gap, MOST_FILLED), 0, -1):
                 empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, _EMPTY)
                 filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
@@ -317,7 +319,7 @@ class StreamServer:
             return []
         left_out = len(stream.waiting) - 1
         stream.waiting = deque([stream.waiting[-1]])
-        self.counts.skipped += left_out
+        self.counts.skipped_frames += left_out
         return [words_message(Notice("skipped", frames=left_out))]
 
     def _due(self, sent: SentFrame, now_s: float) -> _Due:
@@ -381,7 +383,7 @@ class StreamServer:
 
     def _planned(self, delay_s: float) -> None:
         self.counts.plans += 1
-        self.counts.misses += delay_s > self._deadline_s
+        self.counts.deadline_misses += delay_s > self._deadline_s
         self.counts.delays_s.append(delay_s)
 
     def _weigh(self, plans: int, steps: int, step_s: float) -> None:

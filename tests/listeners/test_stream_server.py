@@ -92,7 +92,7 @@ def test_memory_of_a_stream_is_bounded_and_what_is_left_out_is_told():
         notices += server.receive(stream, frame(number), 0.0)
     assert len(server._streams[stream].waiting) <= MOST_WAITING
     left_out = sum(parse_words(each).frames for each in notices)
-    assert left_out == server.counts.skipped == 500 - len(server._streams[stream].waiting)
+    assert left_out == server.counts.skipped_frames == 500 - len(server._streams[stream].waiting)
 
 
 def test_frames_that_come_late_or_twice_are_not_stepped_twice():
@@ -101,7 +101,7 @@ def test_frames_that_come_late_or_twice_are_not_stepped_twice():
     for number in (0, 2, 1, 2, 3):
         server.receive(stream, frame(number), 0.0)
     stepped(server)
-    assert server._streams[stream].memory == (0, 4) and server.counts.lost == 1
+    assert server._streams[stream].memory == (0, 4) and server.counts.lost_frames == 1
 
 
 def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():

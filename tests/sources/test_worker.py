@@ -7,10 +7,9 @@ import pytest
 
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.processes import LIMITS
-from sfms_robot.sources.worker import MOST_WAITING, SourceWorker
+from sfms_robot.sources.worker import SourceWorker
 
 SILENT_S = LIMITS["source"].silent_s["running"]
-START_LIMIT_S = LIMITS["source"].silent_s["starting"]
 PAUSE_S = LIMITS["source"].pause_s
 
 
@@ -88,13 +87,6 @@ def test_values_come_in_their_order_and_a_worker_that_returns_is_not_started_aga
     assert worker.statistics() == {"state": "finished", "restarts": 0, "dropped": 0}
 
 
-def test_values_that_are_not_fetched_are_dropped_oldest_first_and_counted(start):
-    worker = start(counts, MOST_WAITING)
-    worker._supervised.child.reader.join()
-    assert worker.messages(0.0) == list(range(2, MOST_WAITING))  # and two messages of the end
-    assert worker.statistics()["dropped"] == 2
-
-
 @pytest.mark.parametrize(("work", "error", "text"), [
     (refuses, ConfigError, "^no such thing$"),
     (needs_an_extra, MissingExtra, r"pip install 'sfms-robot\[parts\]'"),
@@ -131,20 +123,6 @@ def test_a_silent_worker_is_named_once_and_started_again_with_the_newest_message
         f"test: no sign of life for {1.1 * SILENT_S:.1f} s; restarting",
         "test: running again",
     ]
-
-
-def test_a_worker_that_does_not_start_counts_as_silent_after_a_minute(start):
-    worker = start(never_starts)
-    worker.messages(0.0)
-    worker.messages(0.9 * START_LIMIT_S)
-    assert worker.statistics()["state"] == "starting"
-    worker.messages(1.1 * START_LIMIT_S)
-    assert worker.statistics()["state"] == "lost"
-
-
-def never_starts(_):
-    threading.Event().wait()
-    yield
 
 
 def test_a_worker_that_breaks_is_reported(start, caplog):

@@ -72,10 +72,10 @@ def test_log_odds_are_finite_whatever_comes(values):
         assert np.isfinite(bank.log_odds(bank.contributions(np.array(values)))).all()
 
 
-def test_the_largest_terms_are_told(tables):
+def test_the_largest_terms_are_returned(tables):
     bank, evidence = HazardBank(tables.hazards), rows(3)[0]
     given_terms = bank.contributions(evidence)
-    told = bank.told(given_terms, "nod")
+    told = bank.largest(given_terms, "nod")
     assert 1 <= len(told) <= 4 and set(told) <= set(tables.hazards["nod"].weights)
     assert list(np.abs(list(told.values()))) == sorted(np.abs(list(told.values())), reverse=True)
 
