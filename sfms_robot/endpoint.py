@@ -52,7 +52,7 @@ def host_and_port(text: str, least: int = 0) -> tuple[str, int] | None:
     return host.strip("[]") if colon else LOOPBACK, port
 
 
-def shown(host: str, port: int) -> str:
+def address_text(host: str, port: int) -> str:
     """Return an address as people write it: an IPv6 host in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 

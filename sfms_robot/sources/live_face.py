@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, host_and_port, is_address, is_loopback, shown
+from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, address_text, host_and_port, is_address, is_loopback
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import (
     BLENDSHAPES,
@@ -381,7 +381,7 @@ class UdpSight:
             self._say(str(error), packet.sender)
             return
         if self._sender is None:
-            logger.info("%s: packets come from %s", self._kind, shown(*packet.sender[:2]))
+            logger.info("%s: packets come from %s", self._kind, address_text(*packet.sender[:2]))
             self._refusal_said = False
             self._face.forget()
         self._sender, self._heard_s, self._hint = packet.sender, time_s, None
@@ -391,7 +391,7 @@ class UdpSight:
 
     def statistics(self) -> dict[str, Any]:
         """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
-        sender = None if self._sender is None else shown(*self._sender[:2])
+        sender = None if self._sender is None else address_text(*self._sender[:2])
         return {**self._counts, "errors": self._socket.errors, "sender": sender, **self._decoder.statistics()}
 
     def close(self) -> None:
@@ -401,14 +401,16 @@ class UdpSight:
     def _refuse(self, sender: Address) -> None:
         self._counts["refused"] += 1
         if not self._refusal_said and self._sender is not None:
-            first = shown(*self._sender[:2])
+            first = address_text(*self._sender[:2])
             text = "%s: %s sends too and is refused until %s is silent for %g s (said once)"
-            logger.warning(text, self._kind, shown(*sender[:2]), first, SILENT_S)
+            logger.warning(text, self._kind, address_text(*sender[:2]), first, SILENT_S)
             self._refusal_said = True
 
     def _say(self, reason: str, sender: Address) -> None:
         if reason not in self._said and len(self._said) < _REASONS_SAID:
-            logger.warning("%s: packets of %s are left out: %s (said once)", self._kind, shown(*sender[:2]), reason)
+            logger.warning(
+                "%s: packets of %s are left out: %s (said once)", self._kind, address_text(*sender[:2]), reason
+            )
             self._said.add(reason)
 
 

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 
-from sfms_robot.endpoint import LOOPBACK, host_and_port, is_loopback, shown, token_admits
+from sfms_robot.endpoint import LOOPBACK, address_text, host_and_port, is_loopback, token_admits
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, POSE_CHANNELS, Floats, Sighting
 from sfms_robot.sources.live_face import LiveFace
@@ -161,7 +161,7 @@ class NetPerson:
         self._intake = Intake(now)
         self._server = NetServer(flag, host, port, self)
         self.token = None if is_loopback(self.address[0]) else secrets.token_urlsafe(12)
-        at = shown(*self.address)
+        at = address_text(*self.address)
         logger.warning(
             "%s: tcp://%s and ws://%s%s", flag, at, at, "" if self.token is None else f", token {self.token}"
         )

@@ -32,7 +32,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
-from sfms_robot.endpoint import listen, origin_problem, shown
+from sfms_robot.endpoint import address_text, listen, origin_problem
 from sfms_robot.errors import PacketError
 from sfms_robot.sources.net_messages import LONGEST, Message, json_message, parse_message
 
@@ -157,7 +157,7 @@ class NetProgram:
     """
 
     def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.name = shown(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
+        self.name = address_text(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
         self.greeted, self.malformed = False, 0
         self.wants: frozenset[str] = frozenset()
         self._server, self._reader, self._writer = server, reader, writer

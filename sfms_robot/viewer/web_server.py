@@ -38,7 +38,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from sfms_robot.endpoint import LOOPBACK, host_problem, is_loopback, listen, origin_problem, port_number, shown
+from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, is_loopback, listen, origin_problem, port_number
 from sfms_robot.errors import ConfigError, InputError, RobotError
 from sfms_robot.viewer.page_process import Address
 
@@ -219,7 +219,7 @@ class LocalServer:
     ) -> None:
         self._socket = listen(flag, host, port, others)
         self.port: int = self._socket.getsockname()[1]
-        self.url = f"http://{shown(host, self.port)}/"
+        self.url = f"http://{address_text(host, self.port)}/"
         self.note = "" if port in (0, self.port) else f" ({port} is taken)"
         self._document: Document = dict
         app = application(routes(lambda: self._document()))
@@ -291,7 +291,7 @@ def listen_at(address: Address) -> ListeningSocket:
     token = None if is_loopback(host) else secrets.token_urlsafe(12)
     name = f"{socket.gethostname().partition('.')[0]}.local" if host in ("0.0.0.0", "::") else host
     scheme = "http" if address.certificate is None else "https"
-    url = f"{scheme}://{shown(name, port)}/" + ("" if token is None else f"?token={token}")
+    url = f"{scheme}://{address_text(name, port)}/" + ("" if token is None else f"?token={token}")
     return ListeningSocket(listening, url, token, None if address.port in (0, port) else address.port)
 
 
