@@ -29,7 +29,7 @@ import numpy as np
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
-from sfms_robot.frames import Floats
+from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
@@ -74,9 +74,46 @@ class Engine(Protocol):
 
 
 class RunsOnEngine:
-    """A listener whose networks an engine runs."""
+    """A `ports.BatchListener` whose networks an engine runs. It has no state but the weights, held by the engine."""
 
     engine: Engine
+
+    def _stepped(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], controls: Sequence[Floats | None] | None
+    ) -> Sequence[tuple[Plan | None, Any]]:
+        """Move N streams one frame on; with a single speaker, all of them had the same from the start."""
+        raise NotImplementedError
+
+    def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]:
+        """Take one frame; return a Plan where one is due, and the next memory. Never changes `memory` in place.
+
+        `control`: rows of `signals.control`, as many as `control_frames` says up to this frame and after it; None
+        without events, and for a frame that brings no plan.
+
+        Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
+        """
+        return self._stepped([speaker], [memory], None if control is None else [control])[0]
+
+    def step_each(
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[Any],
+        controls: Sequence[Floats | None] | None = None,
+    ) -> list[tuple[Plan | None, Any]]:
+        """Step several streams, see `ports.BatchListener`; controls as of `step`."""
+        if len(speakers) != len(memories):
+            raise ValueError(f"{len(speakers)} frames for {len(memories)} streams")
+        return [*self._stepped(speakers, memories, controls)]
+
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats | None] | None = None
+    ) -> tuple[list[Plan], list[Any]]:
+        """Step streams that began together with the same speaker; return their plans, none where none is due.
+
+        As `step_each`, but features of the speaker are computed once.
+        """
+        found = self._stepped([speaker], memories, controls)
+        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
     def standardise(self, motion: Floats) -> Floats:
         """Return motion (..., C) of the motion space in the units of the model."""

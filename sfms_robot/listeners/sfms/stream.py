@@ -99,7 +99,7 @@ class SfmsMemory:
 
 
 class SfmsListener(RunsOnEngine):
-    """A `ports.BatchListener`. It has no state but the weights, which its engine holds (networks: `model.networks`)."""
+    """SFMS as a stream; its engine runs `model.networks`."""
 
     def __init__(
         self,
@@ -199,47 +199,13 @@ class SfmsListener(RunsOnEngine):
         """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
 
-    def step(
-        self, speaker: SpeakerFrame, memory: SfmsMemory, control: Floats | None = None
-    ) -> tuple[Plan | None, SfmsMemory]:
-        """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
-
-        `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None
-        without events, and for a frame that brings no plan.
-
-        Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
-        """
-        return self.step_each([speaker], [memory], [control])[0]
-
-    def step_each(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        memories: Sequence[SfmsMemory],
-        controls: Sequence[Floats | None] | None = None,
-    ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Step several streams, see `ports.BatchListener`; controls as of `step`. Those due are planned together."""
-        heard = [_listened(*each) for each in zip(speakers, [memory.speaker for memory in memories], strict=True)]
-        return self._stepped(speakers, heard, memories, controls)
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None = None
-    ) -> tuple[list[Plan], list[SfmsMemory]]:
-        """Step streams that began together with the same speaker; return their plans, none between hops.
-
-        As `step_each`, but features of the speaker are computed once.
-        """
-        heard = [_listened(speaker, memories[0].speaker)] * len(memories)
-        found = self._stepped([speaker] * len(memories), heard, memories, controls)
-        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
-
     def _stepped(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        heard: Sequence[SpeakerState],
-        memories: Sequence[SfmsMemory],
-        controls: Sequence[Floats | None] | None,
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None
     ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Move every stream one frame on; `heard` are their speakers with the new frame."""
+        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together."""
+        heard = [_listened(speaker, memory.speaker) for speaker, memory in zip(speakers, memories, strict=False)]
+        if len(speakers) < len(memories):
+            speakers, heard = [*speakers] * len(memories), heard * len(memories)
         found: list[tuple[Plan | None, SfmsMemory]] = [
             (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
             for memory, speaker in zip(memories, heard, strict=True)
