@@ -33,6 +33,7 @@ from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
+Examples = Mapping[str, Mapping[str, Array]]  # inputs of every network, by the names of network and input
 
 KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
 ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
@@ -63,8 +64,8 @@ class Engine(Protocol):
         """
         ...
 
-    def build_graphs(self) -> None:
-        """Make calls for a single stream as fast as possible; the weights must not change from now on.
+    def build_graphs(self, examples: Examples) -> None:
+        """Make calls for a single stream, as in `examples`, as fast as possible; the weights must not change any more.
 
         Takes a second with torch, nothing with onnx.
         """
@@ -129,9 +130,13 @@ class RunsOnEngine:
             name = self.engine.name
             raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
 
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        raise NotImplementedError
+
     def build_graphs(self) -> Self:
         """Build the engine's graphs and return this listener."""
-        self.engine.build_graphs()
+        self.engine.build_graphs(self.examples(1))
         return self
 
 
@@ -260,7 +265,7 @@ class OnnxEngine:
         precision = " int8" if self._graphs.in_integers else ""
         return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
 
-    def build_graphs(self) -> None:
+    def build_graphs(self, examples: Examples) -> None:
         """Do nothing: the networks are graphs already."""
 
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:

@@ -26,7 +26,7 @@ from sfms_robot.config.arig import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
-from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
 from sfms_robot.listeners.sway import HeadSway
@@ -170,6 +170,13 @@ REMEMBERED: Final = (
 )
 
 
+FRAME_INPUTS: Final = (
+    *("sounds", "heard", "voiced", "face", "seen", "first", "state", "rotary", "view"),
+    *REMEMBERED,
+    "rows",
+)
+
+
 class BothPeople(NamedTuple):
     """One frame of both people, of N streams.
 
@@ -235,6 +242,22 @@ class ArigListener(RunsOnEngine):
             sojourn=Sojourn(FIRST, 0),
             sway=self.sway.start(seed),
         )
+
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        memories, rows = [self.start(seed) for seed in range(streams)], self._rows(None, streams)
+        heard = self._hear([SpeakerFrame(0.0, np.zeros(0, np.float32))] * streams, memories)
+        inputs = self._frame_inputs(heard, memories, rows)
+        past = [f"{part}_{layer}" for layer in range(self.settings.context_layers) for part in ("keys", "values")]
+        draw = {
+            "z": self.engine.run("frame", *inputs)[0],
+            "noise": np.zeros((streams, *self._noise_shape), np.float32),
+            **{name: _stacked(memories, name) for name in ("standard", "motion_keys")},
+        }
+        if self.settings.events:
+            draw |= {"rows": rows, "speaks": heard.voiced[:, 0]}
+        frame = dict(zip((*FRAME_INPUTS, *past), inputs, strict=True))
+        return {"rest": {"still": memories[0].standard[None]}, "frame": frame, "draw": draw}
 
     def condition(
         self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None

@@ -32,7 +32,7 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.audio_frontend import AudioFrontend, AudioState, check_length
-from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
 from sfms_robot.listeners.sfms.draw import (
     UNDECIDED,
     CodeReach,
@@ -41,6 +41,7 @@ from sfms_robot.listeners.sfms.draw import (
     Sampler,
     Tokens,
     around,
+    last_keyframes,
     later,
     neutral_mask,
     passed,
@@ -194,6 +195,25 @@ class SfmsListener(RunsOnEngine):
         """Return tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
+
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        p, start = self.settings.past_frames, [self.start(seed) for seed in range(streams)]
+        tokens, control = (np.stack([getattr(memory, name) for memory in start]) for name in ("tokens", "control"))
+        parts = ("face", "face_known", "voice", "heard", "phase")
+        speaker = {name: np.stack([getattr(memory.speaker, name) for memory in start]) for name in parts}
+        recent = last_keyframes(tokens)
+        last, at = recent.tokens, recent.at
+        now = {"last": last[:, p - 1], "at": at[:, p - 1], "frame": np.full(streams, p - 1)}
+        return {
+            "rest": {"still": self._still(p)[None], "mask": neutral_mask(p, tokens.shape[2])[None]},
+            "hear": {"rows": np.stack([np.tile(memory.speaker.rows, (2, 1)) for memory in start])},
+            "ahead": speaker | {"tokens": tokens, "control": control, "last": last, "at": at},
+            "next": {"slots": speaker["voice"][:, 0], **now},
+            "decode": dict(
+                zip(("tokens", "before", "after", "rows", "seen", "places"), (tokens, *around(tokens)), strict=True)
+            ),
+        }
 
     def is_due(self, memory: SfmsMemory) -> bool:
         """Return whether the next frame brings a plan."""
