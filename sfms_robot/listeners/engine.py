@@ -29,10 +29,11 @@ import numpy as np
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
-from sfms_robot.frames import Floats
+from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
+Examples = Mapping[str, Mapping[str, Array]]  # inputs of every network, by the names of network and input
 
 KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
 ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
@@ -63,8 +64,8 @@ class Engine(Protocol):
         """
         ...
 
-    def build_graphs(self) -> None:
-        """Make calls for a single stream as fast as possible; the weights must not change from now on.
+    def build_graphs(self, examples: Examples) -> None:
+        """Make calls for a single stream, as in `examples`, as fast as possible; the weights must not change any more.
 
         Takes a second with torch, nothing with onnx.
         """
@@ -74,9 +75,46 @@ class Engine(Protocol):
 
 
 class RunsOnEngine:
-    """A listener whose networks an engine runs."""
+    """A `ports.BatchListener` whose networks an engine runs. It has no state but the weights, held by the engine."""
 
     engine: Engine
+
+    def _stepped(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], controls: Sequence[Floats | None] | None
+    ) -> Sequence[tuple[Plan | None, Any]]:
+        """Move N streams one frame on; with a single speaker, all of them had the same from the start."""
+        raise NotImplementedError
+
+    def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]:
+        """Take one frame; return a Plan where one is due, and the next memory. Never changes `memory` in place.
+
+        `control`: rows of `signals.control`, as many as `control_frames` says up to this frame and after it; None
+        without events, and for a frame that brings no plan.
+
+        Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
+        """
+        return self._stepped([speaker], [memory], None if control is None else [control])[0]
+
+    def step_each(
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[Any],
+        controls: Sequence[Floats | None] | None = None,
+    ) -> list[tuple[Plan | None, Any]]:
+        """Step several streams, see `ports.BatchListener`; controls as of `step`."""
+        if len(speakers) != len(memories):
+            raise ValueError(f"{len(speakers)} frames for {len(memories)} streams")
+        return [*self._stepped(speakers, memories, controls)]
+
+    def step_many(
+        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats | None] | None = None
+    ) -> tuple[list[Plan], list[Any]]:
+        """Step streams that began together with the same speaker; return their plans, none where none is due.
+
+        As `step_each`, but features of the speaker are computed once.
+        """
+        found = self._stepped([speaker], memories, controls)
+        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
 
     def standardise(self, motion: Floats) -> Floats:
         """Return motion (..., C) of the motion space in the units of the model."""
@@ -92,9 +130,13 @@ class RunsOnEngine:
             name = self.engine.name
             raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
 
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        raise NotImplementedError
+
     def build_graphs(self) -> Self:
         """Build the engine's graphs and return this listener."""
-        self.engine.build_graphs()
+        self.engine.build_graphs(self.examples(1))
         return self
 
 
@@ -223,7 +265,7 @@ class OnnxEngine:
         precision = " int8" if self._graphs.in_integers else ""
         return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
 
-    def build_graphs(self) -> None:
+    def build_graphs(self, examples: Examples) -> None:
         """Do nothing: the networks are graphs already."""
 
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:

@@ -180,6 +180,13 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     return F.scaled_dot_product_attention(q, k, v)
 
 
+def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
+    """Return full attention (N, T, D) of q (N, T, D) over k, v (N, S, D)."""
+    if torch.compiler.is_exporting():
+        return exported_attention(q, k, v, heads)
+    return join_heads(attend(*(split_heads(each, heads) for each in (q, k, v))))
+
+
 class FeedForward(PlainModule):
     """Widen to `hidden`, GELU, narrow."""
 
@@ -265,13 +272,7 @@ class CrossAttention(PlainModule):
 
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:
         """Return (N, D) of x (N, D) looking at keys (N, slots, 2D)."""
-        query, told = self.query(self.norm(x))[:, None], keys + self.slots
-        if torch.compiler.is_exporting():
-            k, v = told.chunk(2, dim=-1)
-            seen = exported_attention(query, k, v, self.heads)
-        else:
-            k, v = split_heads(told, 2 * self.heads).chunk(2, dim=1)
-            seen = join_heads(attend(split_heads(query, self.heads), k, v))
-        x = x + self.out(seen[:, 0])
+        query, (k, v) = self.query(self.norm(x))[:, None], (keys + self.slots).chunk(2, dim=-1)
+        x = x + self.out(attention(query, k, v, self.heads)[:, 0])
         out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out

@@ -22,10 +22,9 @@ from torch import Tensor, nn
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array
-from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, digest
+from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Examples, digest
 
 Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
-Examples = Mapping[str, Mapping[str, Tensor]]  # of their inputs, by network and name
 
 WARM_UPS: Final = 3  # torch.jit specialises a graph in its first two runs
 MODEL: Final = "model."  # before the name of a weight, in every network
@@ -40,14 +39,13 @@ class TorchEngine:
     Args:
         model: `tensors` shows its current state.
         networks: of the model.
-        examples: inputs for one stream, from which graphs are traced.
     """
 
-    def __init__(self, model: nn.Module, networks: Networks, examples: Examples) -> None:
+    def __init__(self, model: nn.Module, networks: Networks) -> None:
         self.model = model.eval()
         state = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
         self.tensors = {name: value.detach().numpy() for name, value in state.items() if not value.is_quantized}
-        self._networks, self._examples = networks, examples
+        self._networks = networks
         self._graphs: dict[str, Callable[..., Any]] = {}
 
     @property
@@ -56,14 +54,14 @@ class TorchEngine:
         return "torch"
 
     @torch.inference_mode()
-    def build_graphs(self) -> None:
+    def build_graphs(self, examples: Examples) -> None:
         """Trace every network for a single stream: a small model takes a fifth less time. The weights must not change.
 
         Sizes that a module turns into Python numbers stay those of the example. torch.jit is being retired; what takes
         its place needs a C++ compiler on the machine that runs.
         """
-        for name, named in self._examples.items():
-            network, example = self._networks[name].eval(), tuple(named.values())
+        for name, inputs in examples.items():
+            network, example = self._networks[name].eval(), _tensors(inputs.values())
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 traced = torch.jit.trace(network, example, check_trace=False)  # type: ignore[no-untyped-call]
@@ -74,13 +72,18 @@ class TorchEngine:
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `engine.Engine.run`."""
-        tensors = [torch.from_numpy(each if each.flags.writeable else each.copy()) for each in inputs]
+        tensors = _tensors(inputs)
         module = self._graphs.get(network) if max(map(len, tensors)) == 1 else None
         return tuple(output.numpy() for output in (module or self._networks[network])(*tensors))
 
     def set_threads(self, threads: int) -> None:
         """Use this many threads in the whole process: torch has no other setting."""
         torch.set_num_threads(threads)
+
+
+def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
+    """Return arrays as tensors of the same memory; read-only ones, which torch does not know, are copied."""
+    return tuple(torch.from_numpy(each if each.flags.writeable else each.copy()) for each in arrays)
 
 
 # --- Export -----------------------------------------------------------------------------------------------------------
@@ -119,9 +122,10 @@ def export(
     layers = list(integers)
     graphs: dict[str, Any] = {}
     for name, network in networks.items():
+        example = dict(zip(examples[name], _tensors(examples[name].values()), strict=True))
         with torch.no_grad():
-            network(*examples[name].values())  # fills caches, which must not be traced
-            graphs[name] = _graph(network.eval(), examples[name], several=name != ONE_STREAM)
+            network(*example.values())  # fills caches, which must not be traced
+            graphs[name] = _graph(network.eval(), example, several=name != ONE_STREAM)
         if layers:
             graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
     state: dict[str, Tensor] = next(iter(networks.values())).get_submodule("model").state_dict()

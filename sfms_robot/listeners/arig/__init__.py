@@ -46,11 +46,11 @@ def load_model(folder: Path) -> ArigModel:
 
 def torch_engine(settings: config.Arig, model: ArigModel) -> TorchEngine:
     """Return an engine for a model in memory, in the precision of the settings. Imports torch; raises ModelError."""
-    from sfms_robot.listeners.arig.networks import examples, networks, with_precision
+    from sfms_robot.listeners.arig.networks import networks, with_precision
     from sfms_robot.listeners.torch_engine import TorchEngine
 
     quick = with_precision(model, settings.precision).eval()
-    return TorchEngine(quick, networks(quick), examples(settings, 1))
+    return TorchEngine(quick, networks(quick))
 
 
 def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
@@ -59,10 +59,12 @@ def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     Imports torch. `int8`: write graphs with large layers in 8 bits as well as those in 32.
     """
     from sfms_robot.listeners.arig.model import ArigModel
-    from sfms_robot.listeners.arig.networks import examples, large_layers, networks
-    from sfms_robot.listeners.torch_engine import EXAMPLE_STREAMS, export
+    from sfms_robot.listeners.arig.networks import large_layers, networks
+    from sfms_robot.listeners.torch_engine import EXAMPLE_STREAMS, TorchEngine, export
 
     settings = checkpoint.config_of(folder, config.Arig)
     model = ArigModel(settings).eval()
+    wanted = networks(model, kept=False)
+    listener = ArigListener(settings, TorchEngine(model, wanted))
     layers = large_layers(model) if int8 else []
-    return export(out, settings, networks(model, kept=False), examples(settings, EXAMPLE_STREAMS), layers)
+    return export(out, settings, wanted, listener.examples(EXAMPLE_STREAMS), layers)

@@ -209,8 +209,8 @@ class ArigModel(nn.Module):
             return self.rho * last  # ours, because errors are forgotten at the rate of the data
         before, now = rows.chunk(2, dim=-1)
         off = last - event_curves.features(before) @ self.told  # x_(t-1) - b_(t-1)
-        kept = self.rho * event_curves.remains(before, now, self.moves)  # rho f_t
-        return event_curves.features(now) @ self.told + kept * off
+        # b_t + rho f_t (x_(t-1) - b_(t-1))
+        return event_curves.features(now) @ self.told + self.rho * event_curves.remains(before, now, self.moves) * off
 
     def moved(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
         """Return the draw (..., C) that leads to motion (..., C) after `last` (..., C), both standardised.

@@ -27,8 +27,7 @@ from sfms_robot.listeners.layers import (
     Linear,
     Modulation,
     PlainModule,
-    attend,
-    exported_attention,
+    attention,
     join_heads,
     modulated,
     split_heads,
@@ -114,11 +113,8 @@ class Integrated(PlainModule):
 
 def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
     """Return full self-attention of (N, S, 3D) for the first `wanted` of S tokens, or all (N, wanted, D)."""
-    if torch.compiler.is_exporting():
-        q, k, v = qkv.chunk(3, dim=-1)
-        return exported_attention(q[:, :wanted], k, v, heads)
-    q, k, v = split_heads(qkv, 3 * heads).chunk(3, dim=1)
-    return join_heads(attend(q[:, :, :wanted], k, v))
+    q, k, v = qkv.chunk(3, dim=-1)
+    return attention(q[:, :wanted], k, v, heads)
 
 
 class ShortRange(PlainModule):
@@ -178,8 +174,9 @@ class ContextLayer(PlainModule):
         `rotary`: (2, T, D/h) or (2, B, 1, 1, D/h).
         """
         qkv = split_heads(self.qkv(self.norm(x)), 3 * self.heads)
-        both, (cosine, sine) = qkv.narrow(1, 0, 2 * self.heads), rotary.unbind(0)
+        both = qkv.narrow(1, 0, 2 * self.heads)
         first, second = both.chunk(2, dim=-1)  # the two coordinates of each plane
+        cosine, sine = rotary.unbind(0)
         q, k = torch.addcmul(both * cosine, torch.cat([second, first], dim=-1), sine).chunk(2, dim=1)
         return q, k, qkv.narrow(1, 2 * self.heads, self.heads)
 
@@ -224,8 +221,8 @@ class LongRange(nn.Module):
 
         Frame t belongs to chunk t // c, and the last of its frames makes the summary that stays.
         """
-        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each of its frames makes a new
-        # summary, as a stream refreshes it; later chunks see only that of its last frame.
+        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each frame makes a new summary,
+        # as a stream refreshes it; later chunks see only that of its last frame.
         t = summaries.shape[1]
         frame = torch.arange(t, device=summaries.device)
         of = frame // self.chunk

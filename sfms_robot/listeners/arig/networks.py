@@ -12,21 +12,17 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot import config
 from sfms_robot.errors import ModelError
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sampler import Denoiser
-from sfms_robot.listeners.arig.stream import CONTROL_ROWS
-from sfms_robot.listeners.audio_frontend import WIDTHS
 from sfms_robot.listeners.layers import PlainModule
-from sfms_robot.signals.control import COLUMNS
 
 
 class RestNetwork(PlainModule):
@@ -169,45 +165,6 @@ def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
 def networks(model: ArigModel, kept: bool = True) -> dict[str, PlainModule]:
     """Return all networks by name. `kept`: see `DrawNetwork`."""
     return {"rest": RestNetwork(model), "frame": FrameNetwork(model), "draw": DrawNetwork(model, kept)}
-
-
-def examples(settings: config.Arig, streams: int) -> Mapping[str, dict[str, Tensor]]:
-    """Return inputs of every network for this many streams, by the names of network and input."""
-    n, d, h, chunk, channels = streams, settings.width, settings.heads, settings.chunk_frames, len(settings.channels)
-    room = settings.context_chunks - 1
-    told = d + d * settings.events + channels * (settings.draws == "innovation")
-    motion_keys = torch.zeros(n, settings.motion_frames, 2 * d)
-    names = [f"{part}_{layer}" for layer in range(settings.context_layers) for part in ("keys", "values")]
-    frame = {
-        "sounds": torch.zeros(n, 2, WIDTHS[settings.sound]),
-        "heard": torch.ones(n, 2, dtype=torch.bool),
-        "voiced": torch.zeros(n, 2, dtype=torch.bool),
-        "face": torch.zeros(n, channels),
-        "seen": torch.ones(n, dtype=torch.bool),
-        "first": torch.zeros(n, dtype=torch.bool),
-        "state": torch.zeros(n, dtype=torch.long),
-        "rotary": torch.zeros(n, 2, d // h),
-        "view": torch.ones(n, room, dtype=torch.bool),
-        "agent_sound": torch.zeros(n, d),
-        "agent_behaviour": torch.zeros(n, chunk, d),
-        "user_behaviour": torch.zeros(n, chunk, d),
-        "sound_keys": torch.zeros(n, settings.sound_frames, 2 * d),
-        "motion": torch.zeros(n, d),
-        "motion_keys": motion_keys,
-        "sample": torch.zeros(n, channels),
-        "rows": torch.zeros(n, CONTROL_ROWS * len(COLUMNS) * settings.events),
-        **{name: torch.zeros(n, h, room, d // h) for name in names},
-    }
-    noise = (1, 1) if settings.discrete else (settings.diffusion.steps, channels)
-    draw = {
-        "z": torch.zeros(n, told),
-        "noise": torch.zeros(n, *noise),
-        "standard": torch.zeros(n, channels),
-        "motion_keys": motion_keys.clone(),
-    }
-    if settings.events:
-        draw |= {"rows": torch.zeros(n, CONTROL_ROWS * len(COLUMNS)), "speaks": torch.zeros(n, dtype=torch.bool)}
-    return {"rest": {"still": torch.zeros(1, channels)}, "frame": frame, "draw": draw}
 
 
 # --- Large layers in 8 bits -------------------------------------------------------------------------------------------

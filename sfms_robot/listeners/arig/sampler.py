@@ -119,8 +119,7 @@ class Denoiser(nn.Module):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
         if levels is None:
             levels = self.level(torch.tensor(self.levels, device=z.device))
-        # Ours, for speed: the modulation of every step in one product, the noisiest last; of a single sample as
-        # vectors.
+        # Ours, for speed: the modulation of all steps in one product, the noisiest last; of a single sample as vectors.
         told = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
         kinds = self.modulation.parts
         parts = (told if n > 1 else told[0]).chunk(k * kinds, dim=-1)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
-from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
@@ -71,7 +71,7 @@ def with_feedback(states: NDArray[Any], rows: Floats) -> NDArray[Any]:
 
 
 def draw_sojourn(
-    durations: Floats, possible: Floats, logits: Floats, voiced: tuple[bool, bool], before: Sojourn, uniforms: Doubles
+    durations: Floats, possible: Floats, logits: Floats, voiced: NDArray[np.bool_], before: Sojourn, uniforms: Doubles
 ) -> Sojourn:
     """Draw the state of a frame.
 
@@ -81,7 +81,7 @@ def draw_sojourn(
     Args:
         durations, possible: of `modules.StateUnderstanding`.
         logits: (S,) of the frame.
-        voiced: speech of agent and user, as the model takes it.
+        voiced: (2,) speech of agent and user, as the model takes it.
         before: that of the frame before.
         uniforms: (2,) in 0..1: which state, and for how long.
     """
@@ -170,31 +170,33 @@ REMEMBERED: Final = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class BothPeople:
-    """One frame of both people.
+FRAME_INPUTS: Final = (
+    *("sounds", "heard", "voiced", "face", "seen", "first", "state", "rotary", "view"),
+    *REMEMBERED,
+    "rows",
+)
+
+
+class BothPeople(NamedTuple):
+    """One frame of both people, of N streams.
 
     Attributes:
-        sounds: (2, A) features of user and agent; present: (2,) which of them there are.
-        face: (C,) the user's, standardised; seen: whether there is one.
-        user_voice, agent_voice: audio states after the frame.
+        sounds: (N, 2, A) features of user and agent; present: (N, 2) which of them there are.
+        voiced: (N, 2) whether agent and user speak.
+        face: (N, C) the user's, standardised; seen: (N,) whether there is one.
+        voices: of each stream the audio states of user and agent after the frame.
     """
 
     sounds: Floats
     present: NDArray[np.bool_]
+    voiced: NDArray[np.bool_]
     face: Floats
-    seen: bool
-    user_voice: AudioState
-    agent_voice: AudioState
-
-    @property
-    def voiced(self) -> tuple[bool, bool]:
-        """Return whether agent and user speak."""
-        return self.agent_voice.voiced, self.user_voice.voiced
+    seen: NDArray[np.bool_]
+    voices: list[tuple[AudioState, AudioState]]
 
 
 class ArigListener(RunsOnEngine):
-    """A `ports.BatchListener`. It has no state but the weights, which its engine holds (`networks`)."""
+    """ARIG as a stream; its engine runs `networks`."""
 
     hop = horizon = 1
 
@@ -241,30 +243,21 @@ class ArigListener(RunsOnEngine):
             sway=self.sway.start(seed),
         )
 
-    def step(self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None) -> tuple[Plan, ArigMemory]:
-        """Take one frame, plan the next. Never changes `memory` in place.
-
-        `control` (2, K): rows of `signals.control` of the frame taken and of the next; None: no events. Raises
-        ValueError when the frame holds another number of samples than 640 or none, for control of another shape, and
-        for any where the listener has no events.
-        """
-        return self._stepped([speaker], [memory], None if control is None else [control])[0]
-
-    def step_each(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats] | None = None
-    ) -> list[tuple[Plan | None, ArigMemory]]:
-        """Step several streams, see `ports.BatchListener`; controls as of `step`."""
-        return [*self._stepped(speakers, memories, controls)]
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[ArigMemory], controls: Sequence[Floats] | None = None
-    ) -> tuple[list[Plan], list[ArigMemory]]:
-        """Step streams that began together with the same speaker, each with its own control.
-
-        As `step_each`, but features of the speaker are computed once.
-        """
-        found = self._stepped([speaker], memories, controls)
-        return [plan for plan, _ in found], [memory for _, memory in found]
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        memories, rows = [self.start(seed) for seed in range(streams)], self._rows(None, streams)
+        heard = self._hear([SpeakerFrame(0.0, np.zeros(0, np.float32))] * streams, memories)
+        inputs = self._frame_inputs(heard, memories, rows)
+        past = [f"{part}_{layer}" for layer in range(self.settings.context_layers) for part in ("keys", "values")]
+        draw = {
+            "z": self.engine.run("frame", *inputs)[0],
+            "noise": np.zeros((streams, *self._noise_shape), np.float32),
+            **{name: _stacked(memories, name) for name in ("standard", "motion_keys")},
+        }
+        if self.settings.events:
+            draw |= {"rows": rows, "speaks": heard.voiced[:, 0]}
+        frame = dict(zip((*FRAME_INPUTS, *past), inputs, strict=True))
+        return {"rest": {"still": memories[0].standard[None]}, "frame": frame, "draw": draw}
 
     def condition(
         self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None
@@ -275,23 +268,21 @@ class ArigListener(RunsOnEngine):
         return z, now
 
     def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats] | None
-    ) -> list[tuple[Plan, ArigMemory]]:
-        """Move every stream one frame on; a single speaker of several streams is theirs from the start."""
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats | None] | None
+    ) -> list[tuple[Plan | None, ArigMemory]]:
+        """Move every stream one frame on; each plans its next frame."""
         rows = self._rows(controls, len(memories))
-        heard = self._hear(speakers, memories[: len(speakers)])
-        if len(heard) < len(memories):
-            heard = heard * len(memories)
+        heard = self._hear(speakers, memories)
         # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         z, logits, now = self._conditions(heard, memories, rows)
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
-        told = [rows, np.array([one.voiced[0] for one in heard])] if self.settings.events else []
+        told = [rows, heard.voiced[:, 0]] if self.settings.events else []
         made, *drawn = self.engine.run("draw", *inputs, *told)
         newest = np.array([memory.frames for memory in now])
         shown = self.sway.added(made[:, None].copy(), _stacked(now, "sway"), newest)
         sojourns, states = self._states(logits, now, rows, heard)
-        out = []
+        out: list[tuple[Plan | None, ArigMemory]] = []
         for index, memory in enumerate(now):
             time_s = speakers[min(index, len(speakers) - 1)].time_s
             frames, jaw_rad = self.space.decode(shown[index])
@@ -303,22 +294,22 @@ class ArigListener(RunsOnEngine):
         return out
 
     def _conditions(
-        self, heard: Sequence[BothPeople], memories: Sequence[ArigMemory], rows: Floats
+        self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats
     ) -> tuple[Floats, Floats, list[ArigMemory]]:
         """Return the sampler's inputs (N, its width), logits of the states (N, S), and memories without its draws."""
         z, logits, made, *rest = self.engine.run("frame", *self._frame_inputs(heard, memories, rows))
         after = []
-        for index, (one, memory) in enumerate(zip(heard, memories, strict=True)):
+        for index, ((user, agent), memory) in enumerate(zip(heard.voices, memories, strict=True)):
             frames, context = memory.frames + 1, memory.context
             if frames % self.settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
                 context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
             own = dict(zip(REMEMBERED[:4], (part[index] for part in rest), strict=True))
-            voices = {"user_voice": one.user_voice, "agent_voice": one.agent_voice}
+            voices = {"user_voice": user, "agent_voice": agent}
             after.append(changed(memory, **own, **voices, frames=frames, context=context))
         return z, logits, after
 
     def _states(
-        self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, heard: Sequence[BothPeople]
+        self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, heard: BothPeople
     ) -> tuple[list[Sojourn], list[int]]:
         """Return states of the frame that is made: the most probable, or drawn where the model has events."""
         before = [memory.sojourn for memory in now]
@@ -329,13 +320,13 @@ class ArigListener(RunsOnEngine):
         durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
         # Ours: a state lasts as long as in the data, and feedback that is seen comes from the events.
         sojourns = [
-            draw_sojourn(durations, possible, scores, one.voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
-            for scores, one, last, own in zip(logits, heard, before, now, strict=True)
+            draw_sojourn(durations, possible, scores, voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
+            for scores, voiced, last, own in zip(logits, heard.voiced, before, now, strict=True)
         ]
         drawn = np.array([sojourn.state for sojourn in sojourns])
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
-    def _rows(self, controls: Sequence[Floats] | None, streams: int) -> Floats:
+    def _rows(self, controls: Sequence[Floats | None] | None, streams: int) -> Floats:
         """Return control as (streams, 2K); (streams, 0) without events."""
         if not self.settings.events:
             if controls is not None:
@@ -349,39 +340,31 @@ class ArigListener(RunsOnEngine):
             raise ValueError(f"control is {rows.shape[1:]} of {len(rows)}, not {wanted} of {streams}")
         return rows.reshape(streams, -1)
 
-    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> list[BothPeople]:
-        """Return both people in the newest frame of each stream."""
-        samples, voices = [], []
-        for speaker, memory in zip(speakers, memories, strict=True):
-            samples += [speaker.audio, fit_frame(speaker.agent_audio)]
-            voices += [memory.user_voice, memory.agent_voice]
-        sounds, present, voices = hear_each(samples, voices)
-        found = []
-        for at, speaker in zip(range(0, len(samples), 2), speakers, strict=True):
+    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> BothPeople:
+        """Return both people in the newest frame of each stream; a single speaker is that of all streams."""
+        samples = [track for one in speakers for track in (one.audio, fit_frame(one.agent_audio))]
+        before = [voice for memory in memories[: len(speakers)] for voice in (memory.user_voice, memory.agent_voice)]
+        sounds, present, after = hear_each(samples, before)
+        voices = list(zip(after[::2], after[1::2], strict=True))
+        face = np.zeros((len(speakers), len(self.settings.channels)), np.float32)
+        seen = np.zeros(len(speakers), np.bool_)
+        for row, speaker in enumerate(speakers):
             # A face that is not finite or beyond all faces is not seen: the memory would keep it.
             motion = None if speaker.face is None else speaker.face.motion
-            seen = motion is not None and bool(np.abs(motion).max() < BEYOND)  # false for NaN too
-            face = np.zeros(len(self.settings.channels), np.float32)
-            if motion is not None and seen:
-                face = self.standardise(self.space.encode(motion[None]))[0]
-            here = np.array(present[at : at + 2])
-            both = {"user_voice": voices[at], "agent_voice": voices[at + 1]}
-            found.append(BothPeople(sounds=sounds[at : at + 2], present=here, face=face, seen=seen, **both))
-        return found
+            if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
+                face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
+        voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
+        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
+        streams = len(memories) // len(speakers)
+        return BothPeople(*(np.repeat(part, streams, axis=0) for part in parts), voices * streams)
 
-    def _frame_inputs(
-        self, heard: Sequence[BothPeople], memories: Sequence[ArigMemory], rows: Floats
-    ) -> list[NDArray[Any]]:
+    def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
         """Return the inputs of the network `frame`."""
         settings = self.settings
         frames = np.array([memory.frames for memory in memories])
         chunks, room = frames // settings.chunk_frames, settings.context_chunks - 1
         return [
-            _stacked(heard, "sounds"),
-            _stacked(heard, "present"),
-            np.array([one.voiced for one in heard]),
-            _stacked(heard, "face"),
-            np.array([one.seen for one in heard]),
+            *heard[:5],
             frames == 0,
             np.array([memory.state for memory in memories]),
             rotary(chunks, settings.width // settings.heads),

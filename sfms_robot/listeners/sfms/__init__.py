@@ -45,10 +45,10 @@ def load_model(folder: Path) -> SfmsModel:
 
 def torch_engine(settings: config.Sfms, model: SfmsModel) -> TorchEngine:
     """Return an engine for a model in memory. Imports torch."""
-    from sfms_robot.listeners.sfms.model import examples, networks
+    from sfms_robot.listeners.sfms.model import networks
     from sfms_robot.listeners.torch_engine import TorchEngine
 
-    return TorchEngine(model, networks(model, settings), examples(settings, 1))
+    return TorchEngine(model, networks(model, settings))
 
 
 def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
@@ -56,8 +56,12 @@ def export_graphs(folder: Path, out: Path, int8: bool = False) -> list[Path]:
 
     Imports torch. `int8` changes nothing: layers of this size gain nothing from it.
     """
-    from sfms_robot.listeners.sfms.model import SfmsModel, examples, networks
-    from sfms_robot.listeners.torch_engine import EXAMPLE_STREAMS, export
+    from sfms_robot.listeners.sfms.model import SfmsModel, networks
+    from sfms_robot.listeners.torch_engine import EXAMPLE_STREAMS, TorchEngine, export
 
     settings = checkpoint.config_of(folder, config.Sfms)
-    return export(out, settings, networks(SfmsModel(settings).eval(), settings), examples(settings, EXAMPLE_STREAMS))
+    model = SfmsModel(settings).eval()
+    wanted = networks(model, settings)
+    frontend = AudioFrontend(settings.audio, settings.phase)  # without the model of wav2vec2: nothing is heard
+    listener = SfmsListener(settings, TorchEngine(model, wanted), frontend=frontend)
+    return export(out, settings, wanted, listener.examples(EXAMPLE_STREAMS))

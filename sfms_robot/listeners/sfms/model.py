@@ -10,9 +10,8 @@ B batch or streams, T frames, P past and H future frames, C channels, G groups, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -21,14 +20,12 @@ from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.listeners.layers import Block, sinusoidal
-from sfms_robot.listeners.sfms.draw import KEYS_STEP, UNDECIDED, LastKeyframes, around, neutral_mask
+from sfms_robot.listeners.sfms.draw import LastKeyframes, neutral_mask
 from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place
 from sfms_robot.listeners.sfms.predictor import Context, Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import COLUMNS
-from sfms_robot.signals.phase import FEATURES
 
 UNMEASURED = 1e6  # deviations a frame: a speed that does not bound anything
 
@@ -325,35 +322,3 @@ def networks(model: SfmsModel, settings: config.Sfms) -> dict[str, Network]:
     """Return all networks by name."""
     kinds = {"rest": Rest, "hear": Hear, "ahead": Ahead, "next": Next, "decode": Decode}
     return {name: kind(model, settings).eval() for name, kind in kinds.items()}
-
-
-def examples(settings: config.Sfms, streams: int) -> Mapping[str, dict[str, Tensor]]:
-    """Return inputs of every network for this many streams, by the names of network and input."""
-    b, p, window, width = streams, settings.past_frames, settings.window_frames, settings.predictor_width
-    channels, groups, (rows, bins) = len(settings.channels), len(settings.groups), SHAPES[settings.audio]
-    tokens = torch.zeros(b, window, groups, dtype=torch.long)
-    recent = torch.zeros(b, window, groups, 2, dtype=torch.long)
-    keyframes = np.ones((b, window, groups), np.int64)
-    keyframes[:, KEYS_STEP:] = 0
-    return {
-        "rest": {"still": torch.zeros(1, p, channels), "mask": torch.zeros(1, p, groups)},
-        "hear": {"rows": torch.zeros(b, 2 * rows, bins)},
-        "ahead": {
-            "face": torch.zeros(b, p, channels),
-            "face_known": torch.ones(b, p, dtype=torch.bool),
-            "voice": torch.zeros(b, p, width),
-            "heard": torch.ones(b, p, dtype=torch.bool),
-            "phase": torch.zeros(b, p, FEATURES * settings.phase),
-            "tokens": torch.cat([tokens[:, :p], torch.full((b, settings.future_frames, groups), UNDECIDED)], dim=1),
-            "control": torch.zeros(b, window, len(COLUMNS) * settings.events),
-            "last": recent,
-            "at": recent - 1,
-        },
-        "next": {
-            "slots": torch.zeros(b, width),
-            "last": recent[:, 0],
-            "at": recent[:, 0] - 1,
-            "frame": torch.full((b,), p - 1),
-        },
-        "decode": {"tokens": tokens} | dict(zip(Around._fields, map(torch.from_numpy, around(keyframes)), strict=True)),
-    }

@@ -93,11 +93,11 @@ class Neighbours:
     def last(self, frames: int) -> Neighbours:
         """Return those of this many frames at the end alone."""
         return Neighbours(
-            frame=self.frame[-frames:],
             before=self.before[:, -frames:],
             after=self.after[:, -frames:],
             has_before=self.has_before[:, -frames:],
             has_after=self.has_after[:, -frames:],
+            frame=self.frame[-frames:],
             ramp=self.ramp,
         )
 

@@ -32,7 +32,7 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.audio_frontend import AudioFrontend, AudioState, check_length
-from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HEAD, HeadSway
 from sfms_robot.listeners.sfms.draw import (
     UNDECIDED,
@@ -42,6 +42,7 @@ from sfms_robot.listeners.sfms.draw import (
     Sampler,
     Tokens,
     around,
+    last_keyframes,
     later,
     neutral_mask,
     passed,
@@ -99,7 +100,7 @@ class SfmsMemory:
 
 
 class SfmsListener(RunsOnEngine):
-    """A `ports.BatchListener`. It has no state but the weights, which its engine holds (networks: `model.networks`)."""
+    """SFMS as a stream; its engine runs `model.networks`."""
 
     def __init__(
         self,
@@ -195,51 +196,36 @@ class SfmsListener(RunsOnEngine):
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
+    def examples(self, streams: int) -> Examples:
+        """Return inputs of every network for this many streams, as at their beginning."""
+        p, start = self.settings.past_frames, [self.start(seed) for seed in range(streams)]
+        tokens, control = (np.stack([getattr(memory, name) for memory in start]) for name in ("tokens", "control"))
+        parts = ("face", "face_known", "voice", "heard", "phase")
+        speaker = {name: np.stack([getattr(memory.speaker, name) for memory in start]) for name in parts}
+        recent = last_keyframes(tokens)
+        last, at = recent.tokens, recent.at
+        now = {"last": last[:, p - 1], "at": at[:, p - 1], "frame": np.full(streams, p - 1)}
+        return {
+            "rest": {"still": self._still(p)[None], "mask": neutral_mask(p, tokens.shape[2])[None]},
+            "hear": {"rows": np.stack([np.tile(memory.speaker.rows, (2, 1)) for memory in start])},
+            "ahead": speaker | {"tokens": tokens, "control": control, "last": last, "at": at},
+            "next": {"slots": speaker["voice"][:, 0], **now},
+            "decode": dict(
+                zip(("tokens", "before", "after", "rows", "seen", "places"), (tokens, *around(tokens)), strict=True)
+            ),
+        }
+
     def is_due(self, memory: SfmsMemory) -> bool:
         """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
 
-    def step(
-        self, speaker: SpeakerFrame, memory: SfmsMemory, control: Floats | None = None
-    ) -> tuple[Plan | None, SfmsMemory]:
-        """Take one frame; a Plan on every `hop`-th, None between. Never changes `memory` in place.
-
-        `control`: rows of `signals.control` for the `control_frames` up to this frame and after it, (P + H, K); None
-        without events, and for a frame that brings no plan.
-
-        Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
-        """
-        return self.step_each([speaker], [memory], [control])[0]
-
-    def step_each(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        memories: Sequence[SfmsMemory],
-        controls: Sequence[Floats | None] | None = None,
-    ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Step several streams, see `ports.BatchListener`; controls as of `step`. Those due are planned together."""
-        heard = [_listened(*each) for each in zip(speakers, [memory.speaker for memory in memories], strict=True)]
-        return self._stepped(speakers, heard, memories, controls)
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None = None
-    ) -> tuple[list[Plan], list[SfmsMemory]]:
-        """Step streams that began together with the same speaker; return their plans, none between hops.
-
-        As `step_each`, but features of the speaker are computed once.
-        """
-        heard = [_listened(speaker, memories[0].speaker)] * len(memories)
-        found = self._stepped([speaker] * len(memories), heard, memories, controls)
-        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
-
     def _stepped(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        heard: Sequence[SpeakerState],
-        memories: Sequence[SfmsMemory],
-        controls: Sequence[Floats | None] | None,
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None
     ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Move every stream one frame on; `heard` are their speakers with the new frame."""
+        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together."""
+        heard = [_listened(speaker, memory.speaker) for speaker, memory in zip(speakers, memories, strict=False)]
+        if len(speakers) < len(memories):
+            speakers, heard = [*speakers] * len(memories), heard * len(memories)
         found: list[tuple[Plan | None, SfmsMemory]] = [
             (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
             for memory, speaker in zip(memories, heard, strict=True)

@@ -160,18 +160,6 @@ def test_a_state_is_one_that_the_voices_leave_and_lasts_as_long_as_was_drawn(sco
         assert found.state != state or sum(possible) == 1
 
 
-def test_states_last_as_long_as_those_of_the_data():
-    durations, possible = np.tile(np.linspace(5, 50, 33, dtype=np.float32), (7, 1)), np.ones((2, 2, 7), np.float32)
-    rng, sojourn, lasted = np.random.default_rng(0), Sojourn(0, 0), [0]
-    for _ in range(20_000):
-        before = sojourn
-        sojourn = draw_sojourn(durations, possible, np.zeros(9, np.float32), (False, False), before, rng.random(2))
-        if sojourn.state != before.state:
-            lasted.append(0)
-        lasted[-1] += 1
-    assert np.percentile(lasted[1:-1], [5, 50, 95]) == pytest.approx([7, 27, 48], abs=3)
-
-
 def test_feedback_that_is_seen_is_known_from_the_events():
     rows = control_track([ListenerEvent("nod", 0.0, 0.2, 0.1), ListenerEvent("smile", 0.12, 0.2, 0.5)], 0, 9)
     seen = with_feedback(np.full(9, LISTENING), rows).tolist()

@@ -197,16 +197,6 @@ def test_what_is_beyond_all_faces_is_not_seen_and_loudness_without_measure_is_li
         assert np.isfinite(streamed(tiny, loud[:3] + speaker)).all()
 
 
-def test_a_robot_that_falls_silent_listens_on(tiny):
-    """Agent audio shorter than the run, its last frame cut short."""
-    speaker = talk(20)
-    cut = [dataclasses.replace(f, agent_audio=f.agent_audio if i < 9 else None) for i, f in enumerate(speaker)]
-    cut[9] = dataclasses.replace(cut[9], agent_audio=speaker[9].agent_audio[:100])
-    out, whole = streamed(tiny, cut), streamed(tiny, speaker)
-    np.testing.assert_array_equal(out[:9], whole[:9])
-    assert np.isfinite(out).all()
-
-
 def test_frames_of_another_length_are_refused(tiny):
     with pytest.raises(ValueError, match="640 samples or none, got 100"):
         tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))

@@ -76,15 +76,6 @@ def test_a_nod_goes_to_its_size_at_each_swing_less_and_comes_back(start_s: float
     np.testing.assert_allclose(course.spread[rows], NODDING.spread * size, rtol=1e-5)
 
 
-def test_streams_and_windows_see_one_course_and_nothing_is_wanted_without_a_nod():
-    rows = control_track([NOD, SMILE], 0, 90)
-    both = nod_course(NODDING, np.stack([rows, control_track([SMILE], 0, 90)])).wanted
-    np.testing.assert_array_equal(both[0], nod_course(NODDING, rows).wanted)
-    assert np.isnan(both[1]).all() and np.isfinite(both[0]).any()
-    later = nod_course(NODDING, control_track([NOD, SMILE], 30, 60)).wanted
-    np.testing.assert_allclose(later[2:], both[0, 32:], atol=1e-4)
-
-
 def corners(plans) -> np.ndarray:
     at = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
     return np.array([plan.frames[0, at].mean() for plan in plans.values()])
@@ -126,13 +117,8 @@ def test_a_listener_that_cannot_keep_to_one_says_so():
     for kind in ("nod", "smile"):
         with pytest.raises(ConfigError, match=f"sampling.{kind}: without events no {kind} is told"):
             tiny_listener(sampling={kind: {"spread": 0.1}})
-    apart = {
-        "one": {"channels": [*POSE_CHANNELS, SMILE_CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
-        "other": {
-            "channels": [name for name in FACE if name != SMILE_CORNERS[0]],
-            "levels": (3, 2),
-            "keyframe_cost": 1.0,
-        },
-    }
+    head, face = [*POSE_CHANNELS, SMILE_CORNERS[0]], [name for name in FACE if name != SMILE_CORNERS[0]]
+    group = {"levels": (3, 2), "keyframe_cost": 1.0}
+    apart = {"one": group | {"channels": head}, "other": group | {"channels": face}}
     with pytest.raises(ConfigError, match="sampling.smile: no group holds both of mouthSmileLeft, mouthSmileRight"):
         told_listener(groups=apart, sampling={"smile": {"spread": 0.1}})

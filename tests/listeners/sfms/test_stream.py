@@ -125,20 +125,6 @@ def test_who_gave_a_frame_may_use_its_arrays_again(tiny):
             np.testing.assert_array_equal(plan.frames, kept[index].frames)
 
 
-def test_streams_begun_at_different_times_are_planned_together_as_each_alone(tiny):
-    speaker, ages = speech(21), (0, 4, 8)
-    alone = [plans_of(tiny, speaker[age:], seed) for seed, age in enumerate(ages)]
-    memories = [tiny.start(seed) for seed in range(len(ages))]
-    for index in range(len(speaker)):
-        here = [row for row, age in enumerate(ages) if index >= age]
-        found = tiny.step_each([speaker[index]] * len(here), [memories[row] for row in here])
-        for row, (plan, memory) in zip(here, found, strict=True):
-            memories[row] = memory
-            assert (plan is None) == (index - ages[row] not in alone[row])
-            if plan is not None:
-                np.testing.assert_allclose(plan.frames, alone[row][index - ages[row]].frames, atol=1e-5)
-
-
 def test_streams_side_by_side_do_what_each_does_alone(tiny):
     speaker, seeds = speech(21), (1, 2, 3)
     alone = [plans_of(tiny, speaker, seed) for seed in seeds]
@@ -226,8 +212,3 @@ def test_a_plan_goes_on_in_place_and_speed():
     assert path[:2].tolist() == [0.0, 1.0]
     assert path[5:].tolist() == [5.0] * 5
     assert np.diff(path).min() >= 0 and np.diff(path).max() < 2
-
-
-def test_a_plan_that_agrees_with_the_past_is_left_as_it_is():
-    decoded = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
-    np.testing.assert_allclose(join(decoded[:2], decoded, seam=4), decoded, rtol=1e-6)

@@ -2,22 +2,11 @@ from typing import get_args
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tiny_sfms import tiny_settings
 
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.piecewise_linear import Neighbours
 from sfms_robot.listeners.sfms.placement import Strategy
-
-
-@given(st.sets(st.integers(0, 19), min_size=1), st.floats(-3, 3), st.floats(-3, 3))
-def test_a_straight_line_between_keyframes_is_restored(frames, slope, start):
-    frames = {0, 19, *frames}
-    mask = torch.zeros(1, 20, 1)
-    mask[0, sorted(frames)] = 1.0
-    line = (start + slope * torch.arange(20.0))[None, :, None, None]
-    torch.testing.assert_close(Neighbours.in_mask(mask).interpolate(line * mask[..., None]), line)
 
 
 def test_ends_are_held_and_a_window_without_keyframes_is_finite(tiny):
