@@ -104,9 +104,8 @@ def listener_(
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
-    channel_order = order.value if order else None
     if table is None:
-        show(evaluate_listener(listener, data, seed, channel_order, hop), json)
+        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json)
         return
     if of_arig:
         if order is not None or hop is not None:
@@ -117,7 +116,7 @@ def listener_(
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json)
         return
-    more: dict[str, Any] = {"order": channel_order, "hop": hop, "models": models, "steps": steps}
+    more: dict[str, Any] = {"order": order.value if order else None, "hop": hop, "models": models, "steps": steps}
     number = int(table.value)
     show(interruptible(lambda: listener_table(number, listener, data, samples, clips, seed, **more)), json)
 
