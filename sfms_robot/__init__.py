@@ -75,13 +75,21 @@ _NAMES: Final = {
     "app.api.servos": ("Servos", "open_bus"),
     "config": ("Head", "load_head"),
     "errors": (
-        "BusError", "ConfigError", "HaltedError", "InputError", "MissingExtra", "ModelError", "PacketError",
-        "PortError", "RobotError", "ServoError",
+        "BusError",
+        "ConfigError",
+        "HaltedError",
+        "InputError",
+        "MissingExtra",
+        "ModelError",
+        "PacketError",
+        "PortError",
+        "RobotError",
+        "ServoError",
     ),
     "frames": ("BLENDSHAPES", "CHANNELS", "FaceFrame", "ListenerEvent", "Plan", "Reading", "SpeakerFrame"),
     "ports": ("Listener", "Source"),
     "retarget.head_retargeter": ("Retargeter",),
-}  # fmt: skip
+}
 _MODULE_OF: Final = {name: module for module, names in _NAMES.items() for name in names}
 _CALLED: Final = {"Retargeter": "HeadRetargeter"}
 

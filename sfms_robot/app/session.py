@@ -70,7 +70,7 @@ def run_log(opened: OpenHead) -> RunLog:
     return RunLog(opened.motion.retargeter.joints, 1.0 / opened.rate_hz, opened.motion.audit)
 
 
-def parts_of(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
+def run_parts(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
     """Return the parts of a run on an open head: a person and a listener; `more` replaces parts of the head's own."""
     motion = opened.motion
     parts = Parts(
@@ -201,7 +201,7 @@ def run(
         outlets = [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
         begin_status(status.document)
         watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
-        parts = parts_of(
+        parts = run_parts(
             opened,
             person,
             feed,

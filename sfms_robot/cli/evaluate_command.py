@@ -63,7 +63,6 @@ def tokenizer(
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
-
     if table is None:
         from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
 
@@ -117,22 +116,9 @@ def listener_(
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json)
         return
+    more: dict[str, Any] = {"order": order.value if order else None, "hop": hop, "models": models, "steps": steps}
     number = int(table.value)
-    result = interruptible(
-        lambda: listener_table(
-            number,
-            listener,
-            data,
-            samples,
-            clips,
-            seed,
-            order=order.value if order else None,
-            hop=hop,
-            models=models,
-            steps=steps,
-        )
-    )
-    show(result, json)
+    show(interruptible(lambda: listener_table(number, listener, data, samples, clips, seed, **more)), json)
 
 
 @app.command()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
+_NESTED = 12
 
 
 def show(result: Mapping[str, Any], json: bool, printed: Callable[[Mapping[str, Any]], None] | None = None) -> None:
@@ -82,21 +83,23 @@ def print_rows(
     *,
     alarming: Callable[[Mapping[str, Any]], bool] = lambda row: False,
 ) -> None:
-    """Print a table whose columns are the keys of the first row; nothing without rows. `alarming` rows are red."""
+    """Print a table whose columns are the keys of the first row; nothing without rows. `alarming` rows are red.
+
+    A column of mappings with more than `_NESTED` keys is left to --json.
+    """
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     if not rows:
         return
-    table = Table(
-        title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_header=any(key.strip() for key in rows[0])
-    )
-    for key in rows[0]:
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    keys = [key for key, value in rows[0].items() if not (isinstance(value, Mapping) and len(value) > _NESTED)]
+    for key in keys:
         numbers = all(isinstance(row.get(key), int | float | None) for row in rows)
         table.add_column(key, justify="right" if numbers else "left", no_wrap=numbers, overflow="fold")
     for row in rows:
-        cells = [Text(cell(row.get(key))) for key in rows[0]]
+        cells = [Text(cell(row.get(key))) for key in keys]
         table.add_row(*cells, style="bold red" if alarming(row) else "")
     screen().print(table)
 

@@ -163,7 +163,7 @@ def test_an_error_before_torque_is_raised_by_start():
 REFUSED = [
     ({"head": "nope"}, sr.ConfigError, "'nope' is neither a shipped name"),
     ({"port": "/dev/nowhere"}, sr.PortError, "/dev/nowhere"),
-    ({"without": ("nose",)}, sr.ConfigError, "expected a joint of head 'face28', got 'nose'"),
+    ({"without": ("nose",)}, sr.ConfigError, f"expected a joint of head '{HEAD}', got 'nose'"),
     ({"fast": True}, sr.InputError, 'another source than audio="push"'),
     ({"face": "me.csv"}, sr.InputError, r"the face comes by see\(\)"),
     ({"intensity": {"ears": 1}}, sr.InputError, r"'ears' is not a region of this head \(.*neck"),

@@ -8,7 +8,7 @@ import pytest
 
 from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.config.head import held_back
@@ -71,7 +71,7 @@ def driven(head, servos, seconds, seed, fault=None):
         motion = build_motion(head, rate_hz)
         there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
-        parts = parts_of(there, silence, InlineFeed(Restless(), seed, 0.01))
+        parts = run_parts(there, silence, InlineFeed(Restless(), seed, 0.01))
         drove = drive_head(there, parts, Interrupt(), duration_s=seconds, signals=False)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
     assert (drove.outcome, drove.error) == ("done", None)

@@ -12,7 +12,7 @@ import pytest
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import HeadOptions, RunOptions
-from sfms_robot.app.session import drive_head, parts_of, run
+from sfms_robot.app.session import drive_head, run, run_parts
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 from sfms_robot.ports import Source
 from sfms_robot.runtime.safety import Interrupt, Released
@@ -120,7 +120,7 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
         if fault is not None:
             chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
         there = replace(opened, bus=bus(opened.bus))
-        parts = parts_of(there, Ending(how, interrupt), NobodyThere())
+        parts = run_parts(there, Ending(how, interrupt), NobodyThere())
         drove = drive_head(there, parts, interrupt, duration_s=0.4, signals=False)
         return drove, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
 

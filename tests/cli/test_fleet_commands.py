@@ -67,7 +67,8 @@ def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(zenoh
             assert "--fleet-key" in answer["error"] and not interrupt()
         (document,) = fleet.states()
         assert document["malformed"] == 4 and [each.levelname for each in caplog.records] == ["WARNING"]
-        assert command_line("fleet", "resume", "--zenoh", zenoh, "--fleet-key", mine).out == "hall: resume\n"
+        resumed = command_line("fleet", "resume", "--zenoh", zenoh, "--fleet-key", mine, "--json").told
+        assert resumed["answers"] == [{"name": "hall", "done": "resume"}]
         assert latch.by is None
 
 

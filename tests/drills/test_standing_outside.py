@@ -8,7 +8,7 @@ import pytest
 
 from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.app.wiring import calibration_of, plugged_in
 from sfms_robot.config import load_head
 from sfms_robot.data import head_names
@@ -78,7 +78,7 @@ def test_wherever_joints_stand_a_run_ends_at_rest_and_limp(name, seed):
             options=HeadOptions(head=name, fast=True), config=head, motion=motion, bus=bus, clock=clock, opened=chains
         )
         silence = PairedSource(RecordedVoice(np.zeros(round(LISTEN_S * 16_000), np.float32)), duration_s=LISTEN_S)
-        parts = parts_of(there, silence, InlineFeed(Nodder(), seed, 0.01))
+        parts = run_parts(there, silence, InlineFeed(Nodder(), seed, 0.01))
         drove = drive_head(there, parts, Interrupt(), duration_s=LISTEN_S, signals=False)
         states = {key: chains[joint.bus].state(joint.id) for key, joint in head.joints.items()}
     assert (drove.outcome, drove.error) == ("done", None)

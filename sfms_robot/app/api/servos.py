@@ -20,7 +20,7 @@ from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import run_report
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
-from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
 from sfms_robot.errors import BusError, ConfigError, InputError, ModelError, PortError, RobotError
 from sfms_robot.frames import POSE, Doubles, Floats, Reading, SpeakerFrame
@@ -313,7 +313,7 @@ class Servos:
 
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, observer: Observer) -> Report:
         opened, alone = self._opened, NobodyThere()
-        parts = parts_of(opened, alone, alone, retargeter=self._target, halt=halt, observers=[observer])
+        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=halt, observers=[observer])
         drove = drive_head(opened, parts, interrupt, signals=False)
         return run_report(opened, drove, alone, "none", 0)
 

@@ -15,7 +15,7 @@ import numpy as np
 from sfms_robot.app.listen.report import Drove, outcome
 from sfms_robot.app.open_head import OpenHead, open_head
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
@@ -120,9 +120,9 @@ class FaceTrack:
         log: RunLog | None = None,
         **more: Any,
     ) -> Drove:
-        """Drive a head with this track once, without a person or a listener. `more`: see `parts_of`."""
+        """Drive a head with this track once, without a person or a listener. `more`: see `run_parts`."""
         alone = NobodyThere()
-        parts = parts_of(opened, alone, alone, timeline=self, observers=[observer], **more)
+        parts = run_parts(opened, alone, alone, timeline=self, observers=[observer], **more)
         duration_s = self.duration_s
         return drive_head(opened, parts, interrupt or Interrupt(), duration_s=duration_s, signals=signals, log=log)
 

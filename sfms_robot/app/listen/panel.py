@@ -38,9 +38,16 @@ _QUIET_DB: Final = -60.0  # an empty meter; 0 is full scale
 _METER: Final = 20  # characters, fewer on a narrow terminal
 _FAULTS: Final = 4  # named; the others are counted
 _COLORS: Final[Mapping[str, str]] = {
-    "starting": "cyan", "idle": "blue", "listening": "green", "speaking": "magenta", "degraded": "yellow",
-    "halted": "bold white on red", "stopping": "cyan", "stopped": "dim", "fault": "bold red",
-}  # fmt: skip
+    "starting": "cyan",
+    "idle": "blue",
+    "listening": "green",
+    "speaking": "magenta",
+    "degraded": "yellow",
+    "halted": "bold white on red",
+    "stopping": "cyan",
+    "stopped": "dim",
+    "fault": "bold red",
+}
 _KEYS: Final = "space halt, r resume, + - intensity, q end, ? help"
 _HELP: Final = (
     "space, h, Esc: emergency stop; r: resume after one; + and -: intensity of all regions, a tenth; "
@@ -101,8 +108,14 @@ class _Screen:
         self.look = threading.Event()
         self.lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
         self._console, self._document, self._interrupt, self._keys = console, document, interrupt, keys
-        self._live = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False,
-                          redirect_stderr=False, vertical_overflow="crop")  # fmt: skip
+        self._live = Live(
+            console=console,
+            auto_refresh=False,
+            transient=True,
+            redirect_stdout=False,
+            redirect_stderr=False,
+            vertical_overflow="crop",
+        )
         self.lock = threading.RLock()  # a signal handler may interrupt the thread that holds it
 
     def draw(self) -> None:

@@ -134,10 +134,19 @@ def plot(recording: RunRecording, png: Path | str) -> None:
     if not Path(png).parent.is_dir():
         raise ConfigError(f"{png}: cannot be written: no folder {Path(png).parent}")
     style: dict[Any, Any] = {
-        "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": FAINT,
-        "xtick.color": FAINT, "ytick.color": FAINT, "axes.labelcolor": INK, "text.color": INK,
-        "axes.titlesize": 11, "axes.titleweight": "bold", "axes.titlelocation": "left", "axes.titlepad": 4.0,
-    }  # fmt: skip
+        "font.size": 10,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": FAINT,
+        "xtick.color": FAINT,
+        "ytick.color": FAINT,
+        "axes.labelcolor": INK,
+        "text.color": INK,
+        "axes.titlesize": 11,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "axes.titlepad": 4.0,
+    }
     with matplotlib.rc_context(style):
         figure = Figure(figsize=_SIZE_IN, dpi=_DPI)
         FigureCanvasAgg(figure)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, parts_of
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.app.wiring import calibration_of
 from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain
@@ -131,7 +131,7 @@ def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], 
         led = replace(opened, motion=replace(motion, leads_s=share * motion.leads_s))
         chains = {bus: chain for bus, chain in opened.opened.items() if isinstance(chain, Chain)}
         seen = Onlooker(opened.config, chains, opened.clock)
-        parts = parts_of(led, NobodyThere(), waves, observers=[seen])
+        parts = run_parts(led, NobodyThere(), waves, observers=[seen])
         drove = drive_head(led, parts, Interrupt(), duration_s=duration_s)
     if drove.error is not None:
         raise drove.error
