@@ -99,11 +99,24 @@ def drive_head(
     """
     motion = opened.motion
     parts = Parts(
-        programme.source, programme.feed, programme.timeline or motion.timeline,
-        programme.retargeter or motion.retargeter, motion.limiter, opened.bus, programme.observers, motion.leads_s,
-        motion.rest_rad, programme.life, programme.knobs, programme.overlay, programme.answers, programme.halt,
-        motion.holds, motion.heat, frozenset(opened.options.without),
-    )  # fmt: skip
+        source=programme.source,
+        feed=programme.feed,
+        timeline=programme.timeline or motion.timeline,
+        retargeter=programme.retargeter or motion.retargeter,
+        limiter=motion.limiter,
+        bus=opened.bus,
+        observers=programme.observers,
+        leads_s=motion.leads_s,
+        rest_rad=motion.rest_rad,
+        life=programme.life,
+        knobs=programme.knobs,
+        overlay=programme.overlay,
+        answers=programme.answers,
+        halt=programme.halt,
+        holds=motion.holds,
+        heat=motion.heat,
+        ignored=frozenset(opened.options.without),
+    )
     log = run_log(opened) if log is None else log
     duration_s = math.inf if programme.duration_s is None else programme.duration_s
     real = not opened.options.fast

@@ -139,7 +139,9 @@ def test_a_course_that_is_none_is_refused(smile, text):
 
 def test_a_listener_that_cannot_keep_to_one_says_so():
     for kind in ("nod", "smile"):
-        with pytest.raises(ConfigError, match=f"sampling.{kind}: without events no {kind} is told"):
+        with pytest.raises(
+            ConfigError, match=f"sampling.{kind}: expected events: true, without which there is no {kind}"
+        ):
             tiny_listener(sampling={kind: {"spread": 0.1}})
     apart = {
         "one": {"channels": [*POSE_CHANNELS, SMILE_CORNERS[0]], "levels": (3, 2), "keyframe_cost": 1.0},
