@@ -120,8 +120,9 @@ def reorder(values: NDArray[np.floating], order: str) -> Floats:
 
 
 def changed(value: Value, **fields: object) -> Value:
-    """`dataclasses.replace` for values that check nothing when they are made, in an eighth of its time: what streams
-    remember is made anew with every frame.
+    """Replace fields as `dataclasses.replace`, in an eighth of its time, for values without checks.
+
+    Memories of streams are replaced with every frame.
     """
     made: Value = object.__new__(type(value))
     made.__dict__.update(value.__dict__, **fields)
@@ -146,7 +147,7 @@ class FaceFrame:
 
     @classmethod
     def of(cls, time_s: float, motion: NDArray[np.floating]) -> FaceFrame:
-        """From one motion row (58,)."""
+        """Return the face of one motion row (58,)."""
         row = np.asarray(motion, dtype=np.float32)
         return cls(time_s, row[POSE], row[SHAPES])
 
@@ -158,13 +159,13 @@ class FaceFrame:
 
 @dataclass(frozen=True)
 class Sighting:
-    """A person as a camera or a phone saw them.
+    """A person as tracked by a camera or a phone.
 
     Attributes:
-        face: pose and blendshapes; its `time_s` is when they were seen, in loop time.
-        attention: 0..1, whether they look at the head; None where that cannot be told.
-        place_m: (3,) where their eyes are, seen from the camera: x out of its lens, y to its left, z up; None where
-            that cannot be told.
+        face: pose and blendshapes; its `time_s` is loop time.
+        attention: 0..1, of the person to the head; None if unknown.
+        place_m: (3,) place of their eyes in the camera's frame: x out of its lens, y to its left, z up; None if
+            unknown.
     """
 
     face: FaceFrame
@@ -174,15 +175,15 @@ class Sighting:
 
 @dataclass(frozen=True)
 class SpeakerFrame:
-    """What the person did in the last 40 ms.
+    """Sound and face of the person in the last 40 ms.
 
     Attributes:
         time_s: the END of the frame: its samples cover (time_s - 0.04, time_s].
         audio: (n,) mono 16 kHz, -1..1; empty when there is no microphone.
         face: the person's face, or None: a missing modality is normal.
-        agent_audio: (n,) what the robot itself says, or None.
+        agent_audio: (n,) voice of the robot itself, or None.
         attention, place_m: see `Sighting`; None without a face. In a meeting that is played back an attention may be
-            NaN: several people are there, and nobody wrote down whom this one looks at.
+            NaN: several people are there, and the target of this one's look was not annotated.
     """
 
     time_s: float
@@ -199,17 +200,17 @@ EVENT_KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_r
 
 @dataclass(frozen=True)
 class ListenerEvent:
-    """Something that a listener has decided to do, or that a person did.
+    """An event that a listener has decided, or that a person showed.
 
     Attributes:
         kind: of `EVENT_KINDS`.
         start_s, duration_s: when its motion begins and how long it lasts; a gaze shift lasts until the next one.
-        size: peak to peak [rad] of a nod, a shake, a tilt; 0..1 of what the face does; how far [rad] a gaze shift goes.
+        size: peak to peak [rad] of a nod, a shake, a tilt; 0..1 of an event of the face; angle [rad] of a gaze shift.
         swings: of a nod or a shake, there and back each; 1 of everything else.
         target_rad: (yaw, pitch) in space that a gaze shift goes to, (0, 0) at the person; None of everything else.
         probability, draw: that it would be decided at this instant, and the number in 0..1 that fell below it; None
             for what was not drawn.
-        evidence: what spoke for it and against it, by name: the largest terms of its log-odds.
+        evidence: the largest terms of its log-odds, by name.
     """
 
     kind: str
@@ -229,15 +230,15 @@ class ListenerEvent:
 
 @dataclass(frozen=True)
 class Plan:
-    """What our face does next. A newer plan replaces an older one from its first time on.
+    """The next motion of our face. A newer plan replaces an older one from its first time on.
 
     Attributes:
         made_at_s: time of the last speaker frame used.
         times_s: (H,) times_s[0] = made_at_s + one frame.
         frames: (H, 58) motion.
         jaw_rad: (H, 3) or None.
-        events: decided since the plan before, each told once; none from a listener that decides none.
-        hazards_hz: by kind, how many a second would be decided if things stayed as they are; empty likewise.
+        events: decided since the plan before, each once; empty for a listener without events.
+        hazards_hz: by kind, rate of decisions at this moment; empty for a listener without events.
     """
 
     made_at_s: float
@@ -250,13 +251,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a bus knows of one joint.
+    """State of one joint as known to its bus.
 
     Attributes:
-        position_rad: None until the servo has answered once, or for good where the family cannot tell.
+        position_rad: None until the servo has answered once, or always for a family without positions.
         age_s: age of the position; inf when there is none.
         fault: named fault or None.
-        extra: what else the family tells, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
+        extra: other values of the family, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
         rejoined: true once, when the servo was away and holds this position now, or the newest goal where it has no
             position to tell; its goals are left out until they begin there, so ease in from it.
     """

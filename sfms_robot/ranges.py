@@ -5,8 +5,8 @@ range reaches out to there. Every goal draws that in: the range in force reaches
 So a joint outside its range moves in or stands still, the way out closes behind it, and once a goal lies inside its
 own range that is the range in force for good, until it is found outside again.
 
-Nothing else has to be remembered, so that all who know the last goal agree. Who sees every k-th goal only (a slow bus)
-is never stricter than who sees all of them, because goals outside the own range only ever move in.
+No other memory is needed, so that all parts that know the last goal agree. A slow bus, which gets every k-th goal, is
+never stricter than a part that gets all of them, because goals outside the own range only ever move in.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Range:
     high: Doubles
 
     def reaching(self, last_rad: Doubles) -> Range:
-        """The range in force, of an own range, where joints were found at, or last sent to, `last_rad` (J,)."""
+        """Return the range in force for an own range and joints found at, or last sent to, `last_rad` (J,)."""
         return Range(np.minimum(self.low, last_rad), np.maximum(self.high, last_rad))
 
     def holds(self, angles_rad: Doubles, slack_rad: float = 0.0) -> Bools:
-        """Which of the angles (J,) lie in it, its ends included; one that is not finite does not."""
+        """Return True for angles (J,) in the range, its ends included; False for one that is not finite."""
         return np.asarray((angles_rad >= self.low - slack_rad) & (angles_rad <= self.high + slack_rad))
 
     def nearest(self, angles_rad: Doubles) -> Doubles:
-        """The angles (J,), those outside moved to the end of the range."""
+        """Return the angles (J,), those outside moved to the end of the range."""
         return np.asarray(np.minimum(np.maximum(angles_rad, self.low), self.high))

@@ -27,6 +27,7 @@ BASE = {
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
+    "runtime": BASE | {"runtime", "motion", "retarget"},  # the loop calls both at every tick
     "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
     "app": BASE | PEERS | {"viewer", "emulator", "app"},

@@ -1,7 +1,7 @@
-"""A servo model's control table as data: adding a servo touches no Python.
+"""A servo model's control table as data, one YAML file per model.
 
-One YAML file per model. A file is refused whole when its registers overlap, do not fit their size, or a role names a
-register that is not there, so that nothing past the loader has to ask. A model whose table changed with its firmware
+A file is refused when its registers overlap, do not fit their size, or a role names a register that is not there, so
+that code past the loader need not check. A model whose table changed with its firmware
 has one file per layout (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` picks by the number read from the servo.
 """
 
@@ -33,7 +33,7 @@ Bit = Annotated[int, Field(ge=0, le=15)]
 
 
 def _sign_rule(value: Any) -> Any:
-    """`true` and `false` are short for two's complement and no sign; YAML reads a bare `no` as false."""
+    """Accept `true` and `false`, short for two's complement and no sign."""
     if isinstance(value, bool):
         return "twos_complement" if value else "no"
     if value in ("no", "twos_complement", "offset_2048"):
@@ -41,11 +41,11 @@ def _sign_rule(value: Any) -> Any:
     bit = str(value).removeprefix("sign_bit_")
     if str(value).startswith("sign_bit_") and bit.isdecimal() and int(bit) < 32:
         return value
-    raise ValueError("is no sign rule (no, twos_complement, sign_bit_N with N 0..31, offset_2048)")
+    raise ValueError("is not a sign rule (no, twos_complement, sign_bit_N with N 0..31, offset_2048)")
 
 
 def value_range(size: int, signed: str) -> tuple[int, int]:
-    """Smallest and largest value that a register of `size` bytes holds under a sign rule."""
+    """Return the smallest and largest value that a register of `size` bytes holds under a sign rule."""
     bits = 8 * size
     if signed == "twos_complement":
         return -(1 << bits - 1), (1 << bits - 1) - 1
@@ -93,7 +93,7 @@ class Register(Model):
         return self.address + self.size
 
     def problems(self) -> Iterator[str]:
-        """What is impossible about this row, each as `key = value says why`."""
+        """Yield each impossible value of this row as `key = value problem`."""
         if self.signed.startswith("sign_bit_") and int(self.signed.removeprefix("sign_bit_")) >= 8 * self.size:
             yield f"signed = {self.signed!r} does not fit {self.size} byte(s)"
             return
@@ -173,7 +173,7 @@ class FirmwareMap(Model):
         return self
 
     def _shape(self) -> Iterator[str]:
-        """A servo is not a board."""
+        """Yield keys of a board in a servo's map, and the reverse."""
         allowed = {"dynamixel": (1, 2), "feetech": (1,)}.get(self.family, (None,))
         if self.protocol not in allowed:
             yield f"protocol = {self.protocol} is not one of family {self.family} ({', '.join(map(str, allowed))})"
@@ -190,7 +190,7 @@ class FirmwareMap(Model):
                 yield "registers is empty"
 
     def _layout(self) -> Iterator[str]:
-        """Registers lie beside one another, inside the address space, and hold the values they promise."""
+        """Yield registers that overlap, leave the address space, or cannot hold their values."""
         end, last = 0, ""
         wide = any(register.size == 4 for register in self.registers.values())
         space = 65536 if self.protocol == 2 else 256  # one address byte in the frame of protocol 1 and Feetech
@@ -217,13 +217,13 @@ class FirmwareMap(Model):
 
 
 def map_files() -> list[Path]:
-    """Every shipped firmware map, sorted."""
+    """Return every shipped firmware map, sorted."""
     return sorted(data_dir("firmware_maps").glob("*/*.yaml"))
 
 
 @lru_cache
 def load_firmware_map(model: str) -> FirmwareMap:
-    """A servo's control table by model name, or by the path of a `.yaml` file of one's own.
+    """Return a servo's control table by model name, or by the path of a `.yaml` file.
 
     Raises ConfigError listing the shipped models.
     """
@@ -237,9 +237,9 @@ def load_firmware_map(model: str) -> FirmwareMap:
 
 
 def variant(model: str | FirmwareMap, firmware: int) -> FirmwareMap:
-    """The layout of `model` that holds for the firmware number read from the servo.
+    """Return the layout of `model` for the firmware number read from the servo.
 
-    Raises ConfigError when no layout does, naming those at hand.
+    Raises ConfigError when there is none, naming those available.
     """
     named = load_firmware_map(model) if isinstance(model, str) else model
     if named.firmware.min <= firmware <= named.firmware.max:

@@ -125,7 +125,7 @@ class FollowingJoint(Model):
 
 
 class RobotDescription(Model):
-    """A URDF file, beside the head's file or anywhere, or the name of a shipped head that looks the same.
+    """A URDF file, or the name of a shipped head with the same look.
 
     Attributes:
         packages: where the folders of `package://NAME/...` lie, from the head's folder on.

@@ -1,4 +1,4 @@
-"""How often a listener plans: its hop, in frames of T = 40 ms.
+"""Hop of a listener, the time between its plans, in frames of T = 40 ms.
 
 A sound comes at any time within a hop, and reaches the goals after
 
@@ -31,7 +31,7 @@ _EPS_S: Final = 1e-9
 
 @dataclass(frozen=True)
 class Probe:
-    """What a listener measured of itself: frames of a plan, hops that it can be run with, and what a plan takes."""
+    """Measurements of a listener: frames of a plan, possible hops, and the time of a plan."""
 
     horizon: int
     hop: int
@@ -42,7 +42,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class Latencies:
-    """What is measured of a run before its hop is chosen, in seconds.
+    """Measurements of a run before its hop is chosen, in seconds.
 
     Attributes:
         horizon: frames of a plan, H.
@@ -60,10 +60,10 @@ class Latencies:
     tick_s: float
 
     def goal_s(self, hop: int, share: float, step_s: float) -> float:
-        """From a sound, `share` of a hop before the end of it, to the first goal of a plan that knows of it."""
-        heard_s = _next_tick(self.source_s, self.tick_s)
+        """Return the time from a sound, `share` of a hop before its end, to the first goal of a plan with it."""
+        given_s = _next_tick(self.source_s, self.tick_s)
         played_late_s = FRAME_S if self.horizon == 1 else 0.0
-        return share * hop * FRAME_S + _next_tick(heard_s + step_s, self.tick_s) + played_late_s
+        return share * hop * FRAME_S + _next_tick(given_s + step_s, self.tick_s) + played_late_s
 
     def p50_s(self, hop: int) -> float:
         return self.goal_s(hop, 0.5, self.step_p50_s)
@@ -72,11 +72,11 @@ class Latencies:
         return self.goal_s(hop, 0.95, self.step_p99_s)
 
     def left_s(self, hop: int) -> float:
-        """What a plan still knows when the next one comes; below 0: it has run out by then."""
+        """Return the time left of a plan when the next one comes; below 0: it has run out by then."""
         return (max(self.horizon - 1, 1) - hop) * FRAME_S - self.source_s - self.step_p99_s
 
     def fits(self, hop: int) -> bool:
-        """Whether the leads have room, sounds are answered in time, and the listener keeps up."""
+        """Return whether the leads have room, sounds are answered in time, and the listener keeps up."""
         return (
             self.left_s(hop) >= self.lead_s - _EPS_S
             and self.p50_s(hop) <= P50_S + _EPS_S
@@ -85,15 +85,16 @@ class Latencies:
         )
 
     def keeps_up(self, hop: int) -> bool:
-        """A plan mostly takes half of its hop at most: what was said while graphs were built is still to be caught up
-        with. Hardly any takes all of it.
+        """Return whether a plan mostly takes half of its hop at most, and hardly ever all of it.
+
+        The rest is for catching up with the sound that came while graphs were built.
         """
         return self.step_p50_s <= hop * FRAME_S / 2 and self.step_p99_s <= hop * FRAME_S
 
 
 @dataclass(frozen=True)
 class HopChoice:
-    """A hop, where its time goes, and in words what did not fit; None: all did."""
+    """A hop, its time budget, and a text about the parts that did not fit; None: all did."""
 
     hop: int
     budget_ms: dict[str, float]
@@ -101,16 +102,17 @@ class HopChoice:
 
 
 def default_hop(horizon: int, step_s: float = STEP_S, lead_s: float = LEAD_S) -> int:
-    """The largest hop that leaves plans long enough for their making and the lead: hop T + step + lead <= (H - 1) T.
+    """Return the largest hop with hop T + step + lead <= (H - 1) T, at least 1.
 
-    At least 1. For virtual time and training, where nothing is measured.
+    For virtual time and training, without measurements.
     """
     return max(1, math.floor((horizon - 1) - (step_s + lead_s) / FRAME_S + _EPS_S))
 
 
 def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
-    """The largest of `hops` (at least one) that fits; where none does, the smallest with which the listener keeps up:
-    of all these it gives up least.
+    """Return the largest of `hops` (at least one) that fits, else the smallest with which the listener keeps up.
+
+    Of all that do not fit the smallest gives up least.
     """
     fitting = [hop for hop in hops if measured.fits(hop)]
     if fitting:

@@ -131,7 +131,7 @@ class Coupling(Model):
 
 
 class Fold(Model):
-    """A channel without a joint of its own, shown by another joint: `gain` x channel is added to that joint's drive."""
+    """A channel without a joint, shown by the joint of another: `gain` x channel is added to that joint's drive."""
 
     channel: str
     into: Name
@@ -227,7 +227,7 @@ class Faults(Model):
 
 
 class LimitClass(Model):
-    """How fast a class of joints may move, in degrees."""
+    """Limits of the motion of a class of joints, in degrees."""
 
     speed_deg_s: Positive
     acceleration_deg_s2: Positive

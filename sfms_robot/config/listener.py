@@ -31,8 +31,8 @@ EVENT_STATES: Final = (*STATES, "giving_feedback_nod", "giving_feedback_smile")
 class Calmness(Model):
     """Events a minute by kind: more is livelier, 0 is never, None is as people do.
 
-    A rate holds for a person in a meeting, who is looked at some of the time. A head that is addressed and looked at
-    nods more often, one that is not nods less often.
+    A rate holds for the mean over a meeting, with looks at the head some of the time. A head that is addressed and
+    looked at nods more often, one that is not nods less often.
 
     Attributes:
         nod, shake, tilt: of the head. Its own nods included, a head nods a tenth more often than the rate: 2.0 are
@@ -194,7 +194,7 @@ class Listener(Model):
         if self.flame_matrix is not None and self.motion_space != "deca56":
             raise ValueError(f"flame_matrix: {self.motion_space} already is ARKit's expression (deca56 takes one)")
         if self.sway and not self.events:
-            raise ValueError("sway: without events a nod cannot be told from it")
+            raise ValueError("sway: expected events: true, without which a nod counts as sway")
         return self
 
 
@@ -273,7 +273,7 @@ class Sfms(Listener):
                 raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
         for kind in ("nod", "smile"):
             if getattr(self.sampling, kind) is not None and not self.events:
-                raise ValueError(f"sampling.{kind}: without events no {kind} is told")
+                raise ValueError(f"sampling.{kind}: expected events: true, without which there is no {kind}")
         if self.sampling.smile is not None and self.smiling_group is None:
             raise ValueError(f"sampling.smile: no group holds both of {', '.join(SMILE_CORNERS)}")
         if self.wav2vec2 is not None and self.audio != "wav2vec2":

@@ -87,17 +87,21 @@ class Measured(Identity):
         return Identity(**{key: getattr(self, key) for key in Identity.model_fields})
 
 
-class CalibrateLayer(Model):
-    """Joints measured so far, and the head file they were measured for."""
+class Layer(Model):
+    """Part of an overlay, and the head file that it was made for."""
 
     head_sha256: Sha256
+
+
+class CalibrateLayer(Layer):
+    """Joints measured so far."""
+
     joints: dict[Name, Measured] = Field(default_factory=dict)
 
 
-class StoredLayer(Model):
-    """Registers that the servos of joints store, confirmed by the user, and the head file they were confirmed for."""
+class StoredLayer(Layer):
+    """Registers that the servos of joints store, confirmed by the user."""
 
-    head_sha256: Sha256
     joints: dict[Name, dict[Name, int]] = Field(default_factory=dict)
 
 
@@ -107,10 +111,9 @@ class Fitted(Model):
     drive: Expression
 
 
-class FitLayer(Model):
-    """Drives learnt from sight, and the head file they were learnt for."""
+class FitLayer(Layer):
+    """Drives learnt from sight."""
 
-    head_sha256: Sha256
     date: date
     note: str = ""
     joints: dict[Name, Fitted] = Field(default_factory=dict)
@@ -135,7 +138,7 @@ class Overlay(Model):
         return self.model_copy(update={"stored": StoredLayer(head_sha256=sha256, joints=joints)})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layered:
     """A head with its overlay on.
 
@@ -159,7 +162,7 @@ def config_folder() -> Path:
 
 
 def overlay_file(head: str, practice: bool = False) -> Path:
-    """Return the file of a head's overlay; `practice`: that of emulated servos, beside it, which is never used."""
+    """Return the file of a head's overlay; `practice`: that of emulated servos, which no run uses."""
     return config_folder() / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
 
 
@@ -235,8 +238,13 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         if wrong := problems(head.model_copy(update={"joints": {**head.joints, **checked}})):
             raise ConfigError(f"{overlay_file(head.name)}: fit: {wrong[0]}")
         joints |= {name: joints[name].model_copy(update=drive) for name, drive in drives.items()}
-    holds = frozenset(measured) - frozenset(refused)
-    return Layered(head.model_copy(update={"joints": joints}), holds, refused, fitted, tuple(notes))
+    return Layered(
+        head=head.model_copy(update={"joints": joints}),
+        calibrated=frozenset(measured) - frozenset(refused),
+        refused=refused,
+        fitted=fitted,
+        notes=tuple(notes),
+    )
 
 
 def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None] | None, name: str) -> str | None:

@@ -151,7 +151,7 @@ class LimiterState:
     refused: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Bounds:
     """A range in force, prepared for the array arithmetic.
 
@@ -299,7 +299,8 @@ class JerkLimiter:
         # then speed and acceleration of the stop, and half the range, along its way and against it.
         stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
         floor = np.stack([low - 1, -ceiling[1], -ceiling[2]])
-        return _Bounds(limits, (low + high) / 2, floor, ceiling, np.stack([*one_tick, *stop]))
+        needed = np.stack([*one_tick, *stop])
+        return _Bounds(range=limits, middle=(low + high) / 2, floor=floor, ceiling=ceiling, needed=needed)
 
     def _needed(self, motion: Doubles, wanted: Doubles, middle: Doubles) -> Doubles:
         """Return the sizes (10, J) needed to go from `motion` to `wanted` (3, J) in one tick, and to stop from there.

@@ -75,7 +75,7 @@ class _Knots:
         return _Knots(self.times_s[cut], self.values[cut], self.slopes[cut], self.bends[cut])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Curve:
     """A piecewise quintic. The last knot is extrapolated by one frame, then follows rest.
 
@@ -99,7 +99,7 @@ class Curve:
         return float(self.knots.times_s[-2])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TimelineState:
     """Memory of the timeline, of bounded size.
 
@@ -341,7 +341,7 @@ def _curve(knots: _Knots, made_at_s: float, delay_s: float) -> Curve:
     )
     low, high = np.minimum(start, end), np.maximum(start, end)
     low[:, POSE], high[:, POSE] = -np.inf, np.inf
-    return Curve(knots, coefficients, low, high, made_at_s, delay_s)
+    return Curve(knots=knots, coefficients=coefficients, low=low, high=high, made_at_s=made_at_s, delay_s=delay_s)
 
 
 def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:

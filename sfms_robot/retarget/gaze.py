@@ -164,7 +164,7 @@ class AimState:
 
 
 class Camera:
-    """Places (..., 3) [m] in the camera's frame (x out of its lens, y left, z up) <-> in that of the base.
+    """Conversion of places (..., 3) [m] from the camera's frame (x out of its lens, y left, z up) to that of the base.
 
     The frame of the head's base has its origin in the middle of the head at home, and stays while the neck moves. A
     camera on the head goes with `pose` (6,), which the neck shows at that instant, so turning the neck does not move
@@ -182,13 +182,6 @@ class Camera:
             return mounted
         moved: Doubles = mounted @ rotation(pose[:3]).T + pose[3:]
         return moved
-
-    def from_base(self, place_m: Floats | Doubles, pose: Doubles) -> Doubles:
-        mounted = np.asarray(place_m, np.float64)
-        if self.on_head:
-            mounted = (mounted - pose[3:]) @ rotation(pose[:3])
-        seen: Doubles = (mounted - self._at_m) @ self._turned
-        return seen
 
 
 class GazeTarget:

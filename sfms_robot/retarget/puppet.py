@@ -41,7 +41,7 @@ _NEVER_S: Final = -math.inf
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ramp:
     """Weights (C,) over time: from `start` up to 1 in `rise_s`, and down to 0 in `fall_s` from `until_s` (C,)."""
 
@@ -53,7 +53,8 @@ class Ramp:
 
     @classmethod
     def zero(cls, size: int, rise_s: float, fall_s: float) -> Ramp:
-        return cls(np.zeros(size), np.full(size, _NEVER_S), np.full(size, _NEVER_S), rise_s, fall_s)
+        never = np.full(size, _NEVER_S)
+        return cls(start=np.zeros(size), began_s=never, until_s=never, rise_s=rise_s, fall_s=fall_s)
 
     def at(self, times_s: Doubles) -> Doubles:
         """Return the weights (N, C) at (N,) instants."""
@@ -68,7 +69,7 @@ class Ramp:
         start = np.where(falling, self.at(np.array([now_s]))[0], self.start)
         began = np.where(falling, now_s, self.began_s)
         until = np.where(which, now_s + self.rise_s + seconds, self.until_s)
-        return Ramp(start, began, until, self.rise_s, self.fall_s)
+        return replace(self, start=start, began_s=began, until_s=until)
 
     @property
     def over_s(self) -> float:
@@ -76,53 +77,42 @@ class Ramp:
         return float(self.until_s.max()) + self.fall_s
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A face (58,) per channel: `before` until `since_s`, then straight to `after`."""
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Requested values (C,): `before` until `since_s`, then to `after` in `change_s`, by a smooth step or straight."""
 
     ramp: Ramp
     before: Doubles
     after: Doubles
     since_s: float
-
-    def values(self, times_s: Doubles) -> Doubles:
-        """Return the values (N, 58) at (N,) instants."""
-        share = np.clip((times_s - self.since_s) / CHANGE_S, 0.0, 1.0)[:, None]
-        value: Doubles = self.before + share * (self.after - self.before)
-        return value
-
-    def then(self, face: Doubles, which: Bools, seconds: Doubles, now_s: float) -> Shown:
-        """Return the same with `which` (58,) bool of `face` (58,) requested from now on."""
-        here = np.array([now_s])
-        value, up = self.values(here)[0], self.ramp.at(here)[0] > 0
-        after = np.where(which, face, self.after)
-        return Shown(self.ramp.hold(which, now_s, seconds), np.where(which & ~up, face, value), after, now_s)
-
-
-@dataclass(frozen=True)
-class Turn:
-    """A turn of eyes or head in (yaw, pitch) [rad]: from `before_rad` in `ramp.rise_s` to `after_rad`."""
-
-    ramp: Ramp
-    before_rad: Doubles
-    after_rad: Doubles
-    since_s: float
+    change_s: float
+    smooth: bool
 
     @classmethod
-    def none(cls, rise_s: float, fall_s: float) -> Turn:
-        return cls(Ramp.zero(2, rise_s, fall_s), np.zeros(2), np.zeros(2), 0.0)
+    def none(cls, size: int, ramp_s: tuple[float, float], change_s: float, smooth: bool) -> Request:
+        still = np.zeros(size)
+        return cls(
+            ramp=Ramp.zero(size, *ramp_s), before=still, after=still, since_s=0.0, change_s=change_s, smooth=smooth
+        )
 
-    def directions_rad(self, times_s: Doubles) -> Doubles:
-        """Return the directions (N, 2) at (N,) instants."""
-        share = ease((times_s - self.since_s) / self.ramp.rise_s)[:, None]
-        direction: Doubles = self.before_rad + share * (self.after_rad - self.before_rad)
-        return direction
+    def values(self, times_s: Doubles) -> Doubles:
+        """Return the values (N, C) at (N,) instants."""
+        share = (times_s - self.since_s) / self.change_s
+        share = ease(share) if self.smooth else np.clip(share, 0.0, 1.0)
+        value: Doubles = self.before + share[:, None] * (self.after - self.before)
+        return value
 
-    def then(self, direction_rad: Doubles, seconds: float, now_s: float) -> Turn:
-        """Return the turn to another direction from now on, for `seconds`."""
+    def then(self, values: Doubles, which: Bools, seconds: Doubles | float, now_s: float) -> Request:
+        """Return the same with `which` (C,) of `values` (C,) requested from now on, for `seconds`."""
         here = np.array([now_s])
-        before = np.where(self.ramp.at(here)[0] > 0, self.directions_rad(here)[0], direction_rad)
-        return Turn(self.ramp.hold(np.ones(2, bool), now_s, seconds), before, direction_rad, now_s)
+        value, up = self.values(here)[0], self.ramp.at(here)[0] > 0
+        return replace(
+            self,
+            ramp=self.ramp.hold(which, now_s, seconds),
+            before=np.where(which & ~up, values, value),
+            after=np.where(which, values, self.after),
+            since_s=now_s,
+        )
 
 
 @dataclass(frozen=True)
@@ -130,9 +120,9 @@ class _Piece:
     """The commands in force from `since_s` on."""
 
     since_s: float
-    shown: Shown
-    eyes: Turn
-    head: Turn
+    shown: Request  # (58,)
+    eyes: Request  # (2,) yaw and pitch [rad]
+    head: Request
 
     @cached_property
     def over_s(self) -> float:
@@ -176,9 +166,10 @@ class Puppet:
         self._gain = np.where(stiff, 0.0, gaze.neck_gain)
         self._asked = _NOTHING
         self._lock = Lock()
-        still = np.zeros(MOTION_DIM)
-        shown = Shown(Ramp.zero(MOTION_DIM, RISE_S, FALL_S), still, still, 0.0)
-        self._pieces = [_Piece(_NEVER_S, shown, Turn.none(EYES_S, FALL_S), Turn.none(HEAD_S, HEAD_S))]
+        shown = Request.none(MOTION_DIM, (RISE_S, FALL_S), CHANGE_S, smooth=False)
+        eyes = Request.none(2, (EYES_S, FALL_S), EYES_S, smooth=True)
+        head = Request.none(2, (HEAD_S, HEAD_S), HEAD_S, smooth=True)
+        self._pieces = [_Piece(_NEVER_S, shown, eyes, head)]
 
     def show(self, face: Floats | Mapping[str, float], seconds: float) -> None:
         """Show a whole face (58,), or some channels by name, for `seconds` once it has risen. Never blocks.
@@ -235,8 +226,8 @@ class Puppet:
             shown = now.shown.then(asked.face, asked.which, asked.seconds, since_s)
             eyes, head = now.eyes, now.head
             if asked.direction_rad is not None:
-                eyes = eyes.then(asked.direction_rad, asked.look_s, since_s)
-                head = head.then(asked.direction_rad, asked.look_s, since_s)
+                both = np.ones(2, bool)
+                eyes, head = (each.then(asked.direction_rad, both, asked.look_s, since_s) for each in (eyes, head))
             self._pieces.append(_Piece(since_s, shown, eyes, head))
         while len(self._pieces) > 1 and self._pieces[1].since_s <= earliest_s:
             self._pieces.pop(0)
@@ -253,9 +244,9 @@ class Puppet:
 
     def _looking(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
         """Turn head and eyes of `motion` (N, 58), in place."""
-        turned = piece.head.directions_rad(times_s) * self._head_share
+        turned = piece.head.values(times_s) * self._head_share
         motion[:, YAW_PITCH] += (piece.head.ramp.at(times_s) * (turned - motion[:, YAW_PITCH])).astype(np.float32)
-        wanted = piece.eyes.directions_rad(times_s) - self._gain * motion[:, YAW_PITCH]
+        wanted = piece.eyes.values(times_s) - self._gain * motion[:, YAW_PITCH]
         both = directions(motion, self._full_rad)  # (N, eye, axis)
         middle = both.mean(axis=1)
         turn(motion, both + (piece.eyes.ramp.at(times_s) * (wanted - middle))[:, None], self._full_rad)

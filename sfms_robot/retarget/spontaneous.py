@@ -191,9 +191,6 @@ class HeadLife:
         self._idle = IdleFiller(config.idle, (config.gaze or Gaze()).full_rad, seed) if config.idle else None
         self._target = GazeTarget(config.person, config.gaze, camera, seed) if config.person else None
 
-    def start(self) -> LifeState:
-        return LifeState()
-
     def step(
         self,
         motion: Floats,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Audit
+from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.events import MOTION_EVENTS
@@ -106,7 +106,7 @@ class RunLog:
 
     joints: Sequence[str]
     period_s: float
-    audit: Audit
+    audit: CommandAudit
     ticks: int = 0
     late: int = 0
     skipped: int = 0
@@ -119,15 +119,15 @@ class RunLog:
     speech_to_wire_ms: Quantiles = field(default_factory=Quantiles)
     eased: int = 0
     listened_s: float = 0.0
-    min_rad: Doubles | None = None
-    max_rad: Doubles | None = None
-    travel_rad: Doubles | None = None
-    audited: Any = None
+    audited: Any = None  # the state of the audit
     state: Any = None  # of the loop at its end, with the counters of timeline and limiter
     torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
     states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
     state_s: dict[str, float] = field(default_factory=dict)
+    _low_rad: Doubles = field(init=False)  # (J,), as the two below
+    _high_rad: Doubles = field(init=False)
+    _travel_rad: Doubles = field(init=False)
     _last_rad: Doubles | None = None
     _waiting: deque[Plan] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _speech_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
@@ -211,12 +211,12 @@ class RunLog:
         self.late_ms.add(late_s * 1e3)
         self.skipped += tick.skipped
         self.audited = self.audit.step(goals_rad, asked_rad, self.audited)
-        if self._last_rad is None or self.min_rad is None or self.max_rad is None or self.travel_rad is None:
-            self.min_rad, self.max_rad, self.travel_rad = goals_rad.copy(), goals_rad.copy(), np.zeros_like(goals_rad)
-        else:
-            self.min_rad = np.minimum(self.min_rad, goals_rad)
-            self.max_rad = np.maximum(self.max_rad, goals_rad)
-            self.travel_rad = self.travel_rad + np.abs(goals_rad - self._last_rad)
+        if self._last_rad is None:
+            self._low_rad, self._high_rad, self._last_rad = goals_rad, goals_rad, goals_rad
+            self._travel_rad = np.zeros_like(goals_rad)
+        self._low_rad = np.minimum(self._low_rad, goals_rad)
+        self._high_rad = np.maximum(self._high_rad, goals_rad)
+        self._travel_rad = self._travel_rad + np.abs(goals_rad - self._last_rad)
         self._last_rad = goals_rad
 
     def attention_report(self) -> dict[str, float | int | None]:
@@ -245,13 +245,10 @@ class RunLog:
 
     def joint_report(self) -> dict[str, dict[str, float]]:
         """Return `joints` of the report: range and travelled way of every goal stream."""
-        if self.min_rad is None or self.max_rad is None or self.travel_rad is None:
+        if self._last_rad is None:
             return {}
+        ways = np.stack([self._low_rad, self._high_rad, self._travel_rad], axis=1).round(5).tolist()
         return {
-            name: {
-                "min_rad": round(float(low), 5),
-                "max_rad": round(float(high), 5),
-                "travel_rad": round(float(way), 5),
-            }
-            for name, low, high, way in zip(self.joints, self.min_rad, self.max_rad, self.travel_rad, strict=True)
+            name: dict(zip(("min_rad", "max_rad", "travel_rad"), each, strict=True))
+            for name, each in zip(self.joints, ways, strict=True)
         }

@@ -2,10 +2,10 @@
 
     source -> listener -> timeline -> retarget -> limits -> bus -> observers
 
-One tick every 1/rate_hz s on absolute deadlines. What changes while it runs is a `State` handed from step to step. It
-is kept as soon as the limiter has decided, so whatever is raised after that, and wherever, the way to rest begins at
-the last command. The reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force
-goes); speed and acceleration are central differences, so one sample lies one tick ahead.
+One tick every 1/rate_hz s on absolute deadlines. All that changes during a run is a `State` passed from step to step.
+It is kept as soon as the limiter has decided, so after any later error the way to rest begins at the last command. The
+reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force goes); speed and
+acceleration are central differences, so one sample lies one tick ahead.
 """
 
 from __future__ import annotations
@@ -21,19 +21,9 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
-from sfms_robot.ports import (
-    Bus,
-    Clock,
-    Limiter,
-    Observer,
-    PlanFeed,
-    Retargeter,
-    Source,
-    SpontaneousMotion,
-    StopPolicy,
-    Tick,
-    Timeline,
-)
+from sfms_robot.motion.limits import JerkLimiter, LimiterState
+from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, StopPolicy, Tick, Timeline
+from sfms_robot.retarget.spontaneous import HeadLife, LifeState
 from sfms_robot.runtime.clock import tick_times
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
@@ -42,39 +32,39 @@ from sfms_robot.runtime.safety import EASE_S, Heat, HeatGuard, come_to_rest, tem
 from sfms_robot.runtime.states import Fade, Presence, RunState, Situation, following
 from sfms_robot.signals.minimum_jerk import ease
 
-LOOK_S: Final = 0.1  # between two looks at what is lost
-WARMTH_S: Final = 1.0  # and at how warm servos are
+LOOK_S: Final = 0.1  # period of the check for lost servos
+WARMTH_S: Final = 1.0  # and of temperatures
 AWAY_S: Final = 1.0  # a position older than this: the servo is away
 PINCH: Final = "pinch"  # a fault that begins so
 _LOADED: Final = np.fft, np.ma  # numpy imports both at their first use, which must not be inside the loop
 _TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "pitch") or name.startswith("eyeLook")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Parts:
-    """Everything a run is made of, put together by `app`; (J,) in joint order.
+    """The parts of a run, put together by `app`; (J,) in joint order.
 
     Attributes:
         leads_s, rest_rad: (J,).
-        knobs: asked at every tick how much the head is to show; None: what its file says.
-        overlay: (motion (N, 58), times (N,)) -> motion lays what somebody asks for by hand over what is planned.
-        answers: what is planned shows only while somebody is there.
-        halt: asked at every tick.
+        knobs: called at every tick for the knobs of the head; None: those of its file.
+        overlay: (motion (N, 58), times (N,)) -> motion adds the commands of a program to the plan.
+        answers: the plan shows only while a person is there.
+        halt: read at every tick.
         holds: (J,) joints that keep their torque when halted; None: no joint does.
-        heat: None: temperatures are nobody's business here.
-        ignored: joints whose faults are known and wanted.
+        heat: temperature derating; None disables it.
+        ignored: joints whose faults are known and accepted.
     """
 
     source: Source
     feed: PlanFeed
     timeline: Timeline
     retargeter: Retargeter
-    limiter: Limiter
+    limiter: JerkLimiter
     bus: Bus
     observers: Sequence[Observer]
     leads_s: Doubles
     rest_rad: Doubles
-    life: SpontaneousMotion | None = None
+    life: HeadLife | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False
@@ -84,31 +74,31 @@ class Parts:
     ignored: frozenset[str] = frozenset()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class State:
-    """What one tick hands to the next.
+    """State of the loop between two ticks.
 
     Attributes:
-        held_rad, since_s: (J,) the pose torque came on in, and when.
+        held_rad, since_s: (J,) the pose in which torque came on, and its time.
         before_rad, here_rad: (J,) two samples of the reference.
         goals_rad: (J,) the last command; `motion` (58,) the face behind it.
-        run: the state of the run; `presence` and `lost_joints` are what it is judged by.
-        answer: how much of the listener's answer shows.
+        run: the state of the run, judged by `presence` and `lost_joints`.
+        answer: share of the listener's answer that shows.
         released: (J,) joints that a halt has let go of and that have not come back; their goals stand still.
         stands: it is halted, and has let go of all that it does not hold.
     """
 
     timeline: Any
-    limiter: Any
+    limiter: LimiterState
     held_rad: Doubles
     since_s: Doubles
     before_rad: Doubles
     here_rad: Doubles
     goals_rad: Doubles
-    life: Any
     retargeter: Any
     heat: Heat
     released: NDArray[np.bool_]
+    life: LifeState = LifeState()
     presence: Presence = field(default_factory=Presence.start)
     run: RunState = RunState()
     lost_joints: tuple[str, ...] = ()
@@ -127,10 +117,10 @@ def drive(
     interrupted: Callable[[], bool],
     stop: StopPolicy = "release",
 ) -> str:
-    """Torque on, ease in, listen for `duration_s`, ease to rest, torque off. Returns "done" or "interrupted".
+    """Run: torque on, ease in, listen for `duration_s`, ease to rest, torque off. Return "done" or "interrupted".
 
-    Blocks until then. Whatever is raised on the way, wherever, every bus that still works eases its joints to rest,
-    and `bus.stop` is called before it is raised further.
+    Blocks until then. After any error every bus that still works eases its joints to rest, and `bus.stop` is called
+    before the error is raised further.
     """
     observers = Observers(parts.observers)
     log.detached = observers.detached
@@ -142,7 +132,7 @@ def drive(
         try:
             parts.source.start(clock.origin_s + start_s)
             for tick in tick_times(clock, rate_hz, start_s):
-                if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end hears the last frame
+                if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end reads the last frame
                     break
                 before_rad = state.goals_rad
                 state = _heard(parts, observers, log, tick.time_s, state)
@@ -163,16 +153,30 @@ def drive(
                 parts.source.moves(float(np.abs(command.goals_rad - before_rad).sum() * rate_hz))
                 observers.tick(
                     Tick(
-                        tick.time_s, command.motion, command.goals_rad, readings, state.run.name, state.run.why,
-                        written_s,
+                        time_s=tick.time_s,
+                        motion=command.motion,
+                        goals_rad=command.goals_rad,
+                        readings=readings,
+                        state=state.run.name,
+                        why=state.run.why,
+                        written_s=written_s,
                     )
-                )  # fmt: skip
+                )
         finally:
             state = _ending(log, clock.now_s() - start_s, state)
             if not parts.halt.causes:  # a head that was halted moves no more
                 way = tick_times(clock, rate_hz, start_s)
                 seen = partial(_seen_on_the_way, observers, state)
-                come_to_rest(parts.bus, parts.limiter, state.limiter, state.here_rad, parts.rest_rad, way, log, seen)
+                come_to_rest(
+                    parts.bus,
+                    parts.limiter,
+                    state.limiter,
+                    from_rad=state.here_rad,
+                    rest_rad=parts.rest_rad,
+                    ticks=way,
+                    log=log,
+                    seen=seen,
+                )
             log.state = state
     finally:
         parts.bus.stop(stop)
@@ -180,7 +184,7 @@ def drive(
 
 
 def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> State | None:
-    """Torque on, joint by joint, so that who asks to end need not wait for all of them; None when somebody did."""
+    """Switch torque on, joint by joint; None if the run is interrupted meanwhile."""
     held_rad = np.zeros(len(parts.retargeter.joints))
     for index, joint in enumerate(parts.retargeter.joints):
         if interrupted():
@@ -191,14 +195,21 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
             raise BusError(f"halted by {', '.join(parts.halt.causes)} while joints were switched on")
     log.start(held_rad)
     return State(
-        parts.timeline.start(), parts.limiter.start(held_rad), held_rad, 0 * held_rad, held_rad, held_rad, held_rad,
-        parts.life.start() if parts.life else None, parts.retargeter.start(), Heat.cool(len(held_rad)),
-        np.zeros(len(held_rad), np.bool_),
-    )  # fmt: skip
+        timeline=parts.timeline.start(),
+        limiter=parts.limiter.start(held_rad),
+        held_rad=held_rad,
+        since_s=0 * held_rad,
+        before_rad=held_rad,
+        here_rad=held_rad,
+        goals_rad=held_rad,
+        retargeter=parts.retargeter.start(),
+        heat=Heat.cool(len(held_rad)),
+        released=np.zeros(len(held_rad), np.bool_),
+    )
 
 
 def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: State) -> State:
-    """Frames of the person go to the listener, plans that are ready join the timeline."""
+    """Pass frames of the person to the listener, and plans that are ready to the timeline."""
     presence = state.presence
     for frame in parts.source.read(now_s):
         presence = presence.after(frame)
@@ -217,7 +228,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 
 
 def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
-    """Return the state with what the run is doing from here on."""
+    """Return the state with the state of the run from here on."""
     presence = state.presence
     lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
     eased_in = bool(now_s - state.since_s.max() >= EASE_S)
@@ -243,21 +254,21 @@ def _ending(log: RunLog, now_s: float, state: State) -> State:
 def _seen_on_the_way(
     observers: Observers, state: State, now_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]
 ) -> None:
-    """A tick of the way to rest, of which the share `ahead` is still to go: the last face fades with it."""
+    """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
     motion = state.motion * np.float32(ahead)
     observers.tick(Tick(now_s, motion, goals_rad, readings, state.run.name, state.run.why))
 
 
 def turned_by_hand(planned: Floats, asked: Floats) -> bool:
-    """Whether what is asked (N, 58) turns head or eyes otherwise than what was planned (N, 58)."""
+    """Return whether the requested motion (N, 58) turns head or eyes differently from the planned one (N, 58)."""
     return asked is not planned and not np.array_equal(asked[:, _TURNING], planned[:, _TURNING])
 
 
 @dataclass(frozen=True)
 class Command:
-    """What a tick asks of the servos: goals (J,), what the limiter was asked for (J,), the face (58,) behind it.
+    """Command of a tick: goals (J,), the limiter's reference (J,), the face (58,) behind it.
 
-    `reach_s`: how far into the timeline it looked.
+    `reach_s`: latest instant of the timeline that it used.
     """
 
     goals_rad: Doubles
@@ -267,7 +278,7 @@ class Command:
 
 
 def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tuple[State, Command]:
-    """The face of this instant, each joint ahead by its lead, as goals inside the limits."""
+    """Return the goals inside the limits for the face of this instant, each joint ahead by its lead."""
     ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
     times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
@@ -300,10 +311,10 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
 
 
 def _halted(parts: Parts, now_s: float, state: State) -> tuple[State, Command]:
-    """Brake; once all joints stand, let go of those that need not hold themselves."""
+    """Brake; once all joints stand, release those that need not hold."""
     goals_rad, limiter = parts.limiter.brake(state.limiter)
     released, stands = state.released, state.stands
-    if state.run.since_s == now_s and released.any():  # on their way back from a halt before: not now
+    if state.run.since_s == now_s and released.any():  # on their way back from an earlier halt
         _let_go(parts, released)
     if not stands and np.array_equal(goals_rad, state.goals_rad):
         stands, released = True, np.ones_like(released) if parts.holds is None else released | ~parts.holds
@@ -317,7 +328,7 @@ def _let_go(parts: Parts, which: NDArray[np.bool_]) -> None:
 
 
 def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
-    """End a halt: held joints ease in from where they stand now, the others from where they come back."""
+    """End a halt: held joints ease in from their present angles, the others from those they return at."""
     parts.bus.resume(parts.retargeter.joints)
     every = np.ones_like(state.released)
     back = state.released & [joint not in parts.ignored for joint in parts.retargeter.joints]
@@ -325,12 +336,12 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
-    """Ease joints that were away in again from where they stand, as all did when torque came on."""
+    """Ease in joints that were away again from their present angles, as at the start."""
     joints = parts.retargeter.joints
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
     if not back.any():
         return state
-    stands_rad = state.goals_rad.copy()  # of a servo that cannot tell its position, too
+    stands_rad = state.goals_rad.copy()  # also for a servo without a position
     for index in np.flatnonzero(back).tolist():
         position_rad = readings[joints[index]].position_rad
         stands_rad[index] = stands_rad[index] if position_rad is None else position_rad
@@ -340,7 +351,7 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
 def _eased_in_from(
     parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: State, now_s: float
 ) -> State:
-    """`which` (J,) joints stand still at `stands_rad` (J,) from `now_s` on, and are led into the face; others go on."""
+    """Return the state in which `which` (J,) joints ease in from standing at `stands_rad` (J,), from `now_s` on."""
     log.restart(which, stands_rad)
 
     def stand(angles_rad: Doubles) -> Doubles:
@@ -354,7 +365,7 @@ def _eased_in_from(
 
 
 def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s: float, period_s: float) -> State:
-    """Take what the servos say: which are away, faulty or warm; a pinch while halted lets go of all at once."""
+    """Use the readings: servos that are away, faulty or warm; a pinch while halted releases all at once."""
     heat = state.heat
     if parts.heat:
         if _due(now_s, period_s, WARMTH_S):
@@ -375,10 +386,10 @@ def _is_lost(reading: Reading) -> bool:
 
 
 def _due(now_s: float, period_s: float, every_s: float) -> bool:
-    """Whether this is the first tick of a new `every_s`."""
+    """Return whether this is the first tick of a new `every_s`."""
     return math.floor(now_s / every_s + 1e-9) != math.floor((now_s - period_s) / every_s + 1e-9)
 
 
 def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:
-    """Angle, speed and acceleration at `here` from three samples (J,) one period apart -> (3, J)."""
+    """Return angle, speed and acceleration (3, J) at `here` from three samples (J,) one period apart."""
     return np.stack([here, (ahead - before) / (2 * period_s), (ahead - 2 * here + before) / period_s**2])

@@ -53,6 +53,7 @@ _log = logging.getLogger(__name__)
 
 _NUMBER: Final = {"type": "number"}
 _NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
+_NUMBERS_OR_NULL: Final = {"type": ["array", "null"], "items": _NUMBER}
 _PCM16: Final = {"type": "string", "contentEncoding": "base64"}
 _CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
 _JOINT: Final = {
@@ -72,9 +73,9 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "audio_hz": _NUMBER,
         "energy_db": _NUMBER,
         "face": {"type": ["object", "null"], "properties": _CHANNELS},
-        "jaw_rad": {"type": ["array", "null"], "items": _NUMBER},
+        "jaw_rad": _NUMBERS_OR_NULL,
         "attention": _NUMBER_OR_NULL,
-        "place_m": {"type": ["array", "null"], "items": _NUMBER},
+        "place_m": _NUMBERS_OR_NULL,
     },
     "/plan": {
         "made_at_s": _NUMBER,
@@ -89,7 +90,7 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
         "duration_s": _NUMBER,
         "size": _NUMBER,
         "swings": _NUMBER,
-        "target_rad": {"type": ["array", "null"], "items": _NUMBER},
+        "target_rad": _NUMBERS_OR_NULL,
         "probability": _NUMBER_OR_NULL,
         "draw": _NUMBER_OR_NULL,
         "evidence": {"type": "object", "additionalProperties": _NUMBER},

@@ -15,12 +15,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import Bus, Limiter
+from sfms_robot.motion.limits import JerkLimiter, LimiterState
+from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.signals.minimum_jerk import ease
@@ -41,8 +42,9 @@ logger = logging.getLogger(__name__)
 
 def come_to_rest(
     bus: Bus,
-    limiter: Limiter,
-    state: Any,
+    limiter: JerkLimiter,
+    state: LimiterState,
+    *,
     from_rad: Doubles,
     rest_rad: Doubles,
     ticks: Iterable[TickTime],

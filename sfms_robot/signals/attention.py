@@ -33,7 +33,7 @@ FORGET_S: Final = 10.0  # a face after so long is another person
 _FULL_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AttentionState:
     """Memory of a face.
 
@@ -80,7 +80,15 @@ def attend(
     looks = _at(float(np.hypot(*(gaze_rad - neutral_rad)))) if face.time_s - open_s <= BLINK_S else 0.0
     attention = looks if first else looks + (before.attention - looks) * math.exp(-dt_s / SMOOTH_S)
     turns = before.turns or bool(motion[YAW_PITCH].any() or directions(motion, _FULL_RAD).any())
-    after = AttentionState(face.time_s, seen_s, neutral_rad, eyes_rad, open_s, attention, turns)
+    after = AttentionState(
+        time_s=face.time_s,
+        seen_s=seen_s,
+        neutral_rad=neutral_rad,
+        eyes_rad=eyes_rad,
+        open_s=open_s,
+        attention=attention,
+        turns=turns,
+    )
     return attention if turns else None, after
 
 

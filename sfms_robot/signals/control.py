@@ -1,8 +1,8 @@
-"""Events as numbers per frame: what a model of motion is told of a nod, a smile, a blink that has been decided.
+"""Control rows: decided events, such as a nod, a smile or a blink, as numbers per frame for a model of motion.
 
-Training reads the events that a dyad is made of, a stream those that it has decided so far; both get the same rows from
-here. Row i is the face at the end of frame i. Laws: rows of two halves are the rows of the whole; an event outside its
-time changes nothing; rows are finite, and bounded by `BOUND`, whatever the events.
+Training uses the events that a dyad is made of, a stream those decided so far; both get the same rows from here. Row i
+is the face at the end of frame i. Laws: rows of two halves are the rows of the whole; an event outside its time changes
+nothing; rows are finite, and bounded by `BOUND`, for any events.
 
 Of every kind: it is under way (0 or 1), for how long (logarithm), how much of it is over (0..1), its size. Of kinds
 that swing also sine and cosine of the swing: where in it the head is.
@@ -30,9 +30,9 @@ _SOFT_S: Final = 0.2
 
 
 def control_track(events: Sequence[ListenerEvent], first: int, frames: int) -> Floats:
-    """Rows (frames, len(COLUMNS)) of frames `first`, `first` + 1, ...; times of the events count from frame 0.
+    """Return rows (frames, len(COLUMNS)) of frames `first`, `first` + 1, ...; times of the events count from frame 0.
 
-    Of two events of one kind at one time the later one is told. Kinds without columns are left out.
+    Of two events of one kind at one time the later one counts. Kinds without columns are left out.
     """
     out = np.zeros((frames, len(COLUMNS)), np.float32)
     begin_s, over_s = (first + 1) * FRAME_S, (first + frames) * FRAME_S
@@ -64,5 +64,5 @@ def _tell(out: Floats, rows: slice, since_s: np.typing.NDArray[np.float64], even
 
 
 def since_s(told: Floats) -> Doubles:
-    """Column `since` (...,) -> how long the event is under way, seconds; the longest that is told is 10.7."""
+    """Return the elapsed time [s] of events from column `since` (...,), at most 10.7."""
     return np.asarray(_SOFT_S * np.expm1(told.astype(np.float64)))

@@ -1,8 +1,8 @@
-"""How large and how long a listener's events are: what composed dyads, the event model and its teacher share.
+"""Sizes and durations of a listener's events, for composed dyads, the event model and its teacher.
 
-Sizes of nods, shakes and tilts are degrees from peak to peak, those of a face shares of full closure or pull. Nobody
-measured the sizes of annotated nods: these are of the recorded heads that composed dyads are made of. Looks aside are
-those of 14 people who listened to somebody with no table between them (Dembinsky et al., ETRA 2024, github
+Sizes of nods, shakes and tilts are degrees from peak to peak, those of a face shares of full closure or pull. Sizes of
+annotated nods are unknown: these are of the recorded heads that composed dyads are made of. Looks aside are those of 14
+people who listened to another without a table between them (Dembinsky et al., ETRA 2024, github
 psyberlab/eye-gaze-during-conversation-dataset e156145, Apache-2.0): beyond 5 degrees of the other's face for 0.86 s in
 the mean.
 """
@@ -39,18 +39,18 @@ SIDEWAYS, UP = 0.75, 0.75  # shares of looks away: rather sideways than not, rat
 
 
 def swings(length_s: float, pace_hz: float) -> tuple[int, float]:
-    """How often a head goes there and back in about that time, and how long that takes it."""
+    """Return the number of swings, there and back, in about that time, and their duration [s]."""
     count = int(min(max(round(length_s * pace_hz), 1), MOST_SWINGS))
     return count, count * min(max(length_s / count, SWING_S[0]), SWING_S[1])
 
 
 def swing_reach_rad(swing_s: float) -> float:
-    """How far, peak to peak, a head gets there and back within that time."""
+    """Return the peak-to-peak size that a head reaches in a swing of that duration."""
     return math.radians(float(np.interp(swing_s, *SWING_REACH)))
 
 
 def aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:
-    """(yaw, pitch) that far away, to either side alike; `side` and `up` by lot in 0..1."""
+    """Return (yaw, pitch) at that angle, to either side equally; `side` and `up` are random in 0..1."""
     share = 2 * side % 1.0
     steep = 45.0 * (share / SIDEWAYS if share < SIDEWAYS else 1 + (share - SIDEWAYS) / (1 - SIDEWAYS))
     yaw = math.copysign(math.cos(math.radians(steep)), 0.5 - side)
@@ -58,10 +58,10 @@ def aside(angle_rad: float, side: float, up: float) -> tuple[float, float]:
 
 
 def aside_rad(share: float) -> float:
-    """How far aside a look goes; `share` by lot in 0..1."""
+    """Return the angle of a look aside; `share` is random in 0..1."""
     return math.radians(float(np.interp(share, *ASIDE_DEG)))
 
 
 def aside_s(share: float) -> float:
-    """How long one lasts, likewise; `share` below 1."""
+    """Return the duration of a look aside; `share` is random in 0..1, below 1."""
     return ASIDE_LEAST_S - (ASIDE_MEAN_S - ASIDE_LEAST_S) * math.log1p(-share)

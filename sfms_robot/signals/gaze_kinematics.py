@@ -29,7 +29,7 @@ from sfms_robot.signals.minimum_jerk import ease, minimum_jerk
 
 EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
-# Columns of a motion row that `GazeFrame.eyes` stands for.
+# Columns of a motion row that are the eyes' here.
 EYE_CHANNELS: Final = tuple(
     CHANNEL_INDEX[f"eyeLook{way}{side}"] for side in ("Left", "Right") for way in ("Down", "In", "Out", "Up")
 )
@@ -47,19 +47,6 @@ _FIXATION_S: Final = (0.228, 0.48, 0.11)  # median, deviation of its logarithm, 
 
 Pair = tuple[float, float]  # yaw, pitch
 Axis = tuple[float, float, float]  # angle, speed, acceleration
-
-
-@dataclass(frozen=True)
-class GazeFrame:
-    """Gaze in one frame.
-
-    Attributes:
-        head_rad: (3,) roll, pitch, yaw that the look adds to the head.
-        eyes: (8,) values of `EYE_CHANNELS`, 0..1.
-    """
-
-    head_rad: Floats
-    eyes: Floats
 
 
 @dataclass(frozen=True)
@@ -98,25 +85,16 @@ def start(seed: int, wanders: bool = True) -> GazeState:
     return GazeState(seed, wanders, float(np.random.default_rng(seed).uniform(*_SHARES)))
 
 
-def step(target_rad: ArrayLike, pose: ArrayLike, state: GazeState) -> tuple[GazeFrame, GazeState]:
-    """Return the gaze at the end of the next 40 ms, and the state after it.
+def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:
+    """Return the gaze of N frames of 40 ms: the head's part (N, 3), the eyes (N, 8), and the state after each.
 
     Args:
-        target_rad: (2,) yaw and pitch in space, (0, 0) at the person; from the beginning of the frame on.
-        pose: (6,) of the head without its part of the look, at the end of the frame.
+        targets_rad: (N, 2) yaw and pitch in space, (0, 0) at the person; from the beginning of each frame on.
+        poses: (N, 6) of the head without its part of the look, at the end of each frame.
 
-    Raises ValueError for a value that is not finite.
+    The head's part is roll, pitch, yaw [rad]; the eyes are values of `EYE_CHANNELS`, 0..1. Raises ValueError for a
+    value that is not finite.
     """
-    yaw, pitch = (float(value) for value in np.asarray(target_rad, np.float64))
-    _, tilted, turned, *_ = (float(value) for value in np.asarray(pose, np.float64))
-    if not (math.isfinite(yaw) and math.isfinite(pitch) and math.isfinite(tilted) and math.isfinite(turned)):
-        raise ValueError(f"gaze target ({yaw:g}, {pitch:g}) with head at yaw {turned:g}, pitch {tilted:g}: not finite")
-    head, eyes, after = _step((yaw, pitch), (turned, tilted), state)
-    return GazeFrame(np.array(head, np.float32), np.array(eyes, np.float32)), after
-
-
-def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:
-    """Run `step` over targets (N, 2) and poses (N, 6): the head's part (N, 3), the eyes (N, 8), all states."""
     targets, heads = np.asarray(targets_rad, np.float64), np.asarray(poses, np.float64)[:, POSE]
     if not (np.isfinite(targets).all() and np.isfinite(heads[:, 1:3]).all()):
         raise ValueError("gaze targets or head poses are not finite")
@@ -147,7 +125,7 @@ def head_part(gaze_rad: ArrayLike) -> Floats:
 
 
 def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...], tuple[float, ...], GazeState]:
-    """Return the head's part and the eyes, as in a `GazeFrame`, and the state after them."""
+    """Return the head's part (roll, pitch, yaw), the eyes (`EYE_CHANNELS`), and the state after one frame."""
     state = _aimed(target, state)
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
     part = minimum_jerk(min(1.0, since_s / state.shift_s))

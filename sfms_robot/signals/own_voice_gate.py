@@ -52,7 +52,7 @@ _RAMP: Final = 160  # samples over which the gain changes
 _NONE: Final = np.zeros(0, np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HeardFrame:
     """40 ms of sound that may hold a person's voice.
 
@@ -136,7 +136,14 @@ class OwnVoiceGate:
         if self._probability < NO_SPEECH and not voice and not self._echoes:
             self._motors.learn()
         audio = self._turn(left, REJECTED_GAIN if (self._echoes or moves) and not voice else 1.0)
-        return HeardFrame(audio, voice, self._probability, mic_db, left_db, reference_db)
+        return HeardFrame(
+            audio=audio,
+            voice=voice,
+            probability=self._probability,
+            mic_db=mic_db,
+            left_db=left_db,
+            reference_db=reference_db,
+        )
 
     def _suppressed(self, left: Floats, speed_rad_s: ArrayLike) -> Floats:
         """Return the input of the network: (640,) without motors and, where there is a reference, without echo."""

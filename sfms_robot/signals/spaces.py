@@ -26,47 +26,50 @@ from sfms_robot.signals.rotations import rotation as rotation_of
 LOCKED: Final = 1e-7  # cosine of an angle about y from which x and z cannot be told apart
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Space:
-    """One motion space.
+    """One motion space; rotations in radians, translation without a metric scale.
 
     Attributes:
         dim: numbers per frame.
-        expression, rotation: where they stand; `translation` and `jaw` where there are any.
-        unit: of rotation and translation.
+        expression, rotation: their places; `translation` and `jaw` where there are any.
         euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
         axes: A (3, 3), rows are our x, y, z in the space's axes.
         neutral: rotation of a face that looks straight ahead, as the space writes it.
-        metres_per_unit: of the translation; None: it has no metric scale and is left out.
         verified: proof of the axes; None: they are unproved and may have to be flipped.
     """
 
-    name: str
     dim: int
     expression: slice
     rotation: slice
-    translation: slice | None
-    jaw: slice | None
-    unit: str
-    euler: bool
+    translation: slice | None = None
+    jaw: slice | None = None
+    euler: bool = False
     axes: tuple[tuple[int, int, int], ...]
-    neutral: tuple[float, float, float]
-    metres_per_unit: float | None
-    verified: str | None
+    neutral: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    verified: str | None = None
 
 
 # FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
 # row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
 SPACES: Final[Mapping[str, Space]] = {
     "faceverse58": Space(
-        "faceverse58", 58, slice(0, 52), slice(52, 55), slice(55, 58), None, "rad, no metric scale", True,
-        ((0, 0, -1), (1, 0, 0), (0, -1, 0)), (np.pi, 0.0, 0.0), None, None,
+        dim=58,
+        expression=slice(0, 52),
+        rotation=slice(52, 55),
+        translation=slice(55, 58),
+        euler=True,
+        axes=((0, 0, -1), (1, 0, 0), (0, -1, 0)),
+        neutral=(np.pi, 0.0, 0.0),
     ),
     "deca56": Space(
-        "deca56", 56, slice(0, 50), slice(50, 53), None, slice(53, 56), "rad", False,
-        ((0, 0, 1), (1, 0, 0), (0, 1, 0)), (0.0, 0.0, 0.0), None, None,
+        dim=56,
+        expression=slice(0, 50),
+        rotation=slice(50, 53),
+        jaw=slice(53, 56),
+        axes=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -111,11 +114,10 @@ def decode(
 
     motion = np.zeros((len(values), MOTION_DIM))
     motion[:, POSE][:, :3] = angles_of(axes @ _rotations(known, values[:, known.rotation]) @ upright.T)
-    scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
-    if known.translation is not None and scale is not None and len(values):
+    if known.translation is not None and metres_per_unit is not None and len(values):
         place = values[:, known.translation]
         home = np.median(place, axis=0) if neutral is None else np.asarray(neutral)[known.translation]
-        motion[:, POSE][:, 3:] = scale * (place - home) @ axes.T
+        motion[:, POSE][:, 3:] = metres_per_unit * (place - home) @ axes.T
 
     if known.jaw is None:
         shapes = reorder(values[:, known.expression], "faceverse")
@@ -154,9 +156,8 @@ def encode(
         from scipy.spatial.transform import Rotation
 
         out[:, known.rotation] = Rotation.from_matrix(whole).as_rotvec()
-    scale = metres_per_unit if metres_per_unit is not None else known.metres_per_unit
-    if known.translation is not None and scale is not None:
-        out[:, known.translation] += values[:, POSE][:, 3:] @ axes / scale
+    if known.translation is not None and metres_per_unit is not None:
+        out[:, known.translation] += values[:, POSE][:, 3:] @ axes / metres_per_unit
     if known.jaw is None:
         out[:, known.expression] = values[:, SHAPES]
     else:

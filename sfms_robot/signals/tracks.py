@@ -1,9 +1,8 @@
-"""Face-track files: CSV (also gzipped) in, motion in our units and axes out.
+"""Face-track files: CSV (also gzipped), read as motion in our units and axes.
 
 Columns go by name, in any case, so the column order of the Live Link app, of its UDP packet, of Apple's header and of
 MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without one
-they are radians and metres. What a source's axes and signs mean is one row of `SOURCES`; a sign that nothing at hand
-proves stays marked there, and can be flipped by the reader.
+they are radians and metres. Axes and signs of a source are one row of `SOURCES`; an unproved sign is marked there.
 
 A row of NaN means: no face was seen.
 """
@@ -31,48 +30,43 @@ from sfms_robot.frames import (
     CHANNELS,
     FRAME_HZ,
     MOTION_DIM,
-    POSE_CHANNELS,
+    SHAPES,
     Doubles,
     Floats,
 )
 
 logger = logging.getLogger(__name__)
 
-Signs = tuple[int, int, int]
-
 
 @dataclass(frozen=True)
 class SourceAxes:
-    """How one source's head pose becomes ours: roll + right ear down, pitch + nose down, yaw + own left.
+    """Conversion of one source's head pose to ours: roll + right ear down, pitch + nose down, yaw + own left.
 
     Attributes:
         angles: sign of its roll, pitch, yaw.
         position: its axis for our x (forward), y (left), z (up).
-        position_sign: sign of each of these.
-        from_camera: position is measured from a camera, so its median over the file is taken off.
-        verified: how the signs are known, or None: nobody has proved them; flip what turns out wrong.
+        from_camera: position is measured from a camera, so its median over the file is subtracted.
+        verified: proof of the signs; None: they are unproved and may have to be flipped.
     """
 
-    angles: Signs
+    angles: tuple[int, int, int]
     position: tuple[str, str, str]
-    position_sign: Signs
     from_camera: bool
     verified: str | None
 
 
 # All three turn yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll).
 SOURCES: Final[Mapping[str, SourceAxes]] = {
-    "robot": SourceAxes((1, 1, 1), ("x", "y", "z"), (1, 1, 1), False, "our own axes, written by write_track"),
+    "robot": SourceAxes((1, 1, 1), ("x", "y", "z"), False, "our own axes, written by write_track"),
     "mediapipe": SourceAxes(
         (1, 1, 1),
         ("z", "x", "y"),
-        (1, 1, 1),
         True,
         "camera frame x viewer's right, y up, z to the viewer; R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform",
     ),
     # In think-biq/LLV @ 07ec14c examples/dao.gesichter the eyes turn against HeadYaw (r = -0.95 with the look-left
     # channels), as they do when a face keeps looking at its phone: a hint that + is own left, no proof.
-    "live_link": SourceAxes((1, 1, 1), ("z", "x", "y"), (1, 1, 1), True, None),
+    "live_link": SourceAxes((1, 1, 1), ("z", "x", "y"), True, None),
 }
 
 _UNITS: Final = {"deg": math.pi / 180, "rad": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -89,9 +83,16 @@ _TIME_COLUMNS: Final = {
 _SHAPE_BY_KEY: Final = {name.lower(): name for name in BLENDSHAPES}
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
 _USUAL_STEP_S: Final = (1e-3, 2.0)  # beyond these a time column is in another unit
-_SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped; percent or another unit is refused
-_LARGEST_RAD: Final = 2 * math.pi
-_LARGEST_M: Final = 10.0
+_ANGLES: Final = ("roll", "pitch", "yaw")
+_PLACE: Final = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
+# Lowest and highest value, and the problem of one beyond: most likely it is in another unit.
+_RANGES: Final[Mapping[str, tuple[float, float, str]]] = {
+    **dict.fromkeys(
+        _ANGLES, (-2 * math.pi, 2 * math.pi, "is more than a turn: in degrees? (_deg at the column's name)")
+    ),
+    **dict.fromkeys(("x", "y", "z"), (-10.0, 10.0, "is more than 10 m: in cm or mm? (_cm at the column's name)")),
+}
+_SHAPE_RANGE: Final = (-0.5, 2.0, "is not a blendshape (0 to 1)")  # a tracker may overshoot 0..1, and is clipped
 _TIME_EPS_S: Final = 1e-6
 
 
@@ -115,49 +116,45 @@ class Track:
         return float(self.times_s[-1]) if len(self.times_s) else 0.0
 
 
-@dataclass(frozen=True)
-class _Column:
-    """Where one of our channels stands in the file, and its factor to our unit."""
+def read_track(path: Path | str) -> Track:
+    """Read a face track; its source (`SOURCES`) is recognised by the header.
 
-    index: int
-    channel: str
-    factor: float
-
-
-def read_track(path: Path | str, source: str | None = None, flip: Iterable[str] = ()) -> Track:
-    """Read a face track.
-
-    `source` is a key of `SOURCES`, or None: told from the header. `flip` names pose channels whose sign is turned.
-    Raises ConfigError, in one line with file, row and column, for what cannot be used: ragged rows, cells divided by
-    something else than commas, values or times that are in another unit.
+    Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, cells
+    divided by something else than commas, values or times that are in another unit.
     """
     file = Path(path)
     header, rows = _cells(file)
     if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
         raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
-    axes = _axes(file, source, header)
+    axes = _axes(header)
     columns = _columns(file, header, axes)
-    time_column = _time_column(file, header)
+    time_column = next((index for index, name in enumerate(header) if name.lower() in _TIME_COLUMNS), None)
+    if time_column is None:
+        raise ConfigError(f"{file}: no column tells the time (Timecode, t_s, time_s, t_ms, time_ms)")
     rows = _even(file, header, rows, time_column)
-    flipped = _flips(file, flip)
 
-    motion = np.zeros((len(rows), MOTION_DIM), dtype=np.float64)
-    for number, row in enumerate(rows):
-        motion[number] = _motion_row(file, number + 2, row, header, columns)
-    times_s = _times(file, header[time_column], [row[time_column] for row in rows])
-    if axes.from_camera:
-        moved = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
-        seen = np.isfinite(motion[:, 0])
-        if seen.any():
-            motion[:, moved] -= np.median(motion[seen, moved], axis=0)
-    motion[:, flipped] *= -1
-    motion[:, len(POSE_CHANNELS) :] = np.clip(motion[:, len(POSE_CHANNELS) :], 0.0, 1.0)
-    return Track(times_s, motion.astype(np.float32), frozenset(column.channel for column in columns))
+    motion = np.zeros((len(rows), MOTION_DIM))
+    for channel, (index, factor) in columns.items():
+        cells = [row[index].strip() for row in rows]
+        lost = [cell == "" or cell.lower() == "nan" for cell in cells]
+        values = factor * np.where(lost, np.nan, _numbers(file, header[index], np.where(lost, "0", cells)))
+        low, high, problem = _RANGES.get(channel, _SHAPE_RANGE)
+        outside = np.flatnonzero((values < low) | (values > high))
+        if len(outside):
+            row = int(outside[0])
+            raise ConfigError(f"{file}: row {row + 2}, column {header[index]} = {cells[row]} {problem}")
+        motion[:, CHANNEL_INDEX[channel]] = values
+    motion[np.isnan(motion).any(axis=1)] = np.nan
+    if axes.from_camera and np.isfinite(motion[:, 0]).any():
+        motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
+    motion[:, SHAPES] = np.clip(motion[:, SHAPES], 0.0, 1.0)
+    times_s = _times(file, header[time_column], [row[time_column].strip() for row in rows])
+    return Track(times_s, motion.astype(np.float32), frozenset(columns))
 
 
 def write_track(path: Path | str, track: Track) -> None:
     """Write a track in our own axes; gzipped when the name ends in `.gz`. An unseen face becomes empty cells."""
-    units = dict.fromkeys(("roll", "pitch", "yaw"), "_rad") | dict.fromkeys(("x", "y", "z"), "_m")
+    units = dict.fromkeys(_ANGLES, "_rad") | dict.fromkeys(("x", "y", "z"), "_m")
     names = [name for name in CHANNELS if name in track.known]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -171,7 +168,7 @@ def write_track(path: Path | str, track: Track) -> None:
 
 
 def resample(track: Track, rate_hz: float = FRAME_HZ, start_s: float = 0.0) -> Track:
-    """The track at start_s, start_s + 1/rate_hz, ... up to its last row.
+    """Return the track at start_s, start_s + 1/rate_hz, ... up to its last row.
 
     Linear in time; a blink takes its maximum over the interval that ends at the instant, so that none falls between
     frames. NaN before the first row and wherever a neighbour is NaN or more than 0.25 s away.
@@ -204,9 +201,27 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
 # --- the parts of reading ---------------------------------------------------------------------------------------
 
 
+def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows that are not empty."""
+    try:
+        data = file.read_bytes()
+        if data[:2] == b"\x1f\x8b":
+            data = gzip.decompress(data)
+        rows = [row for row in csv.reader(io.StringIO(data.decode("utf-8-sig"))) if row]
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file") from None
+    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
+    if len(rows) < 2:
+        raise ConfigError(f"{file}: holds no face: " + ("a header and no rows" if rows else "the file is empty"))
+    return [cell.strip() for cell in rows[0]], rows[1:]
+
+
 def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column: int) -> list[list[str]]:
-    """Rows as long as the header: one that ends with its time, or a count of 0 after it, has lost the face (Live Link
-    writes such rows), a last one cut off is left out."""
+    """Return rows as long as the header; an incomplete last row is left out.
+
+    A row that ends with its time, or with a count of 0 after it, has lost the face: Live Link writes such rows.
+    """
     lost = [""] * (len(header) - time_column - 1)
     ends = time_column + 1
     rows = [[*row[:ends], *lost] if len(row) == ends or row[ends:] == ["0"] else row for row in rows]
@@ -219,127 +234,56 @@ def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column:
     return rows
 
 
-def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
-    try:
-        data = file.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-        text = data.decode("utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file") from None
-    except (OSError, EOFError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
-    try:
-        rows = [row for row in csv.reader(io.StringIO(text)) if row]
-    except csv.Error as error:
-        raise ConfigError(f"{file}: not a CSV file: {error}") from error
-    if len(rows) < 2:
-        raise ConfigError(f"{file}: holds no face: " + ("a header and no rows" if rows else "the file is empty"))
-    return [cell.strip() for cell in rows[0]], rows[1:]
-
-
-def _axes(file: Path, source: str | None, header: Sequence[str]) -> SourceAxes:
-    if source is not None:
-        if source not in SOURCES:
-            raise ConfigError.at(file, "source", source, "is not a known source", SOURCES)
-        return SOURCES[source]
-    posed = [match for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)) if match]
-    if not any(match[1] for match in posed):
+def _axes(header: Sequence[str]) -> SourceAxes:
+    posed = [match for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)) if match and match[1]]
+    if not posed:
         return SOURCES["robot"]
-    return SOURCES["mediapipe" if any(match[3] for match in posed if match[1]) else "live_link"]
+    return SOURCES["mediapipe" if any(match[3] for match in posed) else "live_link"]
 
 
-def _columns(file: Path, header: Sequence[str], axes: SourceAxes) -> list[_Column]:
-    turned = dict(zip(("roll", "pitch", "yaw"), axes.angles, strict=True))
-    moved = {
-        theirs: (ours, sign)
-        for ours, theirs, sign in zip(("x", "y", "z"), axes.position, axes.position_sign, strict=True)
-    }
-    columns: dict[str, _Column] = {}
+def _columns(file: Path, header: Sequence[str], axes: SourceAxes) -> dict[str, tuple[int, float]]:
+    """Return the column of each of our channels in the file, and its factor to our unit."""
+    signs = dict(zip(_ANGLES, axes.angles, strict=True))
+    moved = dict(zip(axes.position, ("x", "y", "z"), strict=True))
+    columns: dict[str, tuple[int, float]] = {}
     for index, name in enumerate(header):
-        key = name.lower()
-        if key in _SHAPE_BY_KEY:
-            column = _Column(index, _SHAPE_BY_KEY[key], 1.0)
-        elif match := _POSE_COLUMN.fullmatch(key):
-            axis, unit = match[2], match[3]
-            is_angle = axis in turned
-            if unit is not None and is_angle != (unit in ("deg", "rad")):
-                raise ConfigError.at(
-                    file,
-                    "column",
-                    name,
-                    "has a unit that does not fit",
-                    ("_deg, _rad for angles, _m, _cm, _mm for positions",),
-                )
-            channel, sign = (axis, turned[axis]) if is_angle else moved[axis]
-            column = _Column(index, channel, sign * _UNITS[unit or "rad"])
-        else:
-            continue
-        if column.channel in columns:
-            raise ConfigError.at(file, "column", name, f"gives {column.channel} a second time")
-        columns[column.channel] = column
+        channel, factor = _SHAPE_BY_KEY.get(name.lower()), 1.0
+        if channel is None:
+            match = _POSE_COLUMN.fullmatch(name.lower())
+            if match is None:
+                continue
+            axis, unit = match[2], match[3] or "rad"
+            if match[3] and (axis in signs) != (unit in ("deg", "rad")):
+                choices = ("_deg, _rad for angles, _m, _cm, _mm for positions",)
+                raise ConfigError.at(file, "column", name, "has a unit that does not fit", choices)
+            channel, factor = moved.get(axis, axis), signs.get(axis, 1) * _UNITS[unit]
+        if channel in columns:
+            raise ConfigError.at(file, "column", name, f"gives {channel} a second time")
+        columns[channel] = (index, factor)
     if not columns:
-        choices = "ARKit names such as eyeBlinkLeft, jawOpen; head pose such as headYaw_deg, pitch_rad, x_m"
-        raise ConfigError(f"{file}: no column is a face channel ({choices})")
-    return list(columns.values())
+        names = "ARKit names such as eyeBlinkLeft, jawOpen; head pose such as headYaw_deg, pitch_rad, x_m"
+        raise ConfigError(f"{file}: no column is a face channel ({names})")
+    return columns
 
 
-def _time_column(file: Path, header: Sequence[str]) -> int:
-    for index, name in enumerate(header):
-        if name.lower() in _TIME_COLUMNS:
-            return index
-    raise ConfigError(f"{file}: no column tells the time (Timecode, t_s, time_s, t_ms, time_ms)")
-
-
-def _flips(file: Path, flip: Iterable[str]) -> list[int]:
-    for name in flip:
-        if name not in POSE_CHANNELS:
-            raise ConfigError.at(file, "flip", name, "is not a pose channel", POSE_CHANNELS)
-    return [CHANNEL_INDEX[name] for name in flip]
-
-
-def _motion_row(
-    file: Path, number: int, row: Sequence[str], header: Sequence[str], columns: Sequence[_Column]
-) -> Doubles:
-    """One row as motion (58,), all NaN when a cell is empty: the face was lost."""
-    out = np.zeros(MOTION_DIM)
-    for column in columns:
-        cell = row[column.index].strip()
-        if cell == "" or cell.lower() == "nan":
-            return np.full(MOTION_DIM, np.nan)
-        value = _number(file, number, header[column.index], cell) * column.factor
-        if problem := _out_of_range(column.channel, value):
-            raise ConfigError(f"{file}: row {number}, column {header[column.index]} = {cell} {problem}")
-        out[CHANNEL_INDEX[column.channel]] = value
-    return out
-
-
-def _out_of_range(channel: str, value: float) -> str | None:
-    """What speaks against a value in our units: most likely it is in others."""
-    if channel in ("roll", "pitch", "yaw"):
-        return None if abs(value) <= _LARGEST_RAD else "is more than a turn: in degrees? (_deg at the column's name)"
-    if channel in ("x", "y", "z"):
-        return None if abs(value) <= _LARGEST_M else "is more than 10 m: in cm or mm? (_cm at the column's name)"
-    return None if _SHAPE_RANGE[0] <= value <= _SHAPE_RANGE[1] else "is no blendshape (0 to 1)"
-
-
-def _number(file: Path, row: int, column: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ConfigError(f"{file}: row {row}, column {column} = {cell!r} is not a number")
-    return value
+def _numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
+    """Return the numbers of a column, one row after the other from row 2 on."""
+    numbers = []
+    for row, cell in enumerate(cells, 2):
+        try:
+            number = float(cell)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise ConfigError(f"{file}: row {row}, column {column} = {str(cell)!r} is not a number")
+        numbers.append(number)
+    return np.array(numbers)
 
 
 def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """Seconds (N,): as written, or from the first row for a time of day and for a clock that counts from long ago."""
+    """Return seconds (N,): as written, or from the first row for a time of day and for a clock that began long ago."""
     factor = _TIME_COLUMNS[name.lower()]
-    if name.lower() == "timecode":
-        times_s = _timecodes(file, name, cells)
-    else:
-        times_s = np.array([_number(file, n + 2, name, cell.strip()) * factor for n, cell in enumerate(cells)])
+    times_s = factor * _numbers(file, name, cells) if factor else _timecodes(file, name, cells)
     steps_s = np.diff(times_s)
     backwards = np.flatnonzero(steps_s <= 0)
     if len(backwards):
@@ -349,33 +293,31 @@ def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
     if len(steps_s) and not _USUAL_STEP_S[0] <= (usual_s := float(np.median(steps_s))) <= _USUAL_STEP_S[1]:
         unit = "milliseconds: call it t_ms" if usual_s > 1 else "seconds: call it t_s"
         raise ConfigError(f"{file}: column {name}: its rows are {usual_s:g} s apart; are they {unit}?")
-    return times_s - times_s[0] if name.lower() == "timecode" or times_s[0] > 1e6 else times_s
+    return times_s - times_s[0] if not factor or times_s[0] > 1e6 else times_s
 
 
 def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """HH:MM:SS:FF.fff -> seconds (N,). FF counts 60 a second in the Live Link app whatever the rate of the rows.
+    """Return seconds (N,) of HH:MM:SS:FF.fff. FF counts 60 a second in the Live Link app for any rate of the rows.
 
-    Other writers count 24, 25 or 30. The file tells: a take that holds one whole second shows nearly the whole count.
+    Other writers count 24, 25 or 30, which the file shows: a take that holds one whole second has nearly all counts.
     """
-    parts = np.empty((len(cells), 4))
-    for number, cell in enumerate(cells):
-        fields = cell.strip().split(":")
-        if len(fields) != 4:
-            raise ConfigError(f"{file}: row {number + 2}, column {name} = {cell!r} is not HH:MM:SS:FF.fff")
-        parts[number] = [_number(file, number + 2, name, field) for field in fields]
-    whole_s = parts[:, :3] @ np.array([3600.0, 60.0, 1.0])
+    fields = [cell.split(":") for cell in cells]
+    for row, each in enumerate(fields, 2):
+        if len(each) != 4:
+            raise ConfigError(f"{file}: row {row}, column {name} = {':'.join(each)!r} is not HH:MM:SS:FF.fff")
+    hours, minutes, seconds, frames = (_numbers(file, name, column) for column in zip(*fields, strict=True))
+    whole_s = 3600.0 * hours + 60.0 * minutes + seconds
     whole_s += 86_400.0 * np.cumsum(np.diff(whole_s, prepend=whole_s[0]) < -43_200)  # a take across midnight
-    highest = parts[:, 3].max()
     counts = 60
-    if whole_s[-1] - whole_s[0] >= 2 and highest < 30:
-        counts = next(base for base in (24, 25, 30) if highest < base)
-    times_s: Doubles = whole_s + parts[:, 3] / counts
+    if whole_s[-1] - whole_s[0] >= 2 and frames.max() < 30:
+        counts = next(base for base in (24, 25, 30) if frames.max() < base)
+    times_s: Doubles = whole_s + frames / counts
     return times_s
 
 
 @dataclass(frozen=True)
 class Take:
-    """A stretch in which a face was seen all the time. `motion` (N, 58) at 25 fps, radians, metres, 0..1."""
+    """A stretch without a lost face. `motion` (N, 58) at 25 fps, radians, metres, 0..1."""
 
     name: str
     motion: Floats

@@ -96,8 +96,9 @@ def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
         bus = build_bus(head, {"main": chain}, clock)
         bus.connect()
         parts = Parts(
-            NobodyThere(), Waves(), motion.timeline, motion.retargeter, motion.limiter, bus, [goals], motion.leads_s,
-            motion.rest_rad, knobs=lambda: off if len(goals.sent_rad) >= 200 else on,
+            source=NobodyThere(), feed=Waves(), timeline=motion.timeline, retargeter=motion.retargeter,
+            limiter=motion.limiter, bus=bus, observers=[goals], leads_s=motion.leads_s, rest_rad=motion.rest_rad,
+            knobs=lambda: off if len(goals.sent_rad) >= 200 else on,
         )  # fmt: skip
         drive(parts, clock, log, rate_hz=100.0, duration_s=4.0, interrupted=lambda: False)
         bus.close()

@@ -1,4 +1,4 @@
-"""What was measured on one build: it goes over the head's file, and holds only for what it was measured on."""
+"""Measurements of one build: laid over the head's file, they hold only for the servo and file they were made with."""
 
 import math
 from datetime import date
@@ -11,6 +11,7 @@ from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.config.joint import Expression
 from sfms_robot.config.overlay import (
     OLD_FILE,
+    SHOWN,
     CalibrateLayer,
     FitLayer,
     Fitted,
@@ -240,3 +241,20 @@ def test_what_was_measured_keeps_what_the_head_declares_for_all_joints():
     head = FACE.model_copy(update={"safety": usual})
     now = layered(head, overlay(jaw=measured()), SHA).head
     assert now.safety_of("jaw").stored == {"operating_mode": 3, "homing_offset": 0, "drive_mode": 0}
+
+
+def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():
+    told = provenance("face28")
+    assert told["eye_pan_right"]["id"] == (2, "head file")
+    assert told["eye_pan_right"]["max_deg"] == (30.0, "mirror of eye_pan_left")
+    assert told["eye_pan_right"]["model"] == ("xl330-m288", "joint_defaults")
+    assert told["eye_pan_right"]["ratio"] == (1.0, "built in")
+    assert told["lid_right"]["sign"] == (-1, "mirror of lid_left")
+    assert told["lid_right"]["drive"][1] == "mirror of lid_left"
+    assert told["lid_left"]["drive"][1] == "head file"
+
+
+def test_every_joint_and_key_is_there():
+    told = provenance("reachy_mini")
+    assert list(told) == list(load_head("reachy_mini").joints)
+    assert all(tuple(values) == SHOWN for values in told.values())

@@ -1,4 +1,4 @@
-"""Eyes hold and jump; what the neck does is taken back."""
+"""Gaze targets, the camera, and eyes that hold."""
 
 import math
 
@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import Gaze, Life, load_head
+from sfms_robot.config import CameraMount, Gaze, Life, load_head
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.channel_mapping import ChannelMapping
-from sfms_robot.signals.gaze_kinematics import Jump, directions, turn
+from sfms_robot.retarget.gaze import Camera
+from sfms_robot.signals.gaze_kinematics import Jump, direction_to, directions, turn
+from sfms_robot.signals.rotations import rotation
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.04, 0.07])
 FULL_RAD = np.radians([30.0, 20.0])
@@ -30,7 +32,7 @@ def looking(yaw_deg: float, pitch_deg: float = 0.0, **pose_rad: float) -> np.nda
 def lived(listener, seconds: float, **gaze) -> np.ndarray:
     """What is shown, (T, N, 58), of a listener given as a function of time; N instants with leads a tick."""
     alive = spontaneous.HeadLife(Life(gaze=Gaze(**gaze)), seed=0)
-    state, shown = alive.start(), []
+    state, shown = spontaneous.LifeState(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S
         motion, state = alive.step(np.stack([listener(t) for t in times_s]), times_s, now_s, state)
@@ -126,3 +128,53 @@ def test_lids_follow_the_gaze_that_is_shown():
     shown = lived(lambda t: looking(0.0, pitch=-0.2 if t > 0.5 else 0.0), 1.0)  # nose up: the eyes go down
     before, after = (np.degrees(ChannelMapping(head).angles(row[0]))[lid] for row in (shown[0], shown[-1]))
     assert before == pytest.approx(0, abs=1e-6) and after > 5
+
+
+METRES = st.tuples(*[st.floats(-3, 3)] * 3)
+POSES = st.tuples(*[st.floats(-1, 1)] * 3, *[st.floats(-0.1, 0.1)] * 3).map(np.array)
+MOUNTS = st.builds(
+    CameraMount, on=st.sampled_from(["head", "base"]), at_m=METRES, rpy_deg=st.tuples(*[st.floats(-170, 170)] * 3)
+)
+
+
+def from_base(mount, place_m, pose):
+    """The inverse of `Camera.to_base`."""
+    mounted = np.array(place_m)
+    if mount.on == "head":
+        mounted = (mounted - pose[3:]) @ rotation(pose[:3])
+    return (mounted - mount.at_m) @ rotation(np.radians(mount.rpy_deg))
+
+
+@given(MOUNTS, METRES, POSES)
+def test_there_and_back(mount, place_m, pose):
+    camera = Camera(mount)
+    assert camera.to_base(from_base(mount, place_m, pose), pose) == pytest.approx(np.array(place_m), abs=1e-9)
+    assert from_base(mount, camera.to_base(place_m, pose), pose) == pytest.approx(np.array(place_m), abs=1e-9)
+
+
+@given(MOUNTS, METRES, POSES, POSES)
+def test_a_moving_neck_moves_no_person(mount, place_m, one, other):
+    camera = Camera(mount)
+    places = [camera.to_base(from_base(mount, place_m, pose), pose) for pose in (one, other)]
+    assert places[0] == pytest.approx(places[1], abs=1e-9)
+    if mount.on == "base":
+        assert from_base(mount, place_m, one) == pytest.approx(from_base(mount, place_m, other))
+
+
+def test_a_head_that_has_turned_left_sees_who_was_ahead_on_its_right():
+    mount = CameraMount(on="head")
+    camera = Camera(mount)
+    turned = np.array([0, 0, np.radians(30), 0, 0, 0])
+    seen = from_base(mount, (2.0, 0.0, 0.0), turned)
+    assert np.degrees(direction_to(seen)) == pytest.approx([-30, 0])
+    assert np.degrees(direction_to(camera.to_base((2.0, 0.0, 0.0), turned))) == pytest.approx([30, 0])
+
+
+def test_a_camera_that_looks_down_from_above_sees_who_is_ahead_above_its_axis():
+    camera = Camera(CameraMount(on="base", at_m=(0, 0, 0.3), rpy_deg=(0, 20, 0)))
+    assert camera.to_base((1.0, 0.0, 0.0), np.zeros(6)) == pytest.approx([0.9397, 0, 0.3 - 0.342], abs=1e-3)
+
+
+def test_directions_are_those_of_eyes_and_neck():
+    assert np.degrees(direction_to(np.array([1.0, 1.0, 0.0]))) == pytest.approx([45, 0])
+    assert np.degrees(direction_to(np.array([1.0, 0.0, -1.0]))) == pytest.approx([0, 45])  # below: nose down

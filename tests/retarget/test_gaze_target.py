@@ -10,8 +10,9 @@ from sfms_robot.config import CameraMount, Gaze, Life, Person
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
 from sfms_robot.ports import Watched
 from sfms_robot.retarget import spontaneous
-from sfms_robot.retarget.gaze import Camera, HeadTurn
+from sfms_robot.retarget.gaze import HeadTurn
 from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
+from sfms_robot.signals.rotations import rotation
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.05, 0.08])
 FULL_RAD = np.radians([30.0, 20.0])
@@ -29,7 +30,7 @@ def still(t):
 def lived(watched, seconds, person=STEADY, gaze=EYES, camera=BASE, seed=0, listener=still) -> np.ndarray:
     """What is shown, (T, N, 58), of `watched(t, shown so far)`; N instants with leads a tick."""
     alive = spontaneous.HeadLife(Life(gaze=gaze, person=person), seed, camera)
-    state, shown = alive.start(), []
+    state, shown = spontaneous.LifeState(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S
         asked = np.stack([listener(t) for t in times_s])
@@ -140,7 +141,8 @@ def test_a_camera_on_the_head_sees_one_person_while_the_neck_turns():
         seen_s = math.floor((t - 0.1) / FRAME_S + 1e-6) * FRAME_S
         if seen_s < 0:
             return Watched()
-        return Watched(seen_s, Camera(mount).from_base(person_m, shown[round(seen_s / TICK_S)][0, :6].astype(float)))
+        pose = shown[round(seen_s / TICK_S)][0, :6].astype(float)
+        return Watched(seen_s, (person_m - pose[3:]) @ rotation(pose[:3]) - mount.at_m)
 
     gaze = gaze_deg(lived(watched, 4.0, camera=mount)[:, 0])
     assert gaze[-1] == pytest.approx(np.degrees(direction_to(person_m)), abs=0.1)

@@ -17,7 +17,7 @@ BLINK, YAW, PITCH = CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["yaw"], CHANNEL
 def lived(listener, seconds: float, seed: int = 0, **idle) -> np.ndarray:
     """What is shown, (T, N, 58), of a listener given as a function of time."""
     alive = spontaneous.HeadLife(Life(idle=Idle(**idle)), seed)
-    state, shown = alive.start(), []
+    state, shown = spontaneous.LifeState(), []
     for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
         times_s = now_s + LEADS_S
         motion, state = alive.step(np.stack([listener(t) for t in times_s]), times_s, now_s, state)
@@ -46,7 +46,7 @@ def blinks(shown) -> int:
 def test_with_everything_left_out_the_face_is_untouched():
     alive = spontaneous.HeadLife(Life(), seed=0)
     motion = np.random.default_rng(0).uniform(0, 1, (3, MOTION_DIM)).astype(np.float32)
-    assert alive.step(motion, LEADS_S, 0.0, alive.start())[0] is motion
+    assert alive.step(motion, LEADS_S, 0.0, spontaneous.LifeState())[0] is motion
 
 
 def test_with_every_kind_at_zero_the_face_is_the_same():
@@ -59,7 +59,7 @@ def test_with_every_kind_at_zero_the_face_is_the_same():
 def test_the_input_is_not_changed():
     motion = still(0)[None].repeat(3, axis=0)
     alive = spontaneous.HeadLife(Life(idle=Idle()), seed=0)
-    state = alive.start()
+    state = spontaneous.LifeState()
     for now_s in np.arange(0, 20, TICK_S):
         _, state = alive.step(motion, now_s + LEADS_S, now_s, state)
     assert not motion.any()

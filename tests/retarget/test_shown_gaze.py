@@ -55,7 +55,7 @@ def test_the_pose_that_is_said_to_be_shown_is_the_one_that_the_joints_give(name,
 def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style, turn, shift, hz):
     retargeter, knobs = turned(name, intensity, style)
     alive = spontaneous.HeadLife(Life(gaze=Gaze(recentre_deg=RECENTRE_DEG)), seed=0)
-    state, rows = alive.start(), []
+    state, rows = spontaneous.LifeState(), []
     for now_s in np.arange(0.0, 0.6, 0.03):
         times_s = now_s + np.array([0.0, 0.05])
         motion = np.zeros((2, MOTION_DIM), np.float32)
@@ -75,7 +75,7 @@ def test_a_neck_that_is_switched_off_moves_no_eye():
     retargeter = RETARGETERS["face28"]
     knobs = retargeter.mapping.knobs({"neck": 0.0})
     alive = spontaneous.HeadLife(Life(gaze=Gaze()), seed=0)
-    state, times_s = alive.start(), np.zeros(2)
+    state, times_s = spontaneous.LifeState(), np.zeros(2)
     for pitch in (0.0, 0.15):
         motion = np.zeros((2, MOTION_DIM), np.float32)
         motion[:, CHANNEL_INDEX["pitch"]] = pitch

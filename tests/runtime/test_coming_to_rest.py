@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from loop_rig import Posed, driven
 
 from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError, ModelError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX
+from sfms_robot.ports import Observer
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.safety import REST_LIMIT_S, Interrupt, Released
 from sfms_robot.sources.paired import PairedSource
 
@@ -30,22 +31,6 @@ PLACES = (
     "source.read", "feed.push", "feed.poll", "timeline.accept", "timeline.sample", "retargeter.step", "limiter.step",
     "life.step", "bus.write", "bus.poll", "bus.enable",
 )  # fmt: skip
-
-
-class Turner:
-    """A listener that turns its head to one side and keeps it there."""
-
-    hop = horizon = 4
-
-    def start(self, seed: int) -> int:
-        return 0
-
-    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
-        if memory % self.hop:
-            return None, memory + 1
-        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
-        frames[:, CHANNEL_INDEX["yaw"]] = 0.3
-        return Plan(speaker.time_s, speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1), frames), memory + 1
 
 
 class Raising:
@@ -77,7 +62,7 @@ def chain() -> Iterator[Chain]:
         yield running
 
 
-class Watcher:
+class Watcher(Observer):
     """An observer that may raise; keeps the goals."""
 
     def __init__(self, raises_at: int | None = None) -> None:
@@ -91,14 +76,8 @@ class Watcher:
         if len(self.goals) == self._raises_at:
             raise RuntimeError("a browser tab was closed")
 
-    def heard(self, frame: SpeakerFrame) -> None: ...
 
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def driven(
+def ran(
     chain: Chain, clock: VirtualClock, place: str = "", error: type[BaseException] = ValueError, first: int = 1,
     times: int = 1, observer: Watcher | None = None, interrupted: Any = lambda: False, limiter: Any = None,
 ) -> tuple[str, RunLog]:  # fmt: skip
@@ -108,17 +87,20 @@ def driven(
     bus.connect()
     log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
     parts: dict[str, Any] = {
-        "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Turner(), 0, 0.01), "timeline": motion.timeline,
-        "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus, "life": HeadLife(HEAD.life, 0),
+        "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Posed(yaw=lambda times_s: 0.3), 0, 0.01),
+        "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,
+        "life": HeadLife(HEAD.life, 0),
     }  # fmt: skip
     if limiter:
         parts["limiter"] = limiter(parts["limiter"])
     if place:
         name, method = place.split(".")
         parts[name] = Raising(parts[name], method, error, first, times)
-    whole = Parts(**parts, observers=[observer or Watcher()], leads_s=motion.leads_s, rest_rad=motion.rest_rad)
     try:
-        outcome = drive(whole, clock, log, rate_hz=RATE_HZ, duration_s=SECONDS, interrupted=interrupted)
+        outcome, _ = driven(
+            HEAD, parts.pop("bus"), clock, rate_hz=RATE_HZ, duration_s=SECONDS, observer=observer or Watcher(), log=log,
+            interrupted=interrupted, **parts,
+        )  # fmt: skip
     except BaseException as raised:
         outcome = f"{type(raised).__name__}: {raised}"
     finally:
@@ -140,7 +122,7 @@ def assert_at_rest(chain: Chain) -> None:
 @given(place=st.sampled_from(PLACES[:-1]), error=st.sampled_from(ERRORS), at=st.integers(1, 70))
 def test_an_exception_at_any_place_of_any_tick_ends_at_rest_without_torque(chain, place, error, at):
     first = {"source.read": at, "feed.push": 1 + at % 20, "feed.poll": at, "timeline.accept": 1 + at % 5}.get(place, at)
-    outcome, log = driven(chain, VirtualClock(), place, error, first)
+    outcome, log = ran(chain, VirtualClock(), place, error, first)
     assert outcome == f"{error.__name__}: {place.split('.')[1]} broke"
     assert log.audited.violations == 0
     assert_at_rest(chain)
@@ -148,20 +130,20 @@ def test_an_exception_at_any_place_of_any_tick_ends_at_rest_without_torque(chain
 
 @pytest.mark.parametrize("place", ["limiter.step", "bus.write", "bus.poll"])
 def test_what_raises_for_good_still_leaves_no_torque(chain, place):
-    outcome, _ = driven(chain, VirtualClock(), place, ZeroDivisionError, 20, 10**9)
+    outcome, _ = ran(chain, VirtualClock(), place, ZeroDivisionError, 20, 10**9)
     assert outcome.startswith("ZeroDivisionError")
     assert_limp(chain)
 
 
 def test_a_servo_that_refuses_to_be_enabled_leaves_none_of_them_with_torque(chain):
-    outcome, _ = driven(chain, VirtualClock(), "bus.enable", BusError, 2)
+    outcome, _ = ran(chain, VirtualClock(), "bus.enable", BusError, 2)
     assert outcome.startswith("BusError")
     assert_limp(chain)
 
 
 def test_an_observer_that_raises_is_detached_and_the_run_goes_on(chain, caplog):
     observer = Watcher(raises_at=5)
-    outcome, log = driven(chain, VirtualClock(), observer=observer)
+    outcome, log = ran(chain, VirtualClock(), observer=observer)
     assert outcome == "done" and len(observer.goals) == 5
     assert log.detached == {"Watcher": "RuntimeError: a browser tab was closed"}
     assert len([line for line in caplog.messages if "Watcher" in line]) == 1
@@ -170,7 +152,7 @@ def test_an_observer_that_raises_is_detached_and_the_run_goes_on(chain, caplog):
 
 def test_the_way_to_rest_is_seen_and_the_last_face_fades_with_it(chain):
     observer = Watcher()
-    outcome, log = driven(chain, VirtualClock(), observer=observer)
+    outcome, log = ran(chain, VirtualClock(), observer=observer)
     assert outcome == "done" and len(observer.seen) == log.ticks
     ways = [tick.state for tick in observer.seen]
     first = ways.index("stopping")
@@ -187,7 +169,7 @@ def test_the_way_to_rest_is_seen_and_the_last_face_fades_with_it(chain):
 @pytest.mark.parametrize("at", [1, 40])
 def test_an_observer_that_raises_on_the_way_to_rest_keeps_nobody_from_it(chain, at):
     listened = round(SECONDS * RATE_HZ) + 1
-    outcome, log = driven(chain, VirtualClock(), observer=Watcher(raises_at=listened + at))
+    outcome, log = ran(chain, VirtualClock(), observer=Watcher(raises_at=listened + at))
     assert outcome == "done" and set(log.detached) == {"Watcher"}
     assert log.audited.violations == 0
     assert_at_rest(chain)
@@ -195,14 +177,14 @@ def test_an_observer_that_raises_on_the_way_to_rest_keeps_nobody_from_it(chain, 
 
 def test_asked_to_end_between_two_joints_the_rest_of_them_stay_off(chain):
     asked = iter([False, True, True, True])
-    outcome, log = driven(chain, VirtualClock(), interrupted=lambda: next(asked))
+    outcome, log = ran(chain, VirtualClock(), interrupted=lambda: next(asked))
     assert outcome == "interrupted" and log.ticks == 0
     assert_limp(chain)
 
 
 def test_asked_to_end_during_the_last_easing_counts_as_interrupted(chain):
     watcher = Watcher()
-    outcome, _ = driven(chain, VirtualClock(), observer=watcher, interrupted=lambda: len(watcher.goals) > SECONDS * 100)
+    outcome, _ = ran(chain, VirtualClock(), observer=watcher, interrupted=lambda: len(watcher.goals) > SECONDS * 100)
     assert outcome == "interrupted"
     assert_at_rest(chain)
 
@@ -238,7 +220,7 @@ class Late(VirtualClock):
 def test_a_computer_that_is_late_still_comes_to_rest(chain):
     """Its goals take eight times as long; torque stays on until they have arrived."""
     clock = Late()
-    driven(chain, clock)
+    ran(chain, clock)
     assert clock.now_s() < SECONDS + REST_LIMIT_S
     assert_at_rest(chain)
 
@@ -259,6 +241,6 @@ def test_a_limiter_that_never_brings_its_goals_there_holds_nobody_for_longer_tha
             return (goals, after) if self._ticks < 10 else (state.motion[0], state)
 
     clock = Late()
-    _, log = driven(chain, clock, limiter=Lame)
+    _, log = ran(chain, clock, limiter=Lame)
     assert clock.now_s() == pytest.approx(SECONDS + REST_LIMIT_S, abs=1.0)
     assert_limp(chain)

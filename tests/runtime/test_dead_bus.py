@@ -4,6 +4,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from loop_rig import driven
 
 from sfms_robot.app.head.pose import NobodyThere, held_face, parse_face
 from sfms_robot.app.open_head import build_bus, build_motion
@@ -11,9 +12,9 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError
+from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
 
 GIVES_UP_S = 6.0
 WHOLE = load_head("open_duck_mini_v2_head")
@@ -23,7 +24,7 @@ HEAD = WHOLE.model_copy(
 RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
 
 
-class Unplugger:
+class Unplugger(Observer):
     """An observer that pulls one adapter after two seconds, and keeps the goals up to the way to rest."""
 
     def __init__(self, chain):
@@ -36,29 +37,22 @@ class Unplugger:
             self._pulled = True
             self._chain.hang_up()
 
-    def heard(self, frame): ...
-
-    def planned(self, plan): ...
-
-    def close(self): ...
-
 
 @pytest.mark.parametrize(("dead", "alive"), [("antennas", "neck"), ("neck", "antennas")])
 def test_the_bus_that_works_comes_to_rest(dead, alive):
-    clock, motion = VirtualClock(), build_motion(HEAD, RATE_HZ)
+    clock = VirtualClock()
     with ExitStack() as stack:
         chains = {name: stack.enter_context(launch(servos, True)) for name, servos in emulated(HEAD).items()}
         bus = build_bus(HEAD, chains, clock)
         bus.connect()
         stack.callback(bus.close)
-        log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
+        log = RunLog(list(HEAD.joints), 1 / RATE_HZ, build_motion(HEAD, RATE_HZ).audit)
         watcher = Unplugger(chains[dead])
-        parts = Parts(
-            NobodyThere(), NobodyThere(), held_face(parse_face(["pitch=0.2", "browInnerUp=1"]), 60.0),
-            motion.retargeter, motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
-        )  # fmt: skip
         with pytest.raises(BusError, match=dead):
-            drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=60.0, interrupted=lambda: False)
+            driven(
+                HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=60.0, observer=watcher, log=log, source=NobodyThere(),
+                feed=NobodyThere(), timeline=held_face(parse_face(["pitch=0.2", "browInnerUp=1"]), 60.0),
+            )  # fmt: skip
         mine = [(j.id, j.zero_ticks) for j in HEAD.joints.values() if j.bus == alive]
         states = {servo: chains[alive].state(servo) for servo, _ in mine}
     ended_s, last_rad = watcher.goals[-1]

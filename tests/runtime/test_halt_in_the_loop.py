@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from loop_rig import Posed, driven
 
 from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, FaceFrame, Plan, SpeakerFrame
-from sfms_robot.ports import Bus, Source, Tick
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame, SpeakerFrame
+from sfms_robot.ports import Bus, Observer, Source, Tick
 from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.safety import EASE_S
 
 RATE_HZ = 100.0
@@ -28,23 +28,12 @@ NECK = [joint for joint in JOINTS if joint.startswith("neck")]
 STOPS_S = 0.5  # more than any joint of this head needs from full speed
 
 
-class Nodder:
-    """A listener that nods all the time, opens its jaw with it, and looks about."""
+def swing(times_s):
+    return np.sin(2 * np.pi * times_s)
 
-    hop, horizon = 4, 8
 
-    def start(self, seed: int) -> int:
-        return 0
-
-    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
-        if memory % self.hop:
-            return None, memory + 1
-        times_s = speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1)
-        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
-        for channel, size in (("pitch", 0.15), ("yaw", 0.2), ("jawOpen", 0.4)):
-            swing = np.sin(2 * np.pi * times_s)
-            frames[:, CHANNEL_INDEX[channel]] = size * (swing if channel != "jawOpen" else np.abs(swing))
-        return Plan(speaker.time_s, times_s, frames), memory + 1
+# A listener that nods all the time, opens its jaw with it, and looks about.
+NODDER = Posed(pitch=lambda s: 0.15 * swing(s), yaw=lambda s: 0.2 * swing(s), jawOpen=lambda s: 0.4 * np.abs(swing(s)))
 
 
 class Somebody(Source):
@@ -68,7 +57,7 @@ class Somebody(Source):
 
 
 @dataclass
-class Watcher:
+class Watcher(Observer):
     """Keeps every tick, and does at a tick what the test asks for."""
 
     does: dict[int, Callable[[], None]] = field(default_factory=dict)
@@ -77,12 +66,6 @@ class Watcher:
     def tick(self, seen: Tick) -> None:
         self.does.get(len(self.ticks), lambda: None)()
         self.ticks.append(seen)
-
-    def heard(self, frame: SpeakerFrame) -> None: ...
-
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
 
     def states(self) -> list[str]:
         names = [tick.state for tick in self.ticks]
@@ -118,15 +101,14 @@ def run(
     watcher = Watcher(does(latch))
     bus = build_bus(HEAD, {"main": chain}, clock, without=without)
     opened(bus)
-    log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
-    parts = Parts(
-        source or Somebody(), InlineFeed(Nodder(), 0, 0.01), motion.timeline, motion.retargeter, motion.limiter, bus,
-        [watcher], motion.leads_s, motion.rest_rad, answers=True, halt=latch, holds=motion.holds, heat=motion.heat,
-        ignored=frozenset(without),
-    )  # fmt: skip
     bus.connect()
     try:
-        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=interrupted)
+        outcome, log = driven(
+            HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=seconds, observer=watcher, source=source or Somebody(),
+            interrupted=interrupted,
+            feed=InlineFeed(NODDER, 0, 0.01), answers=True, halt=latch, holds=motion.holds, heat=motion.heat,
+            ignored=frozenset(without),
+        )  # fmt: skip
         TIMES[id(chain)] = clock.now_s()
     finally:
         bus.close()

@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loop_rig import Posed, driven
 
 from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated, sagged_rad
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.errors import ModelError, RobotError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.ports import Source, Tick
+from sfms_robot.errors import RobotError
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Plan, SpeakerFrame
+from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive, turned_by_hand
+from sfms_robot.runtime.loop import turned_by_hand
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.paired import PairedSource
@@ -26,39 +27,16 @@ ORIGIN_S = 300.0  # of the clock, as of `time.monotonic`
 HEAD = load_head("face28")
 
 
-class Nodder:
-    """A listener with a known face: a slow nod, and what the test puts on top of it."""
-
-    hop = 4
-    horizon = 8
-
-    def __init__(self, broken_from: int | None = None, raises_from: int | None = None) -> None:
-        self._broken_from = broken_from
-        self._raises_from = raises_from
-
-    def start(self, seed: int) -> int:
-        return 0
-
-    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
-        if self._raises_from is not None and memory >= self._raises_from:
-            raise ModelError("the listener broke")
-        if memory % self.hop:
-            return None, memory + 1
-        times_s = speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1)
-        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
-        frames[:, CHANNEL_INDEX["pitch"]] = 0.1 * np.sin(2 * np.pi * times_s)
-        if self._broken_from is not None and memory >= self._broken_from:
-            frames[:] = np.nan
-        return Plan(speaker.time_s, times_s, frames), memory + 1
+def nodder(**broken) -> Posed:
+    return Posed(pitch=lambda times_s: 0.1 * np.sin(2 * np.pi * times_s), **broken)
 
 
-class Watcher:
-    """ports.Observer that keeps every tick."""
+class Watcher(Observer):
+    """Keeps every tick."""
 
     def __init__(self) -> None:
         self.ticks: list[Tick] = []
-        self.frames = 0
-        self.plans = 0
+        self.frames = self.plans = 0
 
     def tick(self, seen: Tick) -> None:
         self.ticks.append(seen)
@@ -68,8 +46,6 @@ class Watcher:
 
     def planned(self, plan: Plan) -> None:
         self.plans += 1
-
-    def close(self) -> None: ...
 
 
 @pytest.fixture
@@ -91,7 +67,7 @@ class Ran:
 
 def run(
     chain: Chain,
-    listener: Nodder,
+    listener: Posed,
     interrupt_at: int | None = None,
     watcher: Watcher | None = None,
     seconds: float = 2.0,
@@ -99,20 +75,18 @@ def run(
 ) -> Ran:
     clock, watcher = VirtualClock(), watcher or Watcher()
     clock.origin_s = ORIGIN_S
-    motion = build_motion(HEAD, RATE_HZ)
     bus = build_bus(HEAD, {"main": chain}, clock)
-    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
-    parts = Parts(
-        source or PairedSource(duration_s=seconds), InlineFeed(listener, 0, 0.01), motion.timeline,
-        motion.retargeter, motion.limiter, bus, [watcher], motion.leads_s, motion.rest_rad,
-    )  # fmt: skip
+    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, build_motion(HEAD, RATE_HZ).audit)
 
     def interrupted() -> bool:
         return interrupt_at is not None and len(watcher.ticks) >= interrupt_at
 
     bus.connect()
     try:
-        outcome = drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=interrupted)
+        outcome, _ = driven(
+            HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=seconds, observer=watcher, interrupted=interrupted, log=log,
+            source=source or PairedSource(duration_s=seconds), feed=InlineFeed(listener, 0, 0.01),
+        )  # fmt: skip
     except RobotError as error:
         outcome = str(error)
     finally:
@@ -143,7 +117,7 @@ def assert_at_rest(servos: dict[int, dict[str, int]]) -> None:
 
 
 def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain) -> None:
-    ran = run(chain, Nodder())
+    ran = run(chain, nodder())
     assert ran.outcome == "done"
     assert (ran.log.frames, ran.watcher.frames, ran.watcher.plans) == (50, 50, 13)
     assert [tick.state for tick in ran.watcher.ticks].index("stopping") == 201
@@ -152,7 +126,7 @@ def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain)
 
 
 def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> None:
-    ticks = run(chain, Nodder()).watcher.ticks
+    ticks = run(chain, nodder()).watcher.ticks
     sagged = sagged_rad(HEAD.joints["neck_pitch"], sags=True)  # where the emulated head is found when switched on
     row = list(HEAD.joints).index("neck_pitch")
     assert ticks[0].goals_rad[row] == pytest.approx(sagged, abs=2e-3)
@@ -164,7 +138,7 @@ def test_a_joint_outside_its_limits_comes_in_from_where_it_stands(chain: Chain) 
     joint = HEAD.joints["neck_pitch"]
     outside = joint.zero_ticks - 700  # 61 degrees back, the range ends at 30
     chain.turn(joint.id, outside)
-    ran = run(chain, Nodder())
+    ran = run(chain, nodder())
     row = list(HEAD.joints).index("neck_pitch")
     pitches = np.array([tick.goals_rad[row] for tick in ran.watcher.ticks])
     assert pitches[0] == pytest.approx(-700 * 2 * np.pi / 4096, abs=2e-3)
@@ -175,26 +149,26 @@ def test_a_joint_outside_its_limits_comes_in_from_where_it_stands(chain: Chain) 
 
 
 def test_the_head_follows_the_listener(chain: Chain) -> None:
-    ticks = run(chain, Nodder()).watcher.ticks
+    ticks = run(chain, nodder()).watcher.ticks
     pitches = [tick.readings["neck_pitch"].position_rad for tick in ticks if tick.time_s > 1.2]
     assert max(p for p in pitches if p is not None) == pytest.approx(0.1, abs=0.01)
 
 
 def test_an_interruption_still_comes_to_rest(chain: Chain) -> None:
-    ran = run(chain, Nodder(), interrupt_at=130)
+    ran = run(chain, nodder(), interrupt_at=130)
     assert ran.outcome == "interrupted"
     assert [tick.state for tick in ran.watcher.ticks].index("stopping") == 130
     assert_at_rest(ran.servos)
 
 
 def test_an_exception_still_comes_to_rest_and_is_passed_on(chain: Chain) -> None:
-    ran = run(chain, Nodder(raises_from=30))
+    ran = run(chain, nodder(raises_from=30))
     assert ran.outcome == "the listener broke"
     assert_at_rest(ran.servos)
 
 
 def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
-    ran = run(chain, Nodder(broken_from=20))
+    ran = run(chain, nodder(nan_from=20))
     assert ran.outcome == "done" and ran.log.refused_plans > 0
     assert all(np.isfinite(tick.goals_rad).all() for tick in ran.watcher.ticks)
     assert ran.log.audited.violations == 0
@@ -215,7 +189,7 @@ class Killer(Watcher):
 
 
 def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> None:
-    ran = run(chain, Nodder(), watcher=Killer(chain, 4))
+    ran = run(chain, nodder(), watcher=Killer(chain, 4))
     last = ran.watcher.ticks[-1].readings
     assert ran.outcome == "done" and ran.statistics["silent"] == [4]
     assert last["eye_tilt_right"].age_s > 1.0
@@ -224,7 +198,7 @@ def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> Non
 
 def test_a_servo_that_refuses_torque_leaves_none_of_them_with_torque(chain: Chain) -> None:
     chain.fault(5, 0x20)  # overload, latched until reboot
-    ran = run(chain, Nodder())
+    ran = run(chain, nodder())
     assert "lid_left (id 5)" in ran.outcome
     assert ran.watcher.ticks == []
     assert all(servo["torque"] == 0 for servo in ran.servos.values())
@@ -246,7 +220,7 @@ class Started(Source):
 
 def test_a_source_starts_once_at_the_first_tick_after_torque_came_on(chain: Chain) -> None:
     source = Started()
-    ran = run(chain, Nodder(), seconds=0.5, source=source)
+    ran = run(chain, nodder(), seconds=0.5, source=source)
     (_, origin_s), *read = source.told
     assert origin_s == ORIGIN_S and read[0] == ("read", 0.0) and {what for what, _ in read} == {"read"}
     assert ran.outcome == "done" and ran.watcher.ticks[0].time_s == 0.0

@@ -4,16 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from loop_rig import Posed, driven
 
-from sfms_robot.app.open_head import build_bus, build_motion
+from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.ports import Tick
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.clock import InlineFeed, VirtualClock
 from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.sources.paired import PairedSource
 
 RATE_HZ = 100.0
@@ -21,24 +20,7 @@ HEAD = load_head("face28")
 JOINTS = list(HEAD.joints)
 
 
-class Bow:
-    """A listener that bows its head and keeps it there."""
-
-    hop = 4
-    horizon = 8
-
-    def start(self, seed: int) -> int:
-        return 0
-
-    def step(self, speaker: SpeakerFrame, memory: int) -> tuple[Plan | None, int]:
-        if memory % self.hop:
-            return None, memory + 1
-        frames = np.zeros((self.horizon, MOTION_DIM), dtype=np.float32)
-        frames[:, CHANNEL_INDEX["pitch"]] = 0.2
-        return Plan(speaker.time_s, speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1), frames), memory + 1
-
-
-class Hand:
+class Hand(Observer):
     """An observer that does things to the chain at given ticks, and keeps what it sees up to the way to rest."""
 
     def __init__(self, does: dict[int, Callable[[], None]]) -> None:
@@ -52,24 +34,16 @@ class Hand:
         if (act := self._does.get(len(self.ticks))) is not None:
             act()
 
-    def heard(self, frame: SpeakerFrame) -> None: ...
-
-    def planned(self, plan: Plan) -> None: ...
-
-    def close(self) -> None: ...
-
 
 def run(chain: Chain, hand: Hand, seconds: float) -> tuple[str, RunLog]:
-    clock, motion = VirtualClock(), build_motion(HEAD, RATE_HZ)
+    clock = VirtualClock()
     bus = build_bus(HEAD, {"main": chain}, clock)
-    log = RunLog(JOINTS, 1 / RATE_HZ, motion.audit)
-    parts = Parts(
-        PairedSource(duration_s=seconds), InlineFeed(Bow(), 0, 0.01), motion.timeline, motion.retargeter,
-        motion.limiter, bus, [hand], motion.leads_s, motion.rest_rad,
-    )  # fmt: skip
     bus.connect()
     try:
-        return drive(parts, clock, log, rate_hz=RATE_HZ, duration_s=seconds, interrupted=lambda: False), log
+        return driven(
+            HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=seconds, observer=hand,
+            source=PairedSource(duration_s=seconds), feed=InlineFeed(Posed(pitch=lambda times_s: 0.2), 0, 0.01),
+        )  # fmt: skip
     finally:
         bus.close()
 

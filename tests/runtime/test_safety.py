@@ -1,10 +1,24 @@
-"""Signals become a request to end."""
+"""Derating of warm servos, and requests to end."""
 
 import signal
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sfms_robot.runtime.safety import Interrupt, Released, signals_to
+from sfms_robot.frames import Reading
+from sfms_robot.runtime.safety import (
+    COOLER_C,
+    PER_S,
+    WARM_SHARE,
+    Heat,
+    HeatGuard,
+    Interrupt,
+    Released,
+    signals_to,
+    temperatures_C,
+)
 
 
 class NoBus:
@@ -55,3 +69,42 @@ def test_a_signal_that_is_ignored_stays_so() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+WARM, HOT = np.full(3, 60.0), np.full(3, 67.0)
+
+
+def test_shares_follow_the_temperature_and_come_back_a_little_below() -> None:
+    guard, heat = HeatGuard(WARM, HOT), Heat.cool(3)
+    for degrees, wanted in [
+        (59.9, 1.0), (60.0, WARM_SHARE), (67.0, 0.0), (67.0 - COOLER_C + 0.1, 0.0), (67.0 - COOLER_C - 0.1, WARM_SHARE),
+        (60.0 - COOLER_C + 0.1, WARM_SHARE), (60.0 - COOLER_C - 0.1, 1.0),
+    ]:  # fmt: skip
+        heat = guard.judge(np.array([degrees, 20.0, np.nan]), heat)
+        assert heat.wanted.tolist() == [wanted, 1.0, 1.0], degrees
+
+
+@given(st.lists(st.lists(st.floats(0, 100), min_size=3, max_size=3), min_size=1, max_size=50))
+def test_a_share_never_jumps_and_the_neck_goes_as_one(degrees: list[list[float]]) -> None:
+    guard, heat, dt_s = HeatGuard(WARM, HOT, (0, 2)), Heat.cool(3), 0.01
+    for row in degrees:
+        after = guard.after(guard.judge(np.array(row), heat), dt_s)
+        assert np.abs(after.share - heat.share).max() <= PER_S * dt_s + 1e-12
+        assert after.share[0] == after.share[2]
+        assert ((after.share >= 0) & (after.share <= 1)).all()
+        heat = after
+
+
+def test_a_hot_joint_is_at_rest_after_two_seconds_and_comes_back_when_it_has_cooled() -> None:
+    guard, heat = HeatGuard(WARM, HOT), Heat.cool(3)
+    for degrees, shown in ((70.0, 0.0), (30.0, 1.0)):
+        for _ in range(round(1 / PER_S / 0.01) + 1):
+            heat = guard.after(guard.judge(np.array([degrees, 20.0, 20.0]), heat), 0.01)
+        assert np.allclose(heat.share, [shown, 1.0, 1.0])
+    assert heat.none
+
+
+def test_temperatures_are_read_where_they_are_told() -> None:
+    readings = {"a": Reading(0.0, 0.0, extra={"temperature_C": 41.0}), "b": Reading(0.0, 0.0)}
+    assert temperatures_C(["a", "b", "c"], readings)[0] == 41.0
+    assert np.isnan(temperatures_C(["a", "b", "c"], readings)[1:]).all()

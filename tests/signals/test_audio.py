@@ -1,3 +1,5 @@
+"""Sound files, and a signal between its samples."""
+
 import numpy as np
 import pytest
 import soundfile
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.signals.audio import AudioFile, Resampler, energy_db, read_audio
+from sfms_robot.signals.audio import AudioFile, Resampler, at_positions, energy_db, read_audio
 
 
 def tone(rate_hz, seconds=0.5, frequency_hz=440):
@@ -112,3 +114,30 @@ def test_a_file_read_in_frames_is_the_file_read_at_once_and_can_start_again(tmp_
 def test_shipped_voices_are_what_soundfile_reads(name):
     file = data_dir("sim") / "speakers" / name / "speech.flac"
     np.testing.assert_array_equal(read_audio(file), soundfile.read(file, dtype="float32")[0])
+
+
+RATE_HZ = 16_000
+
+
+@given(frequency_hz=st.floats(50, 6_400), first=st.floats(100, 200), ratio=st.floats(0.1, 1.1))
+def test_a_tone_goes_on_between_its_samples(frequency_hz, first, ratio):
+    turn = 2 * np.pi * frequency_hz / RATE_HZ
+    tone = np.sin(turn * np.arange(1000)).astype(np.float32)
+    positions = first + ratio * np.arange(500)
+    np.testing.assert_allclose(at_positions(tone, positions), np.sin(turn * positions), atol=1e-3)
+
+
+@given(seed=st.integers(0, 100), shift=st.integers(-50, 50))
+def test_at_whole_positions_samples_are_what_they_are_and_0_around_them(seed, shift):
+    samples = np.random.default_rng(seed).normal(size=40).astype(np.float32)
+    positions = np.arange(shift, shift + 40, dtype=float)
+    expected = np.pad(samples, 100)[100 + shift : 140 + shift]
+    np.testing.assert_allclose(at_positions(samples, positions), expected, atol=1e-6)
+
+
+def test_of_nothing_asked_there_is_nothing():
+    assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)
+
+
+def test_a_constant_stays_one():
+    assert at_positions(np.ones(200, np.float32), np.linspace(50, 150, 333)) == pytest.approx(np.ones(333), abs=1e-6)

@@ -1,4 +1,4 @@
-"""Laws of a look: eyes first and on target, the head after them with its share, nothing that jumps."""
+"""Gaze kinematics, and the minimum-jerk path."""
 
 import math
 
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE
 from sfms_robot.signals import gaze_kinematics as gaze
 from sfms_robot.signals.gaze_kinematics import directions
+from sfms_robot.signals.minimum_jerk import ease, minimum_jerk
 
 FULL_RAD = np.array([gaze.EYE_PAN_RAD, gaze.EYE_TILT_RAD])
 TARGETS = st.tuples(st.floats(-30, 30), st.floats(-20, 20)).map(np.radians)
@@ -49,9 +50,9 @@ def test_a_whole_is_its_frames_one_by_one(places, seed):
     head, eyes, states = gaze.follow(targets, poses, gaze.start(seed))
     state = gaze.start(seed)
     for row, (target, pose) in enumerate(zip(targets, poses, strict=True)):
-        frame, state = gaze.step(target, pose, state)
-        np.testing.assert_array_equal(frame.head_rad, head[row])
-        np.testing.assert_array_equal(frame.eyes, eyes[row])
+        one_head, one_eyes, (state,) = gaze.follow([target], [pose], state)
+        np.testing.assert_array_equal(one_head[0], head[row])
+        np.testing.assert_array_equal(one_eyes[0], eyes[row])
         assert state == states[row]
 
 
@@ -146,6 +147,21 @@ def test_a_target_that_moves_slowly_is_followed_without_a_shift():
 def test_what_is_not_finite_is_refused(target, pitch):
     pose = np.array([0, pitch, 0, 0, 0, 0.0])
     with pytest.raises(ValueError, match="not finite"):
-        gaze.step(target, pose, gaze.start(0))
-    with pytest.raises(ValueError, match="not finite"):
         gaze.follow([target], [pose], gaze.start(0))
+
+
+def test_rests_at_both_ends_and_is_its_own_mirror():
+    u = np.linspace(0.0, 1.0, 201)
+    way = minimum_jerk(u)
+    assert (way[0], way[-1]) == (0.0, 1.0)
+    assert np.all(np.diff(way) > 0)
+    assert way + way[::-1] == pytest.approx(np.ones(201), abs=1e-12)
+    for ends in (way[:2], 1 - way[-2:]):
+        assert np.ptp(ends) < 10.1 * 0.005**3  # third order: neither speed nor acceleration
+
+
+def test_easing_starts_and_ends_at_rest_and_never_turns_back() -> None:
+    values = [ease(u / 1000) for u in range(-100, 1101)]
+    assert values[0] == 0.0 and values[-1] == 1.0
+    assert all(a <= b for a, b in zip(values, values[1:], strict=False))
+    assert ease(1e-3) < 1e-7 and 1 - ease(1 - 1e-3) < 1e-7

@@ -115,7 +115,9 @@ def test_a_course_that_is_none_is_refused(smile, text):
 
 def test_a_listener_that_cannot_keep_to_one_says_so():
     for kind in ("nod", "smile"):
-        with pytest.raises(ConfigError, match=f"sampling.{kind}: without events no {kind} is told"):
+        with pytest.raises(
+            ConfigError, match=f"sampling.{kind}: expected events: true, without which there is no {kind}"
+        ):
             tiny_listener(sampling={kind: {"spread": 0.1}})
     head, face = [*POSE_CHANNELS, SMILE_CORNERS[0]], [name for name in FACE if name != SMILE_CORNERS[0]]
     group = {"levels": (3, 2), "keyframe_cost": 1.0}

@@ -186,7 +186,7 @@ FACE = {"channels": [name for name in BLENDSHAPES if not name.startswith("eyeLoo
     [
         ({"events": False, "sway": True, "placement": "exact",
           "groups": {"neck": NECK | {"keyframes": 3}, "face": FACE | {"channels": BLENDSHAPES, "keyframes": 3}}},
-         "sway: without events a nod cannot be told from it"),
+         "sway: expected events: true, without which a nod counts as sway"),
         ({"groups": {"neck": NECK | {"keyframe_cost": 1}, "face": FACE | {"channels": GAZE_NAMES, "keyframe_cost": 1}}},
          "'eyeLookDownLeft' is not a channel"),
         ({"groups": {"neck": NECK | {"keyframes": 3}, "face": FACE | {"keyframe_cost": 1}}},
