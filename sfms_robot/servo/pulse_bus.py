@@ -24,10 +24,10 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.ports import Bus as BusConfig
 from sfms_robot.servo.boards import Board, Maestro, Output, RateLimitedPort, Ssc32, board_of, pulses_beyond
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
