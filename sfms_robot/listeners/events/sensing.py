@@ -15,9 +15,20 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles, FaceFrame, Floats, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import Hearing, Instant, Scene, hear, hearing
+from sfms_robot.frames import (
+    CHANNEL_INDEX,
+    FRAME_S,
+    MOTION_DIM,
+    SMILE_CORNERS,
+    Doubles,
+    FaceFrame,
+    Floats,
+    SpeakerFrame,
+    changed,
+)
+from sfms_robot.listeners.events.evidence import Bools, Hearing, Instant, Scene, hear, hearing
 from sfms_robot.signals import phase, voice_activity
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.voice_activity import Ear
@@ -95,11 +106,11 @@ def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceSta
         return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
     pitch, left, right, jaw = (motion.item(channel) for channel in (_PITCH, *_CORNERS, _JAW))
     nods, state = _nod(pitch, state)
-    smiles, beams, state = _smile(_within((left + right) / 2), state)
-    jaw = _within(jaw)
-    opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
-    moves = opening > OPENING
-    return Signs(nods, smiles, beams and moves, moves), changed(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+    over, neutral, held = _smile((left + right) / 2, state.neutral, state.held)
+    jaw, opening = _opening(jaw, state.jaw, state.opening)
+    smiles, moves = held >= HELD_FRAMES, opening > OPENING
+    after = changed(state, frame=state.frame + 1, neutral=neutral, held=held, jaw=jaw, opening=opening)
+    return Signs(nods, smiles, smiles and over > BEAM and moves, moves), after
 
 
 def _within(value: float) -> float:
@@ -108,8 +119,7 @@ def _within(value: float) -> float:
 
 def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
     before = state.pitch_rad
-    smoothed = before[-1] + _SMOOTH * math.remainder(pitch_rad - before[-1], 2 * math.pi) if before else pitch_rad
-    pitch = (*before, smoothed)[-WINDOW:]
+    pitch = (*before, _smoothed(pitch_rad, before[-1] if before else None))[-WINDOW:]
     swing = max(_swing(pitch), _swing([-p for p in pitch]))
     stands_out = swing >= max(NOD_RAD, STANDS_OUT * state.sway_rad)
     new = stands_out and state.frame - state.nodded >= NODS_APART
@@ -124,14 +134,65 @@ def _swing(values: tuple[float, ...] | list[float]) -> float:
     return risen if top - values[-1] >= BACK * risen else 0.0
 
 
-def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
-    """Smiles, beams; after it has been up for a quarter of a second."""
-    neutral = level if state.neutral is None else state.neutral
+def _smoothed(pitch_rad: float, before_rad: float | None) -> float:
+    if before_rad is None:
+        return pitch_rad
+    return before_rad + _SMOOTH * math.remainder(pitch_rad - before_rad, 2 * math.pi)
+
+
+def _smile(level: float, neutral: float | None, held: int) -> tuple[float, float, int]:
+    """Return how far the smile is over its neutral, the neutral, and for how many frames it has been up."""
+    level = _within(level)
+    neutral = level if neutral is None else neutral
     neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
     over = level - neutral
-    held = state.held + 1 if over > SMILE * (0.6 if state.held >= HELD_FRAMES else 1.0) else 0
-    smiles = held >= HELD_FRAMES
-    return smiles, smiles and over > BEAM, changed(state, neutral=neutral, held=held)
+    return over, neutral, held + 1 if over > SMILE * (0.6 if held >= HELD_FRAMES else 1.0) else 0
+
+
+def _opening(jaw: float, before: float, opening: float) -> tuple[float, float]:
+    """Return jawOpen within 0..1, and its smoothed change per frame."""
+    jaw = _within(jaw)
+    return jaw, opening + _MOTION * (abs(jaw - before) - opening)
+
+
+def signs_in(faces: Sequence[FaceFrame | None]) -> Bools:
+    """Return nods, smiles, laughs and moving mouth (N, 4) of a recording: `read_signs` of all frames at once."""
+    channels = np.full((len(faces), 4), np.nan)
+    known = [index for index, face in enumerate(faces) if face is not None]
+    motion = np.array([face.motion for face in faces if face is not None], np.float64).reshape(-1, MOTION_DIM)
+    finite = np.isfinite(motion).all(axis=1)
+    if len(known):
+        channels[np.array(known)[finite]] = motion[finite][:, [_PITCH, *_CORNERS, _JAW]]
+    pitch_rad, found = np.full(len(faces), np.nan), np.zeros((len(faces), 4), bool)
+    smoothed, neutral, held, jaw, opening = None, None, 0, 0.0, 0.0
+    for index, (pitch, left, right, open_) in enumerate(channels.tolist()):
+        if pitch != pitch:  # NaN: no face
+            smoothed, held, opening = None, 0, 0.0
+            continue
+        pitch_rad[index] = smoothed = _smoothed(pitch, smoothed)
+        over, neutral, held = _smile((left + right) / 2, neutral, held)
+        jaw, opening = _opening(open_, jaw, opening)
+        smiles, moves = held >= HELD_FRAMES, opening > OPENING
+        found[index, 1:] = smiles, smiles and over > BEAM and moves, moves
+    nodded, sway = -NODS_APART, 0.0
+    swings = np.maximum(_swings_in(pitch_rad), _swings_in(-pitch_rad)).tolist()
+    for index in np.flatnonzero(~np.isnan(pitch_rad)).tolist():
+        stands_out = swings[index] >= max(NOD_RAD, STANDS_OUT * sway)
+        if stands_out and index - nodded >= NODS_APART:
+            found[index, 0], nodded = True, index
+        sway += _SWAY * (swings[index] - sway)
+    return found
+
+
+def _swings_in(values: Doubles) -> Doubles:
+    """Return `_swing` of the second before each frame (N,), as far as it has no NaN."""
+    windows = sliding_window_view(np.r_[np.full(WINDOW - 1, np.nan), values], WINDOW)
+    whole = np.logical_and.accumulate(~np.isnan(windows[:, ::-1]), axis=1)[:, ::-1]  # since the last NaN
+    high = np.where(whole, windows, -np.inf)
+    lowest = np.minimum.accumulate(np.where(whole, windows, np.inf), axis=1)
+    top, rows = high.argmax(axis=1), np.arange(len(values))
+    risen = high[rows, top] - lowest[rows, top]
+    return np.where(high[rows, top] - values >= BACK * risen, risen, 0.0)
 
 
 @dataclass(frozen=True)
@@ -182,17 +243,13 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
     """What `sense` takes from each frame of a recording; `evidence.heard_in` makes its rows of that."""
     memory = SenseMemory(addressed)
-    deaf, ear, face = True, memory.ear, memory.face
-    speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
-    speaks[:, 0] = [_sounds(frame.agent_audio) for frame in speaker]
+    speaks, looks = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan)
+    nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
+    first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then
+    speaks[first:, 1] = phase.hear(np.array([energy_db(frame.audio) for frame in speaker[first:]]))
     for index, frame in enumerate(speaker):
-        deaf = deaf and not len(frame.audio)
-        ear = ear if deaf else voice_activity.step(energy_db(frame.audio), ear)
-        sign, face = read_signs(frame.face, face)
+        speaks[index, 0] = _sounds(frame.agent_audio)
         looks[index, 1], memory = _looked(frame, memory)
-        speaks[index, 1] = sign.mouth_moves if deaf else ear.active
-        signs.append((sign.laughs, sign.nods, sign.smiles))
-    laughs, nods, smiles = np.array(signs, bool).reshape(-1, 3).T
     silent = phase.times(speaks[:, 1])[:, 0] == 0
     return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
 
