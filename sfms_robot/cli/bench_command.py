@@ -61,20 +61,20 @@ def bench(
         "against": against, "hours": hours, "data": data, "budget": budget or None,
     }  # fmt: skip
     began_s = time.monotonic()
-    told = run_bench(name, {key: value for key, value in options.items() if value is not None}, _say)
+    result = run_bench(name, {key: value for key, value in options.items() if value is not None}, _say)
     if write is not None:
-        from sfms_robot.lab.bench import performance_page
+        from sfms_robot.lab.bench.measure import write_page
 
-        performance_page.write(write, told.figures, (time.monotonic() - began_s) / 60)
+        write_page(write, result.figures, (time.monotonic() - began_s) / 60)
     if json:
-        print_json(told.figures)
+        print_json(result.figures)
     else:
         from sfms_robot.cli.show import print_rows
 
-        print_rows(told.table)
-        for line in told.lines:
+        print_rows(result.table)
+        for line in result.lines:
             print(line)
-    if not told.passed:
+    if not result.passed:
         raise typer.Exit(1)
 
 

@@ -64,15 +64,17 @@ def tokenizer(
     from sfms_robot.cli.show_learning import print_figures, print_tokenizer_tables, show
 
     if table is None:
-        from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
+        from sfms_robot.lab.evaluation.listener_evaluation import evaluate_tokenizer
 
         if data is None:
             raise typer.BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json, print_figures)
         return
-    from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
+    from sfms_robot.lab.evaluation.tokenizer_tables import TableOptions, evaluate_table
 
-    options = TableOptions(table, data, models, train, size.value, steps, jobs, plots=plots)
+    options = TableOptions(
+        table=table, data=data, models=models, train=train, size=size.value, steps=steps, jobs=jobs, plots=plots
+    )
     show(interruptible(lambda: evaluate_table(options)), json, print_tokenizer_tables)
 
 
@@ -99,26 +101,37 @@ def listener_(
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
     from sfms_robot.cli.show_learning import print_arig_table, print_figures, print_listener_table, show
-    from sfms_robot.lab.evaluate.listener_evaluation import evaluate_listener, listener_table
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
     if table is None:
+        from sfms_robot.lab.evaluation.listener_evaluation import evaluate_listener
+
         show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json, print_figures)
         return
     if of_arig:
         if order is not None or hop is not None:
             raise typer.BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.lab.evaluate.arig_evaluation import AblationOptions, arig_table
+        from sfms_robot.lab.evaluation.arig_tables import AblationOptions, arig_table
 
         ablations = AblationOptions(models, config, steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json, print_arig_table)
         return
-    number = int(table.value)
+    from sfms_robot.lab.evaluation.papers import sfms_table
+
     result = interruptible(
-        lambda: listener_table(
-            number, listener, data, samples, clips, seed, order.value if order else None, hop, models, steps
+        lambda: sfms_table(
+            int(table.value),
+            listener,
+            data,
+            samples=samples,
+            limit=clips,
+            seed=seed,
+            order=order.value if order else None,
+            hop=hop,
+            models=models,
+            steps=steps,
         )
     )
     show(result, json, print_listener_table)
@@ -141,9 +154,11 @@ def papers(
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
     from sfms_robot.cli.show_learning import print_paper_table, show
-    from sfms_robot.lab.evaluate.papers import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.lab.evaluation.papers import EVERY, PapersOptions, evaluate_papers
 
-    options = PapersOptions(data, models, table or EVERY, clips, samples, steps, seed)
+    options = PapersOptions(
+        data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed
+    )
     each = (lambda name, found: None) if json else print_paper_table
     show(interruptible(lambda: evaluate_papers(options, each)), json, lambda found: None)
 
@@ -169,11 +184,22 @@ def timing(
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
     from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import print_timing, show
-    from sfms_robot.lab.evaluate.meetings import TimingOptions, evaluate_timing
+    from sfms_robot.lab.evaluation.meetings import TimingOptions, evaluate_timing
 
     runs_on = engine_named(engine)
     options = TimingOptions(
-        listener, data, split.value, allow_training, meetings, minutes, seeds, seed, jobs, hop, runs_on, own_voice
+        listener=listener,
+        data=data,
+        split=split.value,
+        allow_training=allow_training,
+        meetings=meetings,
+        minutes=minutes,
+        seeds=seeds,
+        seed=seed,
+        jobs=jobs,
+        hop=hop,
+        engine=runs_on,
+        own_voice=own_voice,
     )
     show(evaluate_timing(options), json, print_timing)
 
@@ -194,9 +220,11 @@ def robustness(
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
     from sfms_robot.cli.show_learning import print_robustness, show
-    from sfms_robot.lab.evaluate.unseen_speakers import evaluate_robustness
+    from sfms_robot.lab.evaluation.robustness import evaluate_robustness
 
-    found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs)
+    found = evaluate_robustness(
+        listener, data, split=split.value, speakers=speakers, minutes=minutes, seeds=seeds, seed=seed, jobs=jobs
+    )
     show(found, json, print_robustness)
 
 
@@ -214,7 +242,7 @@ def naturalness(
     """How a listener moves beside people whose motion it never saw: nods, smiles, gaze, sway, and a network's guess."""
     from sfms_robot.app.listen.preflight import engine_named
     from sfms_robot.cli.show_learning import show
-    from sfms_robot.lab.evaluate.naturalness import evaluate_naturalness
+    from sfms_robot.lab.evaluation.naturalness import evaluate_naturalness
 
     show(evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine)), json)
 
@@ -231,9 +259,10 @@ def metrics_(
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
     from sfms_robot.cli.show_learning import print_figures, show
-    from sfms_robot.lab.evaluate.motion_metrics import MetricFiles, evaluate_metrics
+    from sfms_robot.lab.evaluation.motion_metrics import MetricFiles, evaluate_metrics
 
-    show(evaluate_metrics(MetricFiles(truth, prediction, speaker, space, frames), seed), json, print_figures)
+    files = MetricFiles(truth=truth, prediction=prediction, speaker=speaker, space=space, frames=frames)
+    show(evaluate_metrics(files, seed), json, print_figures)
 
 
 @app.command()
@@ -246,7 +275,7 @@ def interaction(
 ) -> None:
     """What a listener that speaks is worth: its states against labels, its lips, and the joints of its chunks."""
     from sfms_robot.cli.show_learning import print_interaction, show
-    from sfms_robot.lab.evaluate.arig_evaluation import evaluate_interaction
+    from sfms_robot.lab.evaluation.interaction import evaluate_interaction
 
     show(evaluate_interaction(listener, data, clips, seed), json, print_interaction)
 
@@ -271,12 +300,14 @@ def people(
 ) -> None:
     """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
     from sfms_robot.cli.show_learning import print_preferences, show
-    from sfms_robot.lab.evaluate import people_study
+    from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
         show(people_study.table(results), json, print_preferences)
         return
-    options = people_study.StudyOptions(tuple(listener), data, voices, seconds, seed, out)
+    options = people_study.StudyOptions(
+        conditions=tuple(listener), data=data, voices=voices, seconds=seconds, seed=seed, folder=out
+    )
     study = people_study.prepare(options)
     try:
         people_study.serve(study, view, _ask)

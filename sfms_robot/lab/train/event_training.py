@@ -19,7 +19,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS
 from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
-from sfms_robot.lab.evaluate.meetings import tables
+from sfms_robot.lab.evaluation.meetings import tables
 from sfms_robot.lab.learning.events import borrowed, event_rollout, event_shapes, event_trainer
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, NOD, RIDGE, STUDY_RIDGE, Groups, Student
 from sfms_robot.lab.learning.events.labels import LEARNED
