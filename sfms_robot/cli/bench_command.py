@@ -74,9 +74,9 @@ def bench(
         lambda line: print(line, file=sys.stderr),
     )
     if write is not None:
-        from sfms_robot.lab.bench import performance_page
+        from sfms_robot.lab.bench.measure import write_page
 
-        performance_page.write(write, found.figures, (time.monotonic() - began_s) / 60)
+        write_page(write, found.figures, (time.monotonic() - began_s) / 60)
 
     def printed(_: Mapping[str, Any]) -> None:
         print_rows(found.table)

@@ -64,13 +64,13 @@ def tokenizer(
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
     if table is None:
-        from sfms_robot.lab.evaluate.listener_evaluation import evaluate_tokenizer
+        from sfms_robot.lab.evaluation.listener_evaluation import evaluate_tokenizer
 
         if data is None:
             raise BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
-    from sfms_robot.lab.evaluate.tokenizer_evaluation import TableOptions, evaluate_table
+    from sfms_robot.lab.evaluation.tokenizer_tables import TableOptions, evaluate_table
 
     options = TableOptions(
         table=table, data=data, models=models, train=train, size=size.value, steps=steps, jobs=jobs, plots=plots
@@ -100,7 +100,7 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.lab.evaluate.listener_evaluation import evaluate_listener, listener_table
+    from sfms_robot.lab.evaluation.listener_evaluation import evaluate_listener
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
@@ -110,15 +110,19 @@ def listener_(
     if of_arig:
         if order is not None or hop is not None:
             raise BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.lab.evaluate.arig_evaluation import AblationOptions, arig_table
+        from sfms_robot.lab.evaluation.arig_tables import AblationOptions, arig_table
 
         ablations = AblationOptions(models=models, training=config, steps=steps)
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json)
         return
-    more: dict[str, Any] = {"order": order.value if order else None, "hop": hop, "models": models, "steps": steps}
-    number = int(table.value)
-    show(interruptible(lambda: listener_table(number, listener, data, samples, clips, seed, **more)), json)
+    from sfms_robot.lab.evaluation.papers import sfms_table
+
+    options: dict[str, Any] = {
+        "samples": samples, "limit": clips, "seed": seed, "order": order.value if order else None, "hop": hop,
+        "models": models, "steps": steps,
+    }  # fmt: skip
+    show(interruptible(lambda: sfms_table(int(table.value), listener, data, **options)), json)
 
 
 @app.command()
@@ -137,7 +141,7 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.lab.evaluate.papers import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.lab.evaluation.papers import EVERY, PapersOptions, evaluate_papers
 
     options = PapersOptions(
         data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed
@@ -166,7 +170,7 @@ def timing(
 ) -> None:
     """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
     from sfms_robot.app.options import engine_named
-    from sfms_robot.lab.evaluate.meetings import TimingOptions, evaluate_timing
+    from sfms_robot.lab.evaluation.meetings import TimingOptions, evaluate_timing
 
     options = TimingOptions(
         listener=listener,
@@ -200,9 +204,11 @@ def robustness(
     json: bool = JSON,
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
-    from sfms_robot.lab.evaluate.unseen_speakers import evaluate_robustness
+    from sfms_robot.lab.evaluation.robustness import evaluate_robustness
 
-    found = evaluate_robustness(listener, data, split.value, speakers, minutes, seeds, seed, jobs=jobs)
+    found = evaluate_robustness(
+        listener, data, split=split.value, speakers=speakers, minutes=minutes, seeds=seeds, seed=seed, jobs=jobs
+    )
     show(found, json)
 
 
@@ -219,7 +225,7 @@ def naturalness(
 ) -> None:
     """Compare a listener's motion with that of unseen people: nods, smiles, gaze, sway, and a network's guess."""
     from sfms_robot.app.options import engine_named
-    from sfms_robot.lab.evaluate.naturalness import evaluate_naturalness
+    from sfms_robot.lab.evaluation.naturalness import evaluate_naturalness
 
     show(evaluate_naturalness(listener, data, split, clips, drift, seed, engine_named(engine)), json)
 
@@ -237,7 +243,7 @@ def metrics_(
     json: bool = JSON,
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
-    from sfms_robot.lab.evaluate.motion_metrics import MetricFiles, evaluate_metrics
+    from sfms_robot.lab.evaluation.motion_metrics import MetricFiles, evaluate_metrics
 
     show(
         evaluate_metrics(
@@ -256,7 +262,7 @@ def interaction(
     json: bool = JSON,
 ) -> None:
     """Score a listener that speaks: its states against labels, its lips, and the borders of its chunks."""
-    from sfms_robot.lab.evaluate.arig_evaluation import evaluate_interaction
+    from sfms_robot.lab.evaluation.interaction import evaluate_interaction
 
     show(evaluate_interaction(listener, data, clips, seed), json, _print_interaction)
 
@@ -281,7 +287,7 @@ def people(
     json: bool = JSON,
 ) -> None:
     """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
-    from sfms_robot.lab.evaluate import people_study
+    from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
         show(people_study.table(results), json)

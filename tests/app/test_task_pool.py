@@ -3,7 +3,7 @@
 import pytest
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.evaluate.task_pool import done_in_processes
+from sfms_robot.lab.evaluation.rollout import run_in_processes
 
 
 def squared(number):
@@ -14,10 +14,10 @@ def squared(number):
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_results_come_in_the_order_of_the_tasks(jobs):
-    assert done_in_processes(squared, [3, 1, 2], jobs, "numbers") == [9, 1, 4]
+    assert run_in_processes(squared, [3, 1, 2], jobs, "numbers") == [9, 1, 4]
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_a_task_raises_is_raised(jobs):
     with pytest.raises(ConfigError, match="-1: must be 0 or more"):
-        done_in_processes(squared, [3, -1, 2], jobs, "numbers")
+        run_in_processes(squared, [3, -1, 2], jobs, "numbers")

@@ -12,7 +12,7 @@ import soundfile
 import uvicorn
 from chromium import Page, missing
 
-from sfms_robot.lab.evaluate.people_study import Study, clip_name, read_answers
+from sfms_robot.lab.evaluation.people_study import Study, clip_name, read_answers
 from sfms_robot.viewer.study_server import study_app
 
 LIMIT_S = 60.0

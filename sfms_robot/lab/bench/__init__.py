@@ -1,8 +1,8 @@
-"""`sfms-robot bench`: each part against a peer or a baseline, both measured in the same run.
+"""`sfms-robot bench`: each part beside a peer or a baseline, both measured in the same run.
 
-`BENCHES` is the table of all of them; a new one is a line there, and the function that it names. That function takes
-the options that the line says, as keywords, and returns rows by name (`measure.row`), or `measure.Told` where a table
-of its own says more. Nothing is imported before it is measured: a shell that completes names waits for this file.
+`BENCHES` lists all of them; a new bench is one entry here and the function that the entry names. The function takes the
+options of its entry as keywords and returns rows by name (`measure.row`), or a `measure.BenchResult` with a table of
+its own. Modules are imported when they are measured: shell completion imports this file.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.errors import ConfigError, RobotError
 
 if TYPE_CHECKING:
-    from sfms_robot.lab.bench.measure import Told
+    from sfms_robot.lab.bench.measure import BenchResult
 
 ALL: Final = "all"
 Say = Callable[[str], None]
@@ -28,9 +28,9 @@ class Bench:
 
     Attributes:
         place: "module:function" in this folder.
-        about: what is measured, and beside what.
-        in_all: whether `bench` without a name measures it too: takes a minute or two, needs nothing but the package.
-        takes: options that it understands; "say" is a function that is told what is going on.
+        about: The quantity and its peer.
+        in_all: Part of `bench all`: takes a minute or two and needs no extra package.
+        takes: Options that it understands; "say" is a function that prints progress.
     """
 
     place: str
@@ -55,7 +55,7 @@ BENCHES: Final[Mapping[str, Bench]] = {
         takes=("budget",),
     ),
     "memory": Bench(
-        "memory_bench:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
+        "lead:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
         takes=("hours", "head"),
     ),
     "own-voice": Bench(
@@ -90,44 +90,45 @@ BENCHES: Final[Mapping[str, Bench]] = {
         in_all=False, takes=("say",),
     ),
     "fuzz": Bench(
-        "fuzz:measure", "random bytes at every family; exit code 1 where they do harm", in_all=False,
+        "campaign:measure_fuzz", "random bytes at every family; exit code 1 where they do harm", in_all=False,
         takes=("minutes", "say"),
     ),
 }  # fmt: skip
 
 
-def run_bench(name: str, given: Mapping[str, Any], say: Say) -> Told:
-    """Measure `name`, or all that belong to "all"; `say` is told of each.
+def run_bench(name: str, given: Mapping[str, Any], say: Say) -> BenchResult:
+    """Measure `name`, or everything that belongs to "all"; `say` gets one line of progress for each.
 
     Args:
-        given: options by name, those that were given. `against`, a folder with another installation, goes with every
-            bench of rows: that one becomes the peer, and the two run in turn.
+        name: A key of `BENCHES`, or "all".
+        given: The options that were given, by name. `against`, the folder of another installation, works with every
+            bench of rows: that installation becomes the peer, and the two run in turn.
+        say: Prints a line.
 
-    Raises ConfigError for a name that is none and for an option that means nothing there, and what the bench raises.
+    Raises ConfigError for an unknown name or an option that the bench does not take, and whatever the bench raises.
     """
-    from sfms_robot.lab.bench.measure import Told, beside
+    from sfms_robot.lab.bench.measure import BenchResult, compare_installations
 
     chosen = {key: one for key, one in BENCHES.items() if (one.in_all if name == ALL else key == name)}
     if not chosen:
         raise ConfigError(f'bench: there is no "{name}" ({", ".join([ALL, *BENCHES])})')
     takes = () if name == ALL else BENCHES[name].takes
     if "against" in given and "against" not in takes:
-        return Told.of_rows(beside(name, given["against"]))
+        return BenchResult.of_rows(compare_installations(name, given["against"]))
     for option in given:
         if option not in takes:
             those = " and ".join(f"'bench {key}'" for key, one in BENCHES.items() if option in one.takes)
             raise ConfigError(f"--{option} {given[option]}: only {those} takes it")
-    if name != ALL:
-        return _measured(chosen[name], given, say)
-    return measure_all(chosen, say)
+    return measure_all(chosen, say) if name == ALL else _measured(chosen[name], given, say)
 
 
-def measure_all(chosen: Mapping[str, Bench], say: Say) -> Told:
-    """The rows of these, one after the other; one that cannot be measured here is left out, and that is told.
+def measure_all(chosen: Mapping[str, Bench], say: Say) -> BenchResult:
+    """Return the rows of all benches `chosen`, measured one after the other.
 
-    One that fails does not cost the others: what went wrong is among the lines, and it has not passed.
+    A bench that cannot run here is skipped with a message. A bench that fails adds a line, and the result has not
+    passed; the others are still measured.
     """
-    from sfms_robot.lab.bench.measure import Told
+    from sfms_robot.lab.bench.measure import BenchResult
 
     rows: dict[str, Any] = {}
     failed: list[str] = []
@@ -135,24 +136,23 @@ def measure_all(chosen: Mapping[str, Bench], say: Say) -> Told:
         say(key)
         began_s = time.monotonic()
         try:
-            told = _measured(one, {}, say)
+            found = _measured(one, {}, say)
         except ConfigError as error:
             say(f"{key} is left out: {error}")
             continue
         except RobotError as error:
             failed.append(f"{key}: {error}")
             continue
-        rows |= {name: each for name, each in told.figures.items() if isinstance(each, Mapping) and "median" in each}
-        failed += [] if told.passed else [f"{key}: {line}" for line in told.lines]
+        rows |= {name: each for name, each in found.figures.items() if isinstance(each, Mapping) and "median" in each}
+        failed += [] if found.passed else [f"{key}: {line}" for line in found.lines]
         say(f"{key} took {time.monotonic() - began_s:.0f} s")
-    found = Told.of_rows(rows)
-    return replace(found, lines=failed, passed=not failed)
+    return replace(BenchResult.of_rows(rows), lines=failed, passed=not failed)
 
 
-def _measured(bench: Bench, given: Mapping[str, Any], say: Say) -> Told:
-    from sfms_robot.lab.bench.measure import Told
+def _measured(bench: Bench, given: Mapping[str, Any], say: Say) -> BenchResult:
+    from sfms_robot.lab.bench.measure import BenchResult
 
     module, function = bench.place.split(":")
     measure = getattr(importlib.import_module(f"{__name__}.{module}"), function)
     found = measure(**given, **({"say": say} if "say" in bench.takes else {}))
-    return found if isinstance(found, Told) else Told.of_rows(found)
+    return found if isinstance(found, BenchResult) else BenchResult.of_rows(found)

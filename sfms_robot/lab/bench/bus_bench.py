@@ -1,14 +1,13 @@
-"""The bus beside the vendor SDK's own calls, on the same emulated servos, in real time.
+"""`bench bus`: the bus beside the vendor SDK's calls, on the same emulated servos, in real time.
 
-    write, tick     host CPU of a sync write; of a write and a read of everybody
-    tick_FAMILY     the same of a head of 12 servos of each bus family
+    write, tick     host CPU of a sync write; of a write and a read of all servos
+    tick_FAMILY     the same for a head of 12 servos of each bus family
     cpu_share       of a core, at 100 ticks a second
-    wire_use        bytes x 10 / baud over the time that the host spends in ticks one after the other, on a line that
-                    takes its time; what the emulator itself delivered late does not count as the host's time
-    one_silent      ticks a second at 100 Hz with one servo of the head dead, where those behind it fall silent too, and
-                    where they do not
+    wire_use        bytes x 10 / baud over the host's time for ticks without pauses, on a line with the timing of a
+                    wire; time by which the emulator itself was late does not count
+    one_silent      ticks a second at 100 Hz with one dead servo, with those behind it silent too, and with them working
 
-A silence counts as one after `DEADLINE_MS`, longer than on a wire: the emulator shares the computer's cores.
+A servo counts as silent after `DEADLINE_MS`, longer than on a wire: the emulator shares the computer's cores.
 """
 
 from __future__ import annotations
@@ -42,39 +41,39 @@ _MIDDLE: Final = b"\x00\x08\x00\x00"
 _SERVOS: Final = 12  # of the heads that each protocol is measured with
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A model of a protocol, which has `zero_ticks` in its middle, and (address, length) of its registers."""
+@dataclass(frozen=True, kw_only=True)
+class VendorModel:
+    """A servo model as the vendor SDK addresses it: its middle, and (address, length) of its registers."""
 
-    protocol: float
+    protocol: float = 1.0
     model: str
-    zero_ticks: int
+    zero_ticks: int = 2048
     goal: tuple[int, int]
     position: tuple[int, int]
 
 
-_XL330: Final = Kind(2.0, "xl330-m288", 2048, _GOAL, _POSITION)
-_KINDS: Final = {  # by bus family
+_XL330: Final = VendorModel(protocol=2.0, model="xl330-m288", goal=_GOAL, position=_POSITION)
+_MODELS: Final = {  # by bus family
     "dynamixel2": _XL330,
-    "dynamixel1": Kind(1.0, "mx-28-1.0", 2048, (30, 2), (36, 2)),
-    "feetech": Kind(1.0, "sts3215", 2048, (42, 2), (56, 2)),  # the frame is the same, and so is a sync write
+    "dynamixel1": VendorModel(model="mx-28-1.0", goal=(30, 2), position=(36, 2)),
+    "feetech": VendorModel(model="sts3215", goal=(42, 2), position=(56, 2)),  # frame and sync write of Protocol 1.0
 }
 
 
 @dataclass(frozen=True)
 class Host:
-    """Somebody who moves all servos of a head: writes goals, and makes whole ticks."""
+    """A program that moves all servos of a head: `write` sends goals, `tick` also reads."""
 
     write: Callable[[], object]
     tick: Callable[[], object]
 
 
 def bus() -> dict[str, Row]:
-    """All of it; ours first, then the vendor SDK on the same servos."""
+    """Return all rows; ours first, then the vendor SDK on the same servos."""
     head = _changed(load_head(HEAD), read_deadline_ms=DEADLINE_MS)
     return {
         **_cpu(head),
-        **{f"bus.tick_{family}": _tick(family, kind) for family, kind in _KINDS.items()},
+        **{f"bus.tick_{family}": _tick(family, model) for family, model in _MODELS.items()},
         "bus.wire_use_1M": _wire_use(head, 1_000_000, _POSITION),
         "bus.wire_use_4M": _wire_use(head, 4_000_000, _BLOCK),
         "bus.one_silent_chain_break": _one_silent(head, "chain_break"),
@@ -83,51 +82,53 @@ def bus() -> dict[str, Row]:
 
 
 def _cpu(head: Head) -> dict[str, Row]:
+    def measured(host: Host) -> list[list[float]]:
+        calls = [times(call, _CALLS, time.process_time) for call in (host.write, host.tick)]
+        return [*calls, _paced(host)[1]]
+
     with launch(_plugged(head)) as chain:
         with _ours(head, chain.device) as host:
-            ours = [times(call, _CALLS, time.process_time) for call in (host.write, host.tick)]
-            share = _paced(host, time.process_time)[1]
+            ours = measured(host)
         with _vendor(head, chain.device, _POSITION) as host:
-            peers = [times(call, _CALLS, time.process_time) for call in (host.write, host.tick)]
-            peer_share = _paced(host, time.process_time)[1]
-    vendor = "dynamixel-sdk GroupSyncWrite"
+            peers = measured(host)
+    write = "dynamixel-sdk GroupSyncWrite"
+    tick = f"{write} + GroupSyncRead"
+    units = {"write": ("ms CPU", write), "tick": ("ms CPU", tick), "cpu_share": ("of a core at 100 Hz", tick)}
     return {
-        "bus.write": row(ours[0], peers[0], "ms CPU", vendor),
-        "bus.tick": row(ours[1], peers[1], "ms CPU", f"{vendor} + GroupSyncRead"),
-        "bus.cpu_share": row(share, peer_share, "of a core at 100 Hz", f"{vendor} + GroupSyncRead"),
+        f"bus.{name}": row(own, peer, *unit) for (name, unit), own, peer in zip(units.items(), ours, peers, strict=True)
     }
 
 
-def _tick(family: str, kind: Kind) -> Row:
-    """Write and read of everybody, by what hangs on the wire."""
+def _tick(family: str, model: VendorModel) -> Row:
+    """Measure write and read of all servos of one family."""
     head = _changed(load_head(HEAD), family=family, baud=1_000_000, read_deadline_ms=DEADLINE_MS)
     some = list(head.joints.items())[:_SERVOS]
-    model = {"model": kind.model, "zero_ticks": kind.zero_ticks}
-    head = head.model_copy(update={"joints": {name: joint.model_copy(update=model) for name, joint in some}})
+    values = {"model": model.model, "zero_ticks": model.zero_ticks}
+    head = head.model_copy(update={"joints": {name: joint.model_copy(update=values) for name, joint in some}})
     with launch(_plugged(head)) as chain:
         with _ours(head, chain.device) as host:
             ours = times(host.tick, _CALLS, time.process_time)
-        with _vendor(head, chain.device, kind.position, kind) as host:
+        with _vendor(head, chain.device, model.position, model) as host:
             peers = times(host.tick, _CALLS, time.process_time)
-    reads = "GroupSyncRead" if kind.protocol == 2.0 else "a read of each"
+    reads = "GroupSyncRead" if model.protocol == 2.0 else "a read of each"
     return row(ours, peers, f"ms CPU, {_SERVOS} servos", f"dynamixel-sdk GroupSyncWrite + {reads}")
 
 
 def _one_silent(head: Head, behind: Literal["chain_break", "skip"]) -> Row:
-    """The servo in the middle of the chain dies while the bus runs."""
+    """Measure while the servo in the middle of the chain is dead."""
     ids = _ids(head)
     with launch(_plugged(head), behind_silent=behind) as chain:
         with _ours(head, chain.device) as host:
             host.tick()
             chain.kill(ids[len(ids) // 2])
-            rates = _paced(host, time.process_time)[0]
+            rates = _paced(host)[0]
         with _vendor(head, chain.device, _POSITION) as host:
-            peer_rates = _paced(host, time.process_time)[0]
+            peer_rates = _paced(host)[0]
     return row(rates, peer_rates, f"ticks/s, one of {len(ids)} dead", "dynamixel-sdk group calls")
 
 
 def _wire_use(head: Head, baud: int, where: tuple[int, int]) -> Row:
-    """Share of each tick in which the line carried bytes."""
+    """Measure the share of each tick in which the line carried bytes."""
     head = _changed(head, baud=baud)
     with launch(_plugged(head), timing="wire") as chain:
         with _ours(head, chain.device):
@@ -141,9 +142,9 @@ def _wire_use(head: Head, baud: int, where: tuple[int, int]) -> Row:
 
 
 def _shares(chain: Chain, host: Host, baud: int, ticks: int = 100) -> list[float]:
-    """Of one tick each, by the emulator's count of bytes and its stamps of lateness.
+    """Return one share per tick, from the emulator's count of bytes and its stamps of lateness.
 
-    Ticks with fewer bytes than usual, or more, are left out: the host gave up, and the rest came with the next one.
+    Ticks with an unusual number of bytes are left out: the host gave up, and the rest came with the next tick.
     """
     for _ in range(10):
         host.tick()
@@ -162,33 +163,33 @@ def _shares(chain: Chain, host: Host, baud: int, ticks: int = 100) -> list[float
     return [share for count, share in seen if count == usual]
 
 
-def _paced(host: Host, clock: Callable[[], float]) -> tuple[list[float], list[float]]:
-    """(ticks a second, seconds of `clock` a second) at 100 Hz, window by window; ticks that are missed are missed."""
+def _paced(host: Host) -> tuple[list[float], list[float]]:
+    """Return (ticks a second, processor seconds a second) at 100 Hz, by window; late ticks are not made up for."""
     pace = RealClock()
     rates, shares = [], []
     ticks = tick_times(pace, RATE_HZ, pace.now_s())
     for _ in range(_PACED_TICKS // _WINDOW):
-        began_s, used_s = pace.now_s(), clock()
+        began_s, used_s = pace.now_s(), time.process_time()
         for _ in range(_WINDOW):
             next(ticks)
             host.tick()
         spent_s = pace.now_s() - began_s
         rates.append(_WINDOW / spent_s)
-        shares.append((clock() - used_s) / spent_s)
+        shares.append((time.process_time() - used_s) / spent_s)
     return rates, shares
 
 
-# --- who is measured ------------------------------------------------------------------------------------------------
+# --- hosts ----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def _ours(head: Head, device: str) -> Iterator[Host]:
-    """The bus that `run` uses."""
+    """Open the bus that `run` uses."""
     clock = RealClock()
     bus = build_bus(head, {next(iter(head.buses)): device}, clock)
     bus.connect()
     held = bus.enable(list(head.joints))
-    joints = head.joints.values()  # a head that was switched off has sagged out of its range: it comes in first
+    joints = head.joints.values()  # without power the joints sag out of their ranges: they move in first
     held = np.clip(held, [joint.min_rad for joint in joints], [joint.max_rad for joint in joints])
 
     def write() -> None:
@@ -207,7 +208,7 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
 
 @contextmanager
 def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
-    """The two requests of a tick that `where` stands for, as the bus makes them: goals, and one fast sync read."""
+    """Open a link that makes the two requests of a tick as the bus does: goals, and one fast sync read of `where`."""
     from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
     from sfms_robot.servo.port import SerialPort
 
@@ -231,17 +232,16 @@ def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
 
 
 @contextmanager
-def _vendor(head: Head, device: str, where: tuple[int, int], kind: Kind = _XL330) -> Iterator[Host]:
-    """The calls of the vendor's SDK, as its examples make them. Its bulk read of Protocol 1.0 (4.1.0) fails."""
+def _vendor(head: Head, device: str, where: tuple[int, int], model: VendorModel = _XL330) -> Iterator[Host]:
+    """Open the vendor's SDK, with the calls of its examples. Its bulk read of Protocol 1.0 (4.1.0) fails."""
     import dynamixel_sdk as sdk
 
-    config = next(iter(head.buses.values()))
-    port, protocol = sdk.PortHandler(device), sdk.PacketHandler(kind.protocol)
+    port, protocol = sdk.PortHandler(device), sdk.PacketHandler(model.protocol)
     port.openPort()
-    port.setBaudRate(config.baud)
-    writer = sdk.GroupSyncWrite(port, protocol, *kind.goal)
+    port.setBaudRate(next(iter(head.buses.values())).baud)
+    writer = sdk.GroupSyncWrite(port, protocol, *model.goal)
     reader = sdk.GroupSyncRead(port, protocol, *where)
-    ids, middle = _ids(head), list(_MIDDLE[: kind.goal[1]])
+    ids, middle = _ids(head), list(_MIDDLE[: model.goal[1]])
     for servo in ids:
         writer.addParam(servo, middle)
         reader.addParam(servo)
@@ -253,7 +253,7 @@ def _vendor(head: Head, device: str, where: tuple[int, int], kind: Kind = _XL330
 
     def tick() -> None:
         write()
-        if kind.protocol == 2.0:
+        if model.protocol == 2.0:
             reader.txRxPacket()
         else:
             for servo in ids:
@@ -266,7 +266,7 @@ def _vendor(head: Head, device: str, where: tuple[int, int], kind: Kind = _XL330
 
 
 def _changed(head: Head, **values: Any) -> Head:
-    """The head with other values of its one bus."""
+    """Return the head with other values of its only bus."""
     name, config = next(iter(head.buses.items()))
     return head.model_copy(update={"buses": {name: config.model_copy(update=values)}})
 

@@ -1,30 +1,36 @@
-"""Every kind of trouble on every family of servos, in virtual time: what the bus lets through, and what comes back.
+"""`bench campaign` and `bench fuzz`: faults and random bytes on every family of servos, in virtual time.
 
-One run: four emulated servos follow a slow wave under the limiter, as in the loop. Either a fault of the emulator sets
-in after a while, and when it has passed they get time to come back; or the servos are not as the head's file says from
-the start, or half of them are lost for good. Judged from outside, by what the emulated servos hold and where they are:
+One run: four emulated servos follow a slow wave under the limiter, as in the loop. Either a fault of the emulator
+begins after a while, and when it is over the servos get time to recover; or the servos differ from the head's file from
+the start, or half of them are lost for good. Runs are judged from outside, by the goals and positions of the servos:
 
-    escaped       an exception left the bus that should not have, or a bad goal was not refused
+    escaped       an exception that the bus should have caught, or a bad goal that was accepted
     outside       goals outside the limits of a joint that a servo held
-    pulse_us      the shortest and longest pulse that a board made
-    stale         readings that tell another position than the servo had at the time they name
+    pulse_us      the shortest and longest pulse of a board
+    stale         readings whose position differs from the servo's at the time they state
     recovered_s   from the end of the fault until every joint is read, has torque and follows its goal, for good
-    named         joints that stay out, with their fault named: protection that is latched, or a servo left alone
-    refused       what the bus said at the start, of servos that contradict the head's file
-    off_s, stop_s until the torque was off, and until `stop` returned, where nobody answers
-    left_on       servos that had torque when all was over
+    named         joints that stay out, with their fault: latched protection, or a servo that the bus gave up
+    refused       the error at the start, of servos that contradict the head's file
+    off_s, stop_s until the torque was off, and until `stop` returned, when no servo answers
+    left_on       servos with torque after the run
 
-What a corrupted byte of the host can do is a statement per family (`corrupted_bytes`). On a board without a checksum
-goals outside the limits are part of it, and no failure.
+The effect of a corrupted byte from the host is stated per family (`corrupted_bytes`). On a board without a checksum
+goals outside the limits are part of it, not a failure. Virtual time and seeded dice make every run repeatable.
 
-A run is the same every time: time is virtual, and the dice are seeded.
+For `fuzz` the port delivers bytes that no servo sent before the servos' answers: half of them random, half shaped like
+the beginning of a packet. The loop continues meanwhile; afterwards every joint has to recover, without an exception, a
+hang, or growing memory. An 8-bit checksum accepts one forged answer in 256, so positions are not judged, but the goals
+that servos hold are.
 """
 
 from __future__ import annotations
 
 import logging
+import random
+import resource
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from typing import Any, Final
 
@@ -45,18 +51,18 @@ from sfms_robot.lab.bench.campaign_rig import (
     head_of,
     plugged_in,
 )
-from sfms_robot.lab.bench.measure import Told
-from sfms_robot.servo.port import WrappedPort
+from sfms_robot.lab.bench.measure import BenchResult
+from sfms_robot.servo.port import Port, WrappedPort
 
-TICKS: Final = 1000
+_TICKS: Final = 1000
 _QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
 _BAD_GOALS_EVERY: Final = 50
 _OFF_S, _STOP_S = 0.02, 0.5  # the longest that torque-off and `stop` may take
-_FAILS_AFTER_S: Final = 1.0  # a bus on which nobody answers; a board is given five times that
-_SAID_BY_S: Final = 7.0  # a board that fails is said
+_FAILS_AFTER_S: Final = 1.0  # a bus on which no servo answers; a board gets five times that
+_REPORTED_BY_S: Final = 7.0  # a board that fails is reported
 _OUTSIDE_DEG: Final = 8.0
 
-# Kind -> ids (all of the wire where there are none) and value.
+# Kind -> ids (all of the wire if there are none) and value.
 SPECS: Final[Mapping[str, str]] = {
     "drop": "drop{two}{when}=0.3",
     "delay": "delay{two}{when}=0.03",
@@ -83,18 +89,18 @@ STORED, MANY_TURNS, OUTSIDE = "stored limits", "many turns", "found outside"
 HALF_DEAD, MUTE_AT_STOP = "one bus of two dead", "mute at stop"
 STARTS: Final = (STORED, MANY_TURNS, OUTSIDE)
 CASES: Final = (*KINDS, *STARTS, HALF_DEAD, MUTE_AT_STOP)
-CONTRADICTS: Final = frozenset({STORED, MANY_TURNS})  # a servo may be refused for it at the start
-LATCHED: Final = frozenset({"overload", "overheat", "voltage", "stuck"})  # a servo's protection holds on to these
-LIMP_S: Final = {"stuck": 3.0}  # a joint that was pinched stays limp so long before it comes back
+CONTRADICTS: Final = frozenset({STORED, MANY_TURNS})  # the bus may refuse such a servo at the start
+LATCHED: Final = frozenset({"overload", "overheat", "voltage", "stuck"})  # a servo's protection latches these
+LIMP_S: Final = {"stuck": 3.0}  # a joint that was pinched stays limp that long before it recovers
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of one case on one family; see the head of this file. `possible`: this family can have that case."""
+@dataclass(frozen=True, kw_only=True)
+class CaseOutcome:
+    """The outcome of one case on one family; see the head of this file. `possible`: the family can have that case."""
 
     family: str
     case: str
-    ticks: int
+    ticks: int = 0
     possible: bool = True
     escaped: str | None = None
     outside: int = 0
@@ -109,7 +115,7 @@ class Outcome:
 
     @property
     def as_stated(self) -> bool:
-        """Whether every joint came back in time, or stays out for a reason that is stated."""
+        """Return whether every joint recovered in time, or stays out for a stated reason."""
         if self.case == MUTE_AT_STOP:
             return (self.off_s or 0.0) <= _OFF_S and (self.stop_s or 0.0) <= _STOP_S and self.off_s is not None
         if self.refused is not None:
@@ -120,14 +126,14 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        unchecked = self.case == CORRUPT and not FAMILIES[self.family][-1]
+        unchecked = self.case == CORRUPT and not FAMILIES[self.family].checksum
         harmless = self.escaped is None and (unchecked or not self.outside) and not self.stale and not self.left_on
         return not self.possible or (harmless and self.as_stated)
 
 
 @dataclass
 class SilencePort(WrappedPort):
-    """A port on which silence costs time; what is written arrives at once, and `arrived` is called."""
+    """A port on which silence costs time; written bytes arrive at once, and `arrived` is called."""
 
     baud: int
     arrived: Callable[[], None]
@@ -144,124 +150,22 @@ class SilencePort(WrappedPort):
         return data
 
 
-def one(family: str, case: str, ticks: int = TICKS) -> Outcome:
-    """Run `ticks` of one family in one case."""
-    if case == MUTE_AT_STOP:
-        return _mute_at_stop(family)
-    head = head_of(family, _FAILS_AFTER_S if case == HALF_DEAD else None)
-    servos = emulated(head)
-    if case in STARTS:
-        servos["main"] = _found(servos["main"], case)
-    if not servos["main"] or (case == "voltage" and load_firmware_map(servos["main"][0].model).tick_us):
-        return Outcome(family, case, 0, possible=False)
-    with plugged_in(head, servos) as rig:
-        try:
-            rig.hold()
-        except ServoError as error:
-            return _at_the_end(rig, Outcome(family, case, 0, refused=str(error)))
-        over_s = start_s = rig.clock.now_s() + _QUIET * ticks / RATE_HZ
-        if case == HALF_DEAD:
-            rig.chains["other"].inject(f"silent@{start_s:g}")
-        elif case in KINDS:
-            over_s += _FAULTY * ticks / RATE_HZ
-            names = {"one": f":{rig.ids[1]}", "two": f":{rig.ids[1]},{rig.ids[2]}"}
-            rig.chains["main"].inject(SPECS[case].format(when=f"@{start_s:g}-{over_s:g}", **names))
-        return _ride(rig, Outcome(family, case, ticks), over_s)
-
-
-def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
-    """Return the servos, two of them not as the head's file says; none where the family cannot be found like that."""
-    table = load_firmware_map(servos[0].model)
-    turn = round(table.ticks_per_revolution)
-    changes: list[dict[str, Any]]
-    if case == OUTSIDE:
-        beyond = round((LIMIT_DEG + _OUTSIDE_DEG) / 360.0 * table.ticks_per_revolution)
-        changes = [{"start_ticks": table.center_ticks + sign * beyond} for sign in (1, -1)]
-    elif case == STORED:
-        names = [name for name in table.registers if name.endswith(("position_limit", "angle_limit"))]
-        if not names:
-            return []
-        sides = {name: 1 if name.startswith(("max", "ccw")) else -1 for name in names}
-        narrow = {name: table.center_ticks + side * turn // 20 for name, side in sides.items()}
-        changes = [{"registers": narrow}] * 2
-    else:
-        if not table.registers or table.ticks_per_revolution != turn:
-            return []  # a board, or a potentiometer, which knows one turn only
-        registers = {}
-        if "multi_turn_offset" in table.registers:
-            registers = {"cw_angle_limit": 4095, "ccw_angle_limit": 4095}
-        elif "phase" in table.registers:
-            registers = {"phase": 28}
-        changes = [{"start_ticks": table.center_ticks + sign * turn + 54, "registers": registers} for sign in (1, -1)]
-    return [servos[0], *(replace(s, **change) for s, change in zip(servos[1:3], changes, strict=True)), servos[3]]
-
-
-def _ride(rig: Rig, outcome: Outcome, over_s: float) -> Outcome:
-    """Run the ticks and judge them; the trouble is over at `over_s`, or half of the buses die then.
-
-    A bus that dies is reported once, by a BusError, and the other one continues.
-    """
-    judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
-    for tick in range(outcome.ticks):
-        if dies and rig.clock.now_s() >= over_s:
-            judge.away = frozenset({2, 3})
-        try:
-            judge.see(rig.tick())
-            if tick % _BAD_GOALS_EVERY == 0 and not dies:
-                rig.try_bad_goals(bool(judge.named))
-        except Exception as error:  # what escapes is what is looked for
-            reports += 1
-            if not dies or reports > 1 or not isinstance(error, BusError):
-                outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
-                break
-    if dies and not reports and rig.clock.now_s() > over_s + _SAID_BY_S:
-        outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
-    for chain in rig.chains.values():
-        chain.clear_faults()  # what was dead is plugged in again: torque off has to reach it
-    outcome = replace(
-        outcome,
-        outside=judge.outside,
-        pulse_us=[edge(judge.pulses_us) for edge in (min, max) if judge.pulses_us],
-        stale=judge.stale,
-        recovered_s=judge.recovered_s(over_s),
-        named=judge.named,
-    )
-    return _at_the_end(rig, outcome)
-
-
-def _at_the_end(rig: Rig, outcome: Outcome) -> Outcome:
-    """Switch torque off, and count the servos that still have it."""
-    rig.bus.stop("release")
-    rig.bus.close()
-    return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
-
-
-def _mute_at_stop(family: str) -> Outcome:
-    """Call `stop` while all obey and none answers, and silence costs time."""
-    head, start_s, off_s = head_of(family), np.inf, np.inf
-
-    def arrived() -> None:
-        nonlocal off_s
-        if rig.clock.now_s() >= start_s and not any(state["torque"] for state in rig.states()):
-            off_s = min(off_s, rig.clock.now_s() - start_s)
-
-    with plugged_in(head, wrap=lambda port: SilencePort(port, head.buses["main"].baud, arrived)) as rig:
-        rig.hold()
-        for _ in range(round(_QUIET * TICKS)):
-            rig.tick()
-        rig.chains["main"].inject("mute")
-        start_s = rig.clock.now_s()
-        rig.bus.stop("release")
-        stop_s = rig.clock.now_s() - start_s
-        return _at_the_end(rig, Outcome(family, MUTE_AT_STOP, 0, off_s=float(off_s), stop_s=stop_s))
+def measure(say: Callable[[str], None]) -> BenchResult:
+    """Run the whole campaign as a bench."""
+    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of expected faults
+    outcomes = run_campaign(progress=say)
+    plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
+    passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
+    lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
+    return BenchResult({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
 
 
 def run_campaign(
     families: Iterable[str] = tuple(FAMILIES),
     cases: Iterable[str] = CASES,
-    ticks: int = TICKS,
+    ticks: int = _TICKS,
     progress: Callable[[str], None] = lambda line: None,
-) -> list[Outcome]:
+) -> list[CaseOutcome]:
     """Run every case on every family."""
     out = []
     for family, case in product(families, cases):
@@ -270,21 +174,11 @@ def run_campaign(
     return out
 
 
-def measure(say: Callable[[str], None]) -> Told:
-    """Return `run_campaign` in the form of a bench."""
-    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of faults are said elsewhere
-    outcomes = run_campaign(progress=say)
-    plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
-    passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
-    lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
-    return Told({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
-
-
-def corrupted_bytes(outcomes: Sequence[Outcome]) -> dict[str, dict[str, str]]:
-    """Return, per family, its checksum and what came of corrupted requests, in words."""
+def corrupted_bytes(outcomes: Sequence[CaseOutcome]) -> dict[str, dict[str, str]]:
+    """Return, per family, its checksum and the effect of corrupted requests, in words."""
     return {
         each.family: {
-            "checksum": FAMILIES[each.family][-1] or "no checksum",
+            "checksum": FAMILIES[each.family].checksum or "no checksum",
             "goals": f"{each.outside} outside limits",
             "pulses": "{:g} to {:g} us".format(*each.pulse_us) if each.pulse_us else "no pulses",
         }
@@ -293,7 +187,7 @@ def corrupted_bytes(outcomes: Sequence[Outcome]) -> dict[str, dict[str, str]]:
     }
 
 
-def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+def table(outcomes: Sequence[CaseOutcome]) -> list[dict[str, Any]]:
     """Return a row per run, as printed."""
 
     def short(value: float | None) -> float | None:
@@ -315,3 +209,252 @@ def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
         }
         for each in outcomes
     ]
+
+
+def one(family: str, case: str, ticks: int = _TICKS) -> CaseOutcome:
+    """Run `ticks` of one family in one case."""
+    if case == MUTE_AT_STOP:
+        return _mute_at_stop(family)
+    head = head_of(family, _FAILS_AFTER_S if case == HALF_DEAD else None)
+    servos = emulated(head)
+    if case in STARTS:
+        servos["main"] = _found(servos["main"], case)
+    if not servos["main"] or (case == "voltage" and load_firmware_map(servos["main"][0].model).tick_us):
+        return CaseOutcome(family=family, case=case, possible=False)
+    with plugged_in(head, servos) as rig:
+        try:
+            rig.hold()
+        except ServoError as error:
+            return _at_the_end(rig, CaseOutcome(family=family, case=case, refused=str(error)))
+        over_s = start_s = rig.clock.now_s() + _QUIET * ticks / RATE_HZ
+        if case == HALF_DEAD:
+            rig.chains["other"].inject(f"silent@{start_s:g}")
+        elif case in KINDS:
+            over_s += _FAULTY * ticks / RATE_HZ
+            names = {"one": f":{rig.ids[1]}", "two": f":{rig.ids[1]},{rig.ids[2]}"}
+            rig.chains["main"].inject(SPECS[case].format(when=f"@{start_s:g}-{over_s:g}", **names))
+        return _ride(rig, CaseOutcome(family=family, case=case, ticks=ticks), over_s)
+
+
+def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
+    """Return the servos, two of them unlike the head's file; none if the family cannot be in that condition."""
+    table = load_firmware_map(servos[0].model)
+    turn = round(table.ticks_per_revolution)
+    changes: list[dict[str, Any]]
+    if case == OUTSIDE:
+        beyond = round((LIMIT_DEG + _OUTSIDE_DEG) / 360.0 * table.ticks_per_revolution)
+        changes = [{"start_ticks": table.center_ticks + sign * beyond} for sign in (1, -1)]
+    elif case == STORED:
+        names = [name for name in table.registers if name.endswith(("position_limit", "angle_limit"))]
+        if not names:
+            return []
+        sides = {name: 1 if name.startswith(("max", "ccw")) else -1 for name in names}
+        narrow = {name: table.center_ticks + side * turn // 20 for name, side in sides.items()}
+        changes = [{"registers": narrow}] * 2
+    else:
+        if not table.registers or table.ticks_per_revolution != turn:
+            return []  # a board, or a potentiometer, which has one turn only
+        registers = {}
+        if "multi_turn_offset" in table.registers:
+            registers = {"cw_angle_limit": 4095, "ccw_angle_limit": 4095}
+        elif "phase" in table.registers:
+            registers = {"phase": 28}
+        changes = [{"start_ticks": table.center_ticks + sign * turn + 54, "registers": registers} for sign in (1, -1)]
+    return [servos[0], *(replace(s, **change) for s, change in zip(servos[1:3], changes, strict=True)), servos[3]]
+
+
+def _ride(rig: Rig, outcome: CaseOutcome, over_s: float) -> CaseOutcome:
+    """Run the ticks and judge them; the fault is over at `over_s`, or half of the buses die then.
+
+    A bus that dies is reported once, by a BusError, and the other one continues.
+    """
+    judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
+    for tick in range(outcome.ticks):
+        if dies and rig.clock.now_s() >= over_s:
+            judge.away = frozenset({2, 3})
+        try:
+            judge.see(rig.tick())
+            if tick % _BAD_GOALS_EVERY == 0 and not dies:
+                rig.try_bad_goals(bool(judge.named))
+        except Exception as error:  # the campaign looks for exceptions that escape
+            reports += 1
+            if not dies or reports > 1 or not isinstance(error, BusError):
+                outcome = replace(outcome, ticks=tick, escaped=f"{type(error).__name__}: {error}")
+                break
+    if dies and not reports and rig.clock.now_s() > over_s + _REPORTED_BY_S:
+        outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
+    for chain in rig.chains.values():
+        chain.clear_faults()  # dead servos are connected again: torque off has to reach them
+    outcome = replace(
+        outcome,
+        outside=judge.outside,
+        pulse_us=[edge(judge.pulses_us) for edge in (min, max) if judge.pulses_us],
+        stale=judge.stale,
+        recovered_s=judge.recovered_s(over_s),
+        named=judge.named,
+    )
+    return _at_the_end(rig, outcome)
+
+
+def _at_the_end(rig: Rig, outcome: CaseOutcome) -> CaseOutcome:
+    """Switch torque off, and count the servos that still have it."""
+    rig.bus.stop("release")
+    rig.bus.close()
+    return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
+
+
+def _mute_at_stop(family: str) -> CaseOutcome:
+    """Call `stop` while all servos obey and none answers, and silence costs time."""
+    head, start_s, off_s = head_of(family), np.inf, np.inf
+
+    def arrived() -> None:
+        nonlocal off_s
+        if rig.clock.now_s() >= start_s and not any(state["torque"] for state in rig.states()):
+            off_s = min(off_s, rig.clock.now_s() - start_s)
+
+    with plugged_in(head, wrap=lambda port: SilencePort(port, head.buses["main"].baud, arrived)) as rig:
+        rig.hold()
+        for _ in range(round(_QUIET * _TICKS)):
+            rig.tick()
+        rig.chains["main"].inject("mute")
+        start_s = rig.clock.now_s()
+        rig.bus.stop("release")
+        stop_s = rig.clock.now_s() - start_s
+        return _at_the_end(rig, CaseOutcome(family=family, case=MUTE_AT_STOP, off_s=float(off_s), stop_s=stop_s))
+
+
+# --- random bytes ---------------------------------------------------------------------------------------------------
+
+BYTES: Final = 1_000_000
+_MEMORY_MIB: Final = 64.0  # more than this is growth
+_MOST: Final = 1024  # bytes in one tick
+_WAITING: Final = 8 * _MOST  # a driver's buffer holds no more
+_CALM_TICKS: Final = 240
+_SHARE: Final = 0.8  # of the ticks that are noisy
+_BEGINNINGS: Final = (b"\xff\xff\xfd\x00", b"\xff\xff", b"\xff\xf5", b"\xff\xff\xfd\x00\xfe", b"\xff\xff\xfe")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fuzzed:
+    """The effect of random bytes on one family."""
+
+    family: str
+    bytes: int
+    ticks: int
+    escaped: str | None
+    outside: int
+    recovered_s: float | None
+    named: Sequence[str]
+    slowest_tick_ms: float
+    grown_mib: float
+
+    @property
+    def passed(self) -> bool:
+        back = self.recovered_s is not None and self.recovered_s <= RECOVERY_S
+        return self.escaped is None and not self.outside and back and self.grown_mib < _MEMORY_MIB
+
+
+@dataclass
+class NoisyPort(WrappedPort):
+    """A port that delivers random bytes before the servos' answers, and counts those read or discarded."""
+
+    dice: random.Random
+    waiting: bytearray = field(default_factory=bytearray)
+    count: int = 0
+
+    def rise(self) -> None:
+        """Add a tick's worth of bytes."""
+        if self.dice.random() < _SHARE and len(self.waiting) < _WAITING:
+            start = self.dice.choice(_BEGINNINGS) if self.dice.random() < 0.5 else b""
+            self.waiting += start + self.dice.randbytes(self.dice.randint(1, _MOST))
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        if not self.waiting:
+            return super().read(n, deadline_s)
+        piece = bytes(self.waiting[: self.dice.randint(1, n)])
+        del self.waiting[: len(piece)]
+        self.count += len(piece)
+        return piece
+
+    def discard_input(self) -> None:
+        self.count += len(self.waiting)
+        self.waiting.clear()
+        super().discard_input()
+
+
+def measure_fuzz(say: Callable[[str], None], minutes: float = 0.0) -> BenchResult:
+    """Fuzz every family once with a million bytes, then again with other dice until `minutes` are over."""
+    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of expected faults
+    until_s, seed, fuzzed = time.monotonic() + 60.0 * minutes, 0, list[Fuzzed]()
+    while not fuzzed or time.monotonic() < until_s:
+        for family in FAMILIES:
+            say(f"{family}: {BYTES} bytes, dice {seed}")
+            fuzzed.append(fuzz_one(family, BYTES, seed))
+        seed += 1
+    passed = all(each.passed for each in fuzzed)
+    rows = [
+        {
+            "family": each.family,
+            "bytes": each.bytes,
+            "escaped": each.escaped or 0,
+            "outside": each.outside,
+            "back s": None if each.recovered_s is None else round(each.recovered_s, 2),
+            "out": len(each.named),
+            "ms": round(each.slowest_tick_ms, 1),
+            "MiB": round(each.grown_mib, 1),
+            "passed": "yes" if each.passed else "NO",
+        }
+        for each in fuzzed
+    ]
+    plain = [asdict(each) | {"passed": each.passed} for each in fuzzed]
+    return BenchResult({"passed": passed, "runs": plain}, rows, passed=passed)
+
+
+def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
+    """Deliver `count` bytes to the bus of one family, and then none for a while."""
+    ports: list[NoisyPort] = []
+
+    def noisy(port: Port) -> NoisyPort:
+        if ports:  # the bus has opened its port again
+            ports[0].inner = port
+        else:
+            ports.append(NoisyPort(port, random.Random(seed)))
+        return ports[0]
+
+    with plugged_in(head_of(family), wrap=noisy) as rig:
+        rig.hold()
+        noise, judge = ports[0], Judge(rig)
+        ticks, calm, slowest_s, escaped = 0, 0, 0.0, None
+        end_s, before_mib = rig.clock.now_s(), _memory_mib()
+        while calm < _CALM_TICKS:
+            if noise.count < count:
+                noise.rise()
+                end_s = rig.clock.now_s()
+            else:
+                noise.waiting.clear()
+                calm += 1
+            ticks += 1
+            began_s = time.perf_counter()
+            try:
+                readings = rig.tick()
+            except Exception as error:  # the bench looks for exceptions that escape
+                escaped = f"{type(error).__name__}: {error}"
+                break
+            slowest_s = max(slowest_s, time.perf_counter() - began_s)
+            judge.see(readings)
+        return Fuzzed(
+            family=family,
+            bytes=noise.count,
+            ticks=ticks,
+            escaped=escaped,
+            outside=judge.outside,
+            recovered_s=judge.recovered_s(end_s),
+            named=judge.named,
+            slowest_tick_ms=1e3 * slowest_s,
+            grown_mib=_memory_mib() - before_mib,
+        )
+
+
+def _memory_mib() -> float:
+    """Return the peak memory of this process."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

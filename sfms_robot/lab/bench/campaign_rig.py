@@ -1,11 +1,11 @@
-"""Emulated servos of every family, driven as the loop does it, in virtual time, and an onlooker outside the bus."""
+"""Emulated servos of every family, driven as by the loop in virtual time, and a judge that bypasses the bus."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -31,21 +31,31 @@ _STALE_TICKS: Final = 3  # rounding, and what the servo moves while it answers
 _FRESH_S: Final = 0.3
 _FOLLOWS_RAD: Final = 0.15
 
-# Family -> (bus family, model, ids, baud, what its servos or board check a packet with; "" where they take any byte).
-FAMILIES: Final[Mapping[str, tuple[str, str, Sequence[int], int, str]]] = {
-    "dynamixel2": ("dynamixel2", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
-    "dynamixel1": ("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "dynamixel1-mx": ("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "sts": ("feetech", "sts3215", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "scs": ("feetech", "scs0009", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "maestro": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200, ""),
-    "maestro-crc": ("maestro", "maestro-24", (0, 1, 2, 5), 115_200, "CRC-7"),
-    "ssc32": ("ssc32", "ssc-32", (0, 1, 2, 5), 115_200, ""),
+
+class ServoFamily(NamedTuple):
+    """A bus with servos of one model. `checksum`: of its packets; "" for a protocol without."""
+
+    bus: str
+    model: str
+    ids: Sequence[int]
+    baud: int
+    checksum: str
+
+
+FAMILIES: Final[Mapping[str, ServoFamily]] = {
+    "dynamixel2": ServoFamily("dynamixel2", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
+    "dynamixel1": ServoFamily("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "dynamixel1-mx": ServoFamily("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "sts": ServoFamily("feetech", "sts3215", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "scs": ServoFamily("feetech", "scs0009", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+    "maestro": ServoFamily("maestro", "maestro-24", (0, 1, 2, 5), 115_200, ""),
+    "maestro-crc": ServoFamily("maestro", "maestro-24", (0, 1, 2, 5), 115_200, "CRC-7"),
+    "ssc32": ServoFamily("ssc32", "ssc-32", (0, 1, 2, 5), 115_200, ""),
 }
 
 
 def head_of(family: str, reconnect_s: float | None = None) -> Head:
-    """Four joints of a family on the bus `main`; with `reconnect_s` on two buses, `main` and `other`, which fail then.
+    """Return four joints of a family on the bus `main`; with `reconnect_s` on two, `main` and `other`, which fail then.
 
     Raises ConfigError for an unknown family.
     """
@@ -71,7 +81,7 @@ def head_of(family: str, reconnect_s: float | None = None) -> Head:
 
 
 class Rig:
-    """Emulated servos of one family, their bus, and the way of the loop to it."""
+    """Emulated servos of one family and their bus, driven by the steps of the loop."""
 
     def __init__(self, head: Head, chains: Mapping[str, Chain], clock: VirtualClock, bus: Bus) -> None:
         self.chains, self.clock, self.bus = chains, clock, bus
@@ -91,7 +101,7 @@ class Rig:
         self.goals: Doubles = held
 
     def tick(self) -> Mapping[str, Reading]:
-        """One turn of the loop: limiter, write, poll; who came back is led from where it stands."""
+        """Do one turn of the loop: limiter, write, poll; a joint that rejoined continues from its position."""
         self.clock.wait_until(self.clock.now_s() + 1.0 / RATE_HZ)
         now_s = self.clock.now_s()
         self.goals, self._state = self._limiter.step(self._wave(now_s - self._began_s), self._state)
@@ -107,7 +117,7 @@ class Rig:
         return readings
 
     def _wave(self, time_s: float) -> Doubles:
-        """Reference (3, J): angle, speed, acceleration of a wave that begins at rest where the joints are held."""
+        """Return angle, speed, acceleration (3, J) of a wave that begins at rest at the held angles."""
         turn = 2 * math.pi / _WAVE_S
         phase = turn * time_s
         way = np.where(np.arange(len(self.ids)) % 2, -1.0, 1.0) * _WAVE_RAD
@@ -115,9 +125,9 @@ class Rig:
         return np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
 
     def try_bad_goals(self, withheld: bool) -> None:
-        """Send bad goals of the last joint. Raises AssertionError for one that is not refused.
+        """Send bad goals of the last joint. Raises AssertionError for one that the bus accepts.
 
-        Those out of range are left out where a fault or the way back of a joint may hold its goals back.
+        Goals out of range are left out while a fault or the return of a joint may hold its goals back.
         """
         bad_rad = [math.nan, math.inf]
         if not withheld and self.states()[-1]["goal"] == self.conversion.to_ticks(self.goals)[-1]:
@@ -129,16 +139,16 @@ class Rig:
                 raise AssertionError(f"a goal of {bad:g} rad is not refused")
 
     def states(self) -> list[dict[str, Any]]:
-        """What an onlooker sees of every servo now."""
+        """Return the state of every servo now, read past the bus."""
         for chain in self.chains.values():
             chain.time_is(self.clock.now_s())
         return [chain.state(servo) for chain, servo in zip(self._wires, self.ids, strict=True)]
 
 
 class Judge:
-    """Looks at the servos after every tick, but those of joints `away`, of whom nothing is expected any more.
+    """Judges the servos after every tick, except those of joints `away`, which are lost for good.
 
-    A joint that was found outside its range may be sent anywhere between there and its range, and never out again.
+    A joint that was found outside its range may move anywhere between that place and its range, but not out again.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -174,7 +184,7 @@ class Judge:
             self.well_since_s = rig.clock.now_s()
 
     def recovered_s(self, end_s: float) -> float | None:
-        """From `end_s`, when the trouble was over, until all was well for good; None where it is not."""
+        """Return the time from `end_s`, the end of the fault, until all was well for good; None if it never was."""
         return None if self.well_since_s is None else max(0.0, self.well_since_s - end_s)
 
     def _see_goal(self, index: int, goal: float) -> None:
@@ -183,7 +193,7 @@ class Judge:
         self._high[index] = min(self._high[index], max(goal, self._rig.conversion.high_ticks[index]))
 
     def _misdated(self, index: int, reading: Reading) -> bool:
-        """Whether the servo stood elsewhere at the time that the reading names."""
+        """Return whether the servo was elsewhere at the time that the reading states."""
         if reading.position_rad is None or not math.isfinite(reading.age_s):
             return False
         back = round(reading.age_s * RATE_HZ)
@@ -193,9 +203,9 @@ class Judge:
 
     def _well(self, index: int, reading: Reading, state: Mapping[str, Any], shaft_rad: float) -> bool:
         if reading.fault is not None:
-            return True  # out of the game, and says why
-        told = self._rig.tick_us or reading.age_s < _FRESH_S
-        return bool(told) and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
+            return True  # out, with a stated reason
+        known = self._rig.tick_us or reading.age_s < _FRESH_S
+        return bool(known) and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
 
 
 @contextmanager
@@ -204,7 +214,7 @@ def plugged_in(
     servos: Mapping[str, Sequence[EmulatedServo]] | None = None,
     wrap: Callable[[Port], Port] | None = None,
 ) -> Iterator[Rig]:
-    """The head's servos, as they are found or those given by bus; `wrap` puts the port of a lone bus into another."""
+    """Emulate a head's servos, or those given by bus; `wrap` puts the port of a single bus into another."""
     clock = VirtualClock()
     with ExitStack() as stack:
         plugged = (emulated(head) if servos is None else servos).items()

@@ -1,61 +1,70 @@
-"""Every shipped listener on every engine: how fast, how soon, how much memory, and what a fast way costs in accuracy.
+"""`bench listener`: every shipped listener on every engine: speed, start, memory, and loss of accuracy.
 
-Rows "NAME ENGINE" lay the engines side by side (`engine_bench`); the row NAME is the one that `--engine auto` takes,
-with what else is known of the listener. One without weights (the sizes of the papers) is measured with seeded ones:
-what a frame costs does not depend on them. ARIG's context is filled by hand, as it is after an hour. `in_run` is what
-a listener does beside a servo loop, where it has to share the machine.
+Rows "NAME ENGINE" compare the engines: how long a frame takes on each, in the same run, beside eager fp32 torch. A
+frame is everything that a listener does with it: features of sound, events, networks, draws. Every engine has one
+thread, and they take turns, some frames each, so that other load of the machine meets all of them. A plan of several
+frames falls due on every `hop`-th frame; the other frames are only heard.
+
+The row NAME is the engine that `--engine auto` takes, with further figures of the listener: `in_run` beside a servo
+loop, `samplers` of ARIG. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
+the same. ARIG's context is filled with random numbers, as full as after an hour.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping
-from dataclasses import replace
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sfms_robot import config
+from sfms_robot.app.session import RunOptions, run
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
-from sfms_robot.lab.bench.engine_bench import EAGER, Stream, engines_of, load, process_row, take_turns
-from sfms_robot.lab.bench.in_run import in_run
-from sfms_robot.lab.bench.measure import Row, Told
-from sfms_robot.lab.bench.samplers import samplers
+from sfms_robot.lab.bench.measure import HEAD, BenchResult, Row, listener_process, percentiles, row
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.engine import FOLDER, EngineName, has_graphs, read_graphs
+from sfms_robot.listeners.process import threads
+from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.ports import Listener
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 if TYPE_CHECKING:
-    from sfms_robot.listeners.arig.model import ArigModel
+    from sfms_robot.listeners.arig.stream import ArigListener
 
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 PAPER: Final = "sfms-paper"  # ships as a training only
-TRAINED: Final = "trained"
-BF16: Final = "torch bf16"
-SEEDED: Final = "seeded, not trained"
-MINUTES: Final = 60
-MINUTE: Final = 60 * FRAME_HZ
-COLUMNS: Final = {
+TRAINED, SEEDED = "trained", "seeded, not trained"
+EAGER, BF16 = "eager", "torch bf16"
+TURN_HOPS: Final = 4
+_TURNS: Final = 20
+_LIMIT_S: Final = 20.0  # for all engines of a listener: a busy machine gives fewer turns
+_MINUTES: Final = 60
+_RUN_S: Final = 8.0
+_COLUMNS: Final = {
     "median": "frame ms", "p99": "p99", "ratio": "of eager", "hearing_ms": "hearing ms", "planning_ms": "planning ms",
     "first_plan_s": "first plan s", "resident_mb": "MB", "distance": "distance",
 }  # fmt: skip
 
 
-def listener(budget: bool = False) -> Told:
-    """Rows of `sfms-robot bench listener`; the threads that torch uses are as before when it returns.
+def listener(budget: bool = False) -> BenchResult:
+    """Measure all listeners; restores the number of torch's threads.
 
-    `budget`: what a frame costs, counted, and what small computers need for it (`compute_budget`), instead.
+    `budget`: count the cost of a frame and compute the time on small computers (`operation_count.budget`) instead.
     """
     import torch
 
     if budget:
-        from sfms_robot.lab.bench.compute_budget import budget as counted
+        from sfms_robot.lab.bench import operation_count
 
-        return counted()
-
-    threads = torch.get_num_threads()
+        return operation_count.budget()
+    before = torch.get_num_threads()
     rows: dict[str, Row] = {}
     torch.set_num_threads(1)
     try:
@@ -64,67 +73,64 @@ def listener(budget: bool = False) -> Told:
                 rows |= _measured(name, Path(scratch))
         rows |= _sfms_paper()
     finally:
-        torch.set_num_threads(threads)
-    return Told(Told.of_rows(rows).figures, _table(rows), ["a frame is all of a step, on average over a hop"])
+        torch.set_num_threads(before)
+    return BenchResult(
+        BenchResult.of_rows(rows).figures, engine_table(rows), ["a frame is all of a step, on average over a hop"]
+    )
 
 
-def _table(rows: Mapping[str, Row]) -> list[dict[str, Any]]:
-    """A line per engine."""
+def engine_table(rows: Mapping[str, Row]) -> list[dict[str, Any]]:
+    """Return one line per engine; the row of a listener repeats one of these."""
     found = []
     for name, each in rows.items():
-        if name in NAMES:
-            continue  # one of the others again
-        line: dict[str, Any] = {"measured": name}
-        for key, title in COLUMNS.items():
-            value = each.get(key)
-            line[title] = value["p50"] if isinstance(value, dict) else value
-        found.append(line)
+        if name not in NAMES:
+            values = {title: each.get(key) for key, title in _COLUMNS.items()}
+            shown = {title: value["p50"] if isinstance(value, dict) else value for title, value in values.items()}
+            found.append({"measured": name, **shown})
     return found
 
 
 def _measured(name: str, scratch: Path) -> dict[str, Row]:
-    """Rows of one shipped listener, with trained weights where it has them."""
+    """Return the rows of one shipped listener."""
     folder, weights = with_weights(name, scratch)
     settings = config.load_listener(folder / "config.yaml")
-    ways = engines_of(folder, scratch)
-    speaker = _speaker()
-    streams: dict[str, Stream] = {}
-    for way, (where, engine) in ways.items():
-        found = load(where, engine, eager=way == EAGER)
-        streams[way] = Stream(found, _later(found, found.start(0), speaker))
+    ways, speaker = engines_of(folder, scratch), talk()
+    loaded = {
+        way: load_listener(where, graphs=way != EAGER, engine=engine, threads=1)
+        for way, (where, engine) in ways.items()
+    }
     if isinstance(settings, config.Arig):
-        found = _in_bf16(ways[EAGER][0], settings)
-        streams[BF16] = Stream(found, _later(found, found.start(0), speaker))
+        loaded[BF16] = _in_bf16(ways[EAGER][0], settings)
+    streams = {way: Stream(one, aged(one, one.start(0), speaker)) for way, one in loaded.items()}
     take_turns(streams, speaker)
     rows = {f"{name} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
-    for way, stream in streams.items():
-        if way != EAGER:
-            rows[f"{name} {way}"]["distance"] = _distance(stream.listener, streams[EAGER].listener, speaker)
-        if way in ways and way != EAGER:
-            rows[f"{name} {way}"] |= process_row(*ways[way])
-    chosen = streams[[*ways][-1]]
-    rows[name] = rows[f"{name} {[*ways][-1]}"] | {
+    for way in streams.keys() - {EAGER}:
+        rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
+        if way in ways:
+            rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
+    auto = [*ways][-1]
+    rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
-        "params": _parameters(streams[EAGER].listener),
+        "params": sum(each.numel() for each in _how(loaded[EAGER]).model.parameters()),
         "weights": weights,
     }
     if isinstance(settings, config.Arig):
-        early = Stream(chosen.listener, _later(chosen.listener, chosen.listener.start(0), speaker, minutes=1))
+        early = Stream(loaded[auto], aged(loaded[auto], loaded[auto].start(0), speaker, minutes=1))
         take_turns({name: early}, speaker)
         rows[name] |= {
             "minute_1_ms": float(np.median(early.frame_ms)),
-            f"minute_{MINUTES}_ms": float(np.median(chosen.frame_ms)),
+            f"minute_{_MINUTES}_ms": float(np.median(streams[auto].frame_ms)),
             "in_run": in_run(folder),
-            "samplers": samplers(_how(streams[EAGER].listener), speaker) if weights == TRAINED else None,
+            "samplers": samplers(_how(loaded[EAGER]), speaker) if weights == TRAINED else None,
         }
     return rows
 
 
 def _in_bf16(where: Path, settings: config.Arig) -> Listener:
-    """An ARIG on torch with its large layers in bf16, which no configuration asks for: its row says why."""
+    """Return an ARIG on torch with its large layers in bf16. No configuration asks for it: its row shows why."""
     from sfms_robot.listeners.arig import networks, torch_engine
 
-    found = load(where, "torch", eager=True)
+    found = load_listener(where, graphs=False, engine="torch", threads=1)
     how = _how(found)
     how.engine = torch_engine(
         settings.model_copy(update={"precision": "fp32"}), networks.with_layers(how.model, networks.Bf16Linear)
@@ -134,52 +140,36 @@ def _in_bf16(where: Path, settings: config.Arig) -> Listener:
 
 
 def _how(listener: Listener) -> Any:
-    """The model of motion, without the events that it may be told of."""
+    """Return the model of motion of a listener that may also decide events."""
     return getattr(listener, "how", listener)
 
 
-def _parameters(listener: Listener) -> int:
-    return sum(each.numel() for each in _how(listener).model.parameters())
-
-
 def with_weights(name: str, scratch: Path) -> tuple[Path, str]:
-    """The folder of a shipped listener, and what weights it has in words; where none ship, seeded ones in `scratch`."""
+    """Return the folder of a shipped listener and its kind of weights; if none ship, make seeded ones in `scratch`."""
     shipped = data_dir("configs") / "listeners" / name
     settings = config.load_listener(shipped / "config.yaml")
-    if (shipped / "model.safetensors").is_file() or not isinstance(settings, config.Arig):
+    if (shipped / checkpoint.WEIGHTS).is_file() or not isinstance(settings, config.Arig):
         return shipped, TRAINED
-    return _seeded(shipped, settings, scratch / "seeded"), SEEDED
-
-
-def _seeded(shipped: Path, settings: config.Arig, folder: Path) -> Path:
-    """A listener's folder with seeded weights; its graphs are those that ship."""
     import torch
 
-    from sfms_robot.listeners import checkpoint
     from sfms_robot.listeners.arig.model import ArigModel
     from sfms_robot.listeners.engine import FOLDER, has_graphs
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = ArigModel(settings)
-    _inside(model, settings)
+    model.motion_mean.copy_(torch.tensor([0.5 * (name not in POSE_CHANNELS) for name in settings.channels]))
+    model.motion_std.fill_(0.02)  # motion well inside 0..1, where no value is clipped
+    folder = scratch / "seeded"
     checkpoint.save_config(folder, settings)
     checkpoint.save_weights(folder / checkpoint.WEIGHTS, model)
     if has_graphs(shipped):
         shutil.copytree(shipped / FOLDER, folder / FOLDER)
-    return folder
-
-
-def _inside(model: ArigModel, settings: config.Arig) -> None:
-    """Motion inside 0..1, where nothing is clipped."""
-    import torch
-
-    model.motion_mean.copy_(torch.tensor([0.5 * (name not in POSE_CHANNELS) for name in settings.channels]))
-    model.motion_std.fill_(0.02)
+    return folder, SEEDED
 
 
 def _sfms_paper() -> dict[str, Row]:
-    """The size of the paper, with seeded weights, on torch."""
+    """Measure the paper's size of SFMS with seeded weights, on torch."""
     import torch
 
     from sfms_robot.listeners.sfms import torch_engine
@@ -188,7 +178,7 @@ def _sfms_paper() -> dict[str, Row]:
 
     training = config.load_training(data_dir("configs") / "training" / f"{PAPER}.yaml")
     if not isinstance(training, config.Training):
-        raise ConfigError(f"{PAPER}.yaml is not the training of an SFMS listener")
+        raise ConfigError(f"{PAPER}.yaml: listener.kind: expected sfms")
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
@@ -196,26 +186,28 @@ def _sfms_paper() -> dict[str, Row]:
     for way in (EAGER, "torch"):
         found = SfmsListener(training.listener, torch_engine(training.listener, model))
         streams[way] = Stream(found if way == EAGER else found.build_graphs(), found.start(0))
-    take_turns(streams, _speaker())
-    rows = {f"{PAPER} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
+    take_turns(streams, talk())
     params = sum(each.numel() for each in model.parameters())
-    return {way: each | {"params": params, "weights": SEEDED} for way, each in rows.items()}
+    return {
+        f"{PAPER} {way}": stream.figures(streams[EAGER]) | {"params": params, "weights": SEEDED}
+        for way, stream in streams.items()
+    }
 
 
-def _later(listener: Listener, memory: Any, speaker: list[SpeakerFrame], minutes: int = MINUTES) -> Any:
-    """A memory as it is after so many minutes, its whole chunks made up; one without chunks as it is."""
+def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minutes: int = _MINUTES) -> Any:
+    """Return a memory as after so many minutes, with random whole chunks; a listener without chunks starts fresh."""
     _, memory = listener.step(speaker[0], memory)
     how = getattr(memory, "how", memory)
     context = getattr(how, "context", None)
     if context is None:
         return listener.start(0)
     made_up = np.random.default_rng(0).standard_normal(context.shape, np.float32)
-    older = replace(how, frames=minutes * MINUTE, context=made_up)
+    older = replace(how, frames=minutes * 60 * FRAME_HZ, context=made_up)
     return older if how is memory else replace(memory, how=older)
 
 
-def _distance(quick: Listener, exact: Listener, speaker: list[SpeakerFrame]) -> float:
-    """RMS difference of motion over its deviation: every plan made by both, from the memory of the exact one."""
+def distance(quick: Listener, exact: Listener, speaker: Sequence[SpeakerFrame]) -> float:
+    """Return the RMS difference of motion over its deviation, both listeners stepped from the memory of `exact`."""
     memory, frames = exact.start(0), []
     for frame in speaker:
         other, _ = quick.step(frame, memory)
@@ -228,8 +220,8 @@ def _distance(quick: Listener, exact: Listener, speaker: list[SpeakerFrame]) -> 
     return float(np.sqrt(np.mean(share**2)))
 
 
-def _speaker(frames: int = 100) -> list[SpeakerFrame]:
-    """Both people talk in turns; noise serves, since nothing is judged but time."""
+def talk(frames: int = 100) -> list[SpeakerFrame]:
+    """Return noise in which both people talk in turns: only time is measured."""
     rng = np.random.default_rng(0)
     out = []
     for index in range(frames):
@@ -238,3 +230,160 @@ def _speaker(frames: int = 100) -> list[SpeakerFrame]:
         time_s = (index + 1) * FRAME_S
         out.append(SpeakerFrame(time_s, theirs, FaceFrame.of(time_s, rng.uniform(0, 0.2, 58)), ours))
     return out
+
+
+def in_run(folder: Path, duration_s: float = _RUN_S) -> dict[str, Any]:
+    """Drive `HEAD` on emulated servos with the listener in `folder`, which hears both tracks, in real time.
+
+    The loop must not be late because of the listener, and a step must not take longer than the 40 ms of a frame.
+    """
+    options = RunOptions(
+        head=HEAD, listener=str(folder), audio=DEFAULT_SPEAKER, agent_audio="katie", duration_s=duration_s
+    )
+    report = run(options)
+    step_ms = report["listener_step_ms"]
+    return {
+        "head": HEAD,
+        "duration_s": report["duration_s"],
+        "frames": report["frames"],
+        "unheard_frames": report["listener_state"]["skipped_frames"],
+        "frames_per_s": 1e3 / step_ms["p50"] if step_ms["p50"] else None,
+        "step_ms": step_ms,
+        "ticks": report["ticks"],
+        "late_ticks": report["tick"]["late"],
+        "achieved_hz": report["tick"]["achieved_hz"],
+        "frame_to_wire_ms": report["latency_ms"]["frame_to_wire"],
+        "threads": threads(),
+    }
+
+
+# --- engines side by side -------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Stream:
+    """A running listener: its memory, and durations of its frames [ms], those with a plan and those without."""
+
+    listener: Listener
+    memory: Any
+    _: KW_ONLY
+    planning_ms: list[float] = field(default_factory=list)
+    hearing_ms: list[float] = field(default_factory=list)
+    frame_ms: list[float] = field(default_factory=list)
+    heard: int = 0
+
+    def turn(self, speaker: Sequence[SpeakerFrame], frames: int, keep: bool = True) -> None:
+        """Take so many frames, whole hops; `frame_ms` gains their mean over each hop."""
+        took: list[tuple[float, bool]] = []
+        for _ in range(frames):
+            self.heard += 1
+            frame = replace(speaker[self.heard % len(speaker)], time_s=self.heard * FRAME_S)
+            began_s = time.perf_counter()
+            plan, self.memory = self.listener.step(frame, self.memory)
+            took.append((1e3 * (time.perf_counter() - began_s), plan is not None))
+        if not keep:
+            return
+        self.planning_ms += [ms for ms, planned in took if planned]
+        self.hearing_ms += [ms for ms, planned in took if not planned]
+        self.frame_ms += np.reshape([ms for ms, _ in took], (-1, self.listener.hop)).mean(axis=1).tolist()
+
+    def figures(self, peer: Stream) -> Row:
+        """Return a row: a frame beside the peer's, and its parts."""
+        every_ms = [*self.planning_ms, *self.hearing_ms]
+        return row(self.frame_ms, peer.frame_ms, "ms", "eager fp32 torch, one thread") | {
+            "engine": engine_name(self.listener),
+            "fps": 1e3 / float(np.mean(every_ms)),
+            "step_ms": percentiles(every_ms),
+            "planning_ms": percentiles(self.planning_ms),
+            "hearing_ms": percentiles(self.hearing_ms) if self.hearing_ms else None,
+            "hop": self.listener.hop,
+        }
+
+
+def take_turns(streams: Mapping[str, Stream], speaker: Sequence[SpeakerFrame], turns: int = _TURNS) -> None:
+    """Let all streams hear the same person, `TURN_HOPS` plans at a time; ends early after `_LIMIT_S`."""
+    frames = {name: TURN_HOPS * stream.listener.hop for name, stream in streams.items()}
+    for name, stream in streams.items():
+        stream.turn(speaker, frames[name], keep=False)
+    until_s = time.perf_counter() + _LIMIT_S
+    for turn in range(turns):
+        for name, stream in streams.items():
+            stream.turn(speaker, frames[name])
+        if turn and time.perf_counter() > until_s:
+            return
+
+
+def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]]:
+    """Return the ways to run the listener of a folder, by name: a folder and an engine each.
+
+    The first one is the peer, the last one is the choice of `--engine auto`. Folders with other precisions are made in
+    `scratch`.
+    """
+    settings = checkpoint.load_config(folder)
+    exact = _of_precision(folder, settings, "fp32", scratch)
+    found: dict[str, tuple[Path, EngineName]] = {EAGER: (exact, "torch"), "torch": (folder, "torch")}
+    if has_graphs(folder):
+        found["onnx"] = (exact, "onnx")
+        if read_graphs(folder, settings, integers=True).in_integers:
+            found["onnx int8"] = (_of_precision(folder, settings, "int8", scratch), "onnx")
+    return found
+
+
+def _of_precision(folder: Path, settings: config.Listener, precision: str, scratch: Path) -> Path:
+    """Return a folder of the listener with another precision; its own folder if it has that one, or has none."""
+    if not isinstance(settings, config.Arig) or settings.precision == precision:
+        return folder
+    other = scratch / precision
+    checkpoint.save_config(other, settings.model_copy(update={"precision": precision}))
+    for name in (checkpoint.WEIGHTS, FOLDER):
+        if (folder / name).exists():
+            (other / name).symlink_to((folder / name).resolve())
+    return other
+
+
+# --- samplers -------------------------------------------------------------------------------------------------------
+
+WAYS: Final = (
+    ("ddpm", 50), ("ddpm", 15), ("ddpm", 12), ("ddpm", 10), ("ddpm", 8), ("ddim", 15), ("ddim", 8), ("ddim", 4),
+)  # fmt: skip
+_DRAWS: Final = 32
+_EVERY: Final = 4  # frames between two conditions
+
+
+def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[str, float]:
+    """Return the quality lost by shorter or noiseless sampling (`ddim-8`: DDIM, 8 steps), against 50 steps of eq. (4).
+
+    For the same conditions, many draws of each sampler: how far their mean and spread lie from those of the 50 steps,
+    as a share of the motion's standard deviation. The same 50 steps with another seed show the part of chance.
+    """
+    import torch
+
+    from sfms_robot.listeners.arig.sampler import Denoiser
+
+    head = listener.model.head
+    if not isinstance(head, Denoiser):
+        return {}
+    memory, conditions = listener.start(0), []
+    for index, frame in enumerate(speaker):
+        if index % _EVERY == _EVERY - 1:
+            conditions.append(listener.condition(frame, memory)[0])
+        _, memory = listener.step(frame, memory)
+    repeated = torch.from_numpy(np.concatenate(conditions)).repeat_interleave(_DRAWS, dim=0)
+
+    @torch.inference_mode()
+    def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+        plain = {"sampler": sampler, "steps": steps, "temperature": (1.0, 1.0), "temperatures": {}}
+        other = Denoiser(listener.settings.channels, head.condition.in_features, head.settings.model_copy(update=plain))
+        other.load_state_dict(head.state_dict())
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(len(repeated), steps, listener.model.channels, generator=generator)
+        motion = other.sample(repeated, noise).view(len(conditions), _DRAWS, -1)
+        return motion.mean(1), motion.std(1)
+
+    mean, deviation = drawn("ddpm", 50, seed=1)
+    lost = {}
+    for sampler, steps in WAYS:
+        of_mean, of_deviation = drawn(sampler, steps, seed=2)
+        squared = (of_mean - mean).square().mean() + (of_deviation - deviation).square().mean()
+        lost[f"{sampler}-{steps}"] = float(squared.sqrt())  # standardised motion: its deviation is 1
+    return lost

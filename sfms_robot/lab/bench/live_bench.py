@@ -1,15 +1,14 @@
-"""A head that listens live: `face28` on emulated servos with the timing of a wire, `sfms-small`, a microphone and a
-phone, all in real time.
+"""`bench live`: a head that listens live, with a microphone and a phone, in real time.
 
-    idle          an empty loop of 100 Hz: how punctual this machine is with nothing of ours to do
-    live          the run that is measured, with a recording of it
+    idle          an empty loop of 100 Hz: how punctual this machine is without load from here
+    live          the measured run of `face28` and `sfms-small`, on servos with the timing of a wire, with a recording
     file          the same head and listener with a recorded person, for comparison
-    first_write   `run` is typed with live sources -> its first goal on the wire; the median of some starts
+    first_write   from typing `run` with live sources to its first goal on the wire; median of some starts
 
-The microphone is a null sink of a PulseAudio of our own, into which a recorded voice is played, so that PortAudio's
-callbacks, the audio process and the grid are those of a real one; "push" hands the same voice over by calls. The phone
-sends recorded packets of Live Link Face at their pace. A run is a process of its own, so that processor time and memory
-are those of a run.
+The microphone is a null sink of a private PulseAudio into which a recorded voice is played, so that PortAudio's
+callbacks, the audio process and the grid are those of a real microphone; "push" hands the same voice over by calls. The
+phone sends recorded packets of Live Link Face at their pace. A run is a separate process, so that processor time and
+memory are those of a run.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal
@@ -39,14 +38,12 @@ from sfms_robot.data import data_dir
 from sfms_robot.emulator.launch import READ_DEADLINE_S, launch
 from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ
-from sfms_robot.lab.bench.live_stamps import SETTLED_S, StampedSource, Stamps
-from sfms_robot.lab.bench.measure import HEAD, LISTENER
-from sfms_robot.lab.bench.memory_bench import ResidentMemory
-from sfms_robot.lab.bench.procfs import children_of, processor_time_s
+from sfms_robot.lab.bench.live_stamps import ProcessorTime, ResidentMemory, StampedSource, Stamps
+from sfms_robot.lab.bench.measure import HEAD, LISTENER, BenchResult, package_environment, result_of
 from sfms_robot.lab.bench.startup_bench import first_goal_s
-from sfms_robot.ports import Observer, Source
+from sfms_robot.ports import Source
 from sfms_robot.processes import realtime_priority
 from sfms_robot.runtime.clock import RealClock, tick_times
 from sfms_robot.signals.audio import read_audio
@@ -57,52 +54,51 @@ from sfms_robot.sources.push import PushedVoice
 from sfms_robot.sources.registry import DEFAULT_SPEAKER, open_source, voice_file
 
 Audio = Literal["mic", "push"]
-MINUTES: Final = 10.0
-IDLE_S: Final = 5.0
-FILE_S: Final = 60.0
-STARTS: Final = 5
 SINK: Final = "person"
-BUSY_JITTER_MS: Final = 0.5  # of an empty loop, p99
-GOALS: Final[Mapping[str, float]] = {  # at most, but for the share of ticks in time
+GOALS: Final[Mapping[str, float]] = {  # upper limits, except the share of ticks in time
     "in_time_share": 0.999, "jitter_p99_ms": 0.5, "sound_to_goal_p50_ms": 95, "sound_to_goal_p95_ms": 135,
     "face_to_goal_p95_ms": 80, "first_write_s": 2.2,
 }  # fmt: skip
+_MINUTES: Final = 10.0
+_IDLE_S: Final = 5.0
+_FILE_S: Final = 60.0
+_STARTS: Final = 5
+_BUSY_JITTER_MS: Final = 0.5  # of an empty loop, p99
 _PIECE: Final = 160  # samples that are pushed at once
 _MEMORY_LOOKS: Final = 200
-_ROLES: Final = {"listeners.process": "listener", "sources.worker": "audio", "emulator": "emulator"}
 _CHILD: Final = "from sfms_robot.lab.bench.live_bench import measured_run; measured_run()"
 
 Say = Callable[[str], None]
 
 
-def live(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
-    """All parts, one after the other; Linux only. `say` is told what is going on.
+def live(minutes: float, audio: Audio, say: Say) -> BenchResult:
+    """Measure all four parts, one after the other; Linux only. 0 minutes: ten.
 
-    Raises ConfigError where PulseAudio is not installed and `audio` asks for it.
+    Raises ConfigError if `audio` needs PulseAudio and it is not installed, BusError if the run fails.
     """
     check_audio(audio)
+    run_s = (minutes or _MINUTES) * 60
     say("an empty loop")
-    idle = idle_loop(IDLE_S)
+    idle = idle_loop(_IDLE_S)
     with TemporaryDirectory() as folder, live_person(Path(folder), audio) as person:
-        say(f"a live run of {minutes:g} minutes")
-        told = _run(person.environment, audio=audio, face=person.face, duration_s=minutes * 60, record=f"{folder}/run")
+        say(f"a live run of {run_s / 60:g} minutes")
+        live = _run(person.environment, audio=audio, face=person.face, duration_s=run_s, record=f"{folder}/run")
         say("the same with a recorded person")
-        compared = _run({}, audio="default", face="auto", duration_s=min(minutes * 60, FILE_S), record=None)
+        file = _run({}, audio="default", face="auto", duration_s=min(run_s, _FILE_S), record=None)
         say("`run` until its first goal")
         words = ["--head", str(patient_head(Path(folder))), "--audio", audio, "--face", person.face]
-        typed_s = _median([first_goal_s(words, {**os.environ, **person.environment}) for _ in range(STARTS)])
-    result = {"audio": audio, "idle": idle, "live": told, "file": compared, "first_write_s": typed_s}
-    return {**result, "goals": goals(result)}
-
-
-def _median(times_s: Sequence[float | None]) -> float | None:
-    """None where one start had no goal."""
-    told = [each for each in times_s if each is not None]
-    return float(np.median(told)) if len(told) == len(times_s) else None
+        starts_s = [first_goal_s(words, {**os.environ, **person.environment}) for _ in range(_STARTS)]
+    known_s = [each for each in starts_s if each is not None]
+    typed_s = float(np.median(known_s)) if len(known_s) == _STARTS else None
+    result = {"audio": audio, "idle": idle, "live": live, "file": file, "first_write_s": typed_s}
+    found = goals(result)
+    met = {True: "yes", False: "no", None: "-"}
+    table = [{"what": name, **row, "met": met[row["met"]]} for name, row in found.items()]
+    return BenchResult({**result, "goals": found}, table, _lines(result))
 
 
 def idle_loop(duration_s: float, rate_hz: float = 100.0) -> dict[str, Any]:
-    """Jitter of a loop that does nothing, at the priority of a run, and how busy the machine is. Blocks."""
+    """Measure the jitter of a loop that does nothing, at the priority of a run, and the load. Blocks."""
     clock, late_ms = RealClock(), Quantiles()
     with realtime_priority(wanted=True) as priority:
         for tick in tick_times(clock, rate_hz, clock.now_s()):
@@ -110,53 +106,60 @@ def idle_loop(duration_s: float, rate_hz: float = 100.0) -> dict[str, Any]:
                 break
             late_ms.add((tick.late_s + tick.skipped / rate_hz) * 1e3)
     jitter_ms = late_ms.report(p50=50, p99=99, max=100)
-    busy = late_ms.at(99) > BUSY_JITTER_MS or _load() > (os.cpu_count() or 1) / 2
-    return {"jitter_ms": jitter_ms, "busy": busy, "load": _load(), "cores": os.cpu_count(), "priority": priority}
+    busy = late_ms.at(99) > _BUSY_JITTER_MS or load() > (os.cpu_count() or 1) / 2
+    return {"jitter_ms": jitter_ms, "busy": busy, "load": load(), "cores": os.cpu_count(), "priority": priority}
+
+
+def load() -> float:
+    return round(os.getloadavg()[0], 2)
 
 
 def goals(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What was wanted, what came, and whether that is met; None where nothing was measured."""
-    told = result["live"]
+    """Return each of `GOALS` with the measured figure and whether it is met; None where it was not measured."""
+    live = result["live"]
     came = {
-        "in_time_share": told["in_time_share"],
-        "jitter_p99_ms": told["jitter_ms"]["p99"],
-        "sound_to_goal_p50_ms": told["sound_to_goal_ms"]["p50"],
-        "sound_to_goal_p95_ms": told["sound_to_goal_ms"]["p95"],
-        "face_to_goal_p95_ms": told["face_to_goal_ms"]["p95"],
+        "in_time_share": live["in_time_share"],
+        "jitter_p99_ms": live["jitter_ms"]["p99"],
+        "sound_to_goal_p50_ms": live["sound_to_goal_ms"]["p50"],
+        "sound_to_goal_p95_ms": live["sound_to_goal_ms"]["p95"],
+        "face_to_goal_p95_ms": live["face_to_goal_ms"]["p95"],
         "first_write_s": result["first_write_s"],
     }
+
+    def met(name: str, wanted: float) -> bool | None:
+        if (value := came[name]) is None:
+            return None
+        return bool(value >= wanted if name == "in_time_share" else value <= wanted)
+
     return {
-        name: {"wanted": wanted, "measured": came[name], "met": _met(name, wanted, came[name])}
-        for name, wanted in GOALS.items()
+        name: {"measured": came[name], "wanted": wanted, "met": met(name, wanted)} for name, wanted in GOALS.items()
     }
 
 
-def _met(name: str, wanted: float, came: float | None) -> bool | None:
-    if came is None:
-        return None
-    return came >= wanted if name == "in_time_share" else came <= wanted
-
-
-def table(result: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A row per figure of `goals`, for people."""
-    words = {True: "yes", False: "no", None: "-"}
+def _lines(result: Mapping[str, Any]) -> Sequence[str]:
+    live, idle, file = result["live"], result["idle"], result["file"]
+    stages = ", ".join(f"{name} {ms['p50']}/{ms['p95']}" for name, ms in live["stages_ms"].items())
+    busy = "; other programs use this machine too, so the figures mean little" if idle["busy"] else ""
     return [
-        {"what": name, "measured": row["measured"], "wanted": row["wanted"], "met": words[row["met"]]}
-        for name, row in result["goals"].items()
+        f"load {live['load']} on {idle['cores']} cores; empty loop: jitter p99 {idle['jitter_ms']['p99']} ms{busy}",
+        f"hop {live['hop']} frames; p50/p95 ms of its stages: {stages}",
+        f"CPU seconds a second: {live['cpu_s_per_s']}; resident MB: {live['resident_mb']}",
+        f"with a file: {file['in_time_share']} of ticks in time, jitter p99 {file['jitter_ms']['p99']} ms, "
+        f"sound to goal p50 {file['sound_to_goal_ms']['p50']} ms, p95 {file['sound_to_goal_ms']['p95']} ms",
     ]
 
 
-# --- a person who is there ------------------------------------------------------------------------------------------
+# --- a person in front of the head ----------------------------------------------------------------------------------
 
 
 class LivePerson:
-    """A voice in a microphone and a phone before a face, while `live_person` lasts.
+    """A voice in a microphone and a phone in front of a face, while `live_person` lasts.
 
     Attributes:
-        environment: what a program needs to find the microphone.
-        face: what `--face` says.
-        phone_silent: set: the phone sends nothing.
-        server: the microphone's; None without.
+        environment: Variables with which a program finds the microphone.
+        face: The value of `--face`.
+        phone_silent: While it is set, the phone sends nothing.
+        server: The PulseAudio server of the microphone; None without.
     """
 
     def __init__(self, environment: Mapping[str, str], port: int, server: SoundServer | None) -> None:
@@ -166,14 +169,14 @@ class LivePerson:
 
 
 def check_audio(audio: Audio) -> None:
-    """Raises ConfigError where PulseAudio is needed and missing."""
+    """Raise ConfigError if `audio` needs PulseAudio and it is missing."""
     if audio == "mic" and (missing := SoundServer.missing()) is not None:
         raise ConfigError(f"bench live: PulseAudio is not installed ({missing}, or --audio push)")
 
 
 @contextmanager
 def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
-    """Somebody talks and is seen."""
+    """Start a voice and a phone, and stop them on leaving."""
     with ExitStack() as stack:
         server, environment = None, {}
         if audio == "mic":
@@ -196,7 +199,7 @@ def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
 
 
 def patient_head(folder: Path, deadline_s: float = READ_DEADLINE_S) -> Path:
-    """`HEAD`, with the patience for emulated servos that `--port sim` has: they share this computer's cores."""
+    """Write `HEAD` with the read deadline of `--port sim`: emulated servos share the cores of this computer."""
     place = folder / HEAD
     shutil.copytree(data_dir("configs") / "heads" / HEAD, place)
     raw = yaml.safe_load((place / "head.yaml").read_text(encoding="utf-8"))
@@ -207,14 +210,14 @@ def patient_head(folder: Path, deadline_s: float = READ_DEADLINE_S) -> Path:
 
 
 def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    """A port of loopback that nobody has."""
+    """Return a free port on loopback."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _send(person: LivePerson, over: threading.Event) -> None:
-    """The phone: packets at their pace; those of a silence are not made up for."""
+    """Send the phone's packets at their pace; packets of a silence are skipped, not sent later."""
     phone = EmulatedPhone(port=int(person.face.rpartition(":")[2]))
     began_s = time.monotonic()
     while not over.wait(1 / 240):
@@ -226,7 +229,7 @@ def _send(person: LivePerson, over: threading.Event) -> None:
 
 
 def _talk(server: SoundServer, over: threading.Event) -> None:
-    """The voice, again and again; where there is no sink it tries again."""
+    """Play the voice in a loop; while the sink is missing, try again."""
     voice = voice_file(DEFAULT_SPEAKER)
     assert voice is not None
     while not over.is_set():
@@ -239,32 +242,28 @@ def _talk(server: SoundServer, over: threading.Event) -> None:
         over.wait(0.5)
 
 
-# --- the run, in a process of its own -------------------------------------------------------------------------------
+# --- the run, in a separate process ---------------------------------------------------------------------------------
 
 
 def _run(environment: Mapping[str, str], **options: Any) -> dict[str, Any]:
-    """`measured_run` in a process. Raises BusError with the last it said when it does not come to an end."""
+    """Run `measured_run` in a process. Raises BusError with its last message if it fails."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", _CHILD, json.dumps(options)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **environment},
-        capture_output=True, text=True, check=False,
+        env={**package_environment(), **environment}, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    if done.returncode:
-        raise BusError(f"bench live: the run ended with {done.returncode}: {done.stderr.strip().splitlines()[-1:]}")
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return told
+    found: dict[str, Any] = result_of(done.returncode, done.stderr, done.stdout, "live")
+    return found
 
 
 def measured_run() -> None:
-    """Run what the first argument says, as JSON, and print what was measured."""
+    """Run in the child: a session with the options of the first argument (JSON); print the figures as JSON."""
     options = json.loads(sys.argv[1])
     record = None if options["record"] is None else Path(options["record"])
     over = threading.Event()
     source = StampedSource(_source(options["audio"], options["face"], options["duration_s"], over))
     rate_hz = max(bus.rate_hz for bus in load_head(HEAD).buses.values())
     stamps = Stamps(source.loop_s, lambda: source.latency_s, rate_hz)
-    memory = ResidentMemory(options["duration_s"] / _MEMORY_LOOKS)
-    cpu = ProcessorTime()
+    memory, cpu = ResidentMemory(options["duration_s"] / _MEMORY_LOOKS), ProcessorTime()
     how = {"listener": LISTENER, "duration_s": options["duration_s"], "record": record}
     try:
         with TemporaryDirectory() as folder, launch(emulated(load_head(HEAD))["main"], timing="wire") as chain:
@@ -279,22 +278,24 @@ def measured_run() -> None:
         source.close()
     stamped = stamps.report()
     due = stamped["ticks"] + stamped["missed_ticks"]
-    in_time = None if not due else round((stamped["ticks"] - report["tick"]["late"]) / due, 5)
+    settled = memory.resident_mb[len(memory.resident_mb) // 5 :]  # after a fifth of the time
     measured = {
         **stamped,
-        "in_time_share": in_time,
+        "in_time_share": round((stamped["ticks"] - report["tick"]["late"]) / due, 5) if due else None,
         "jitter_ms": report["tick"]["jitter_ms"],
         "hop": report["hop"],
         "budget_ms": report["budget_ms"],
         "listener_step_ms": report["listener_step_ms"],
         "skipped_frames": report["listener_state"]["skipped_frames"],
         "cpu_s_per_s": cpu.report(),
-        "resident_mb": _growth(memory),
+        "resident_mb": {"settled": round(settled[0], 2), "growth": round(settled[-1] - settled[0], 2)}
+        if settled
+        else {},
         "overruns": report["source"].get("overruns"),
         "wait_ms": report["source"].get("wait_ms"),
         "recording": report.get("recording"),
         "exit": report["exit"],
-        "load": _load(),
+        "load": load(),
     }
     sys.stdout.write(json.dumps(measured) + "\n")
 
@@ -308,7 +309,7 @@ def _source(audio: str, face: str, duration_s: float, over: threading.Event) -> 
 
 
 def _push(voice: PushedVoice, over: threading.Event) -> None:
-    """The recorded voice in pieces of 10 ms, at its pace."""
+    """Push the recorded voice in pieces of 10 ms, at its pace."""
     file = voice_file(DEFAULT_SPEAKER)
     assert file is not None
     samples, began_s, piece = read_audio(file), time.monotonic(), 0
@@ -316,71 +317,3 @@ def _push(voice: PushedVoice, over: threading.Event) -> None:
         start = piece * _PIECE % (len(samples) - _PIECE)
         voice.hear(np.asarray(samples[start : start + _PIECE], np.float32), AUDIO_HZ)
         piece += 1
-
-
-class ProcessorTime(Observer):
-    """An observer of processor time: of this process and those that it started, between two ticks a second apart."""
-
-    def __init__(self) -> None:
-        self._next_s = SETTLED_S
-        self._first: dict[str, float] | None = None
-        self._first_s = self._last_s = 0.0
-        self._last: dict[str, float] = {}
-
-    def tick(self, seen: Any) -> None:
-        if seen.time_s < self._next_s:
-            return
-        self._next_s = seen.time_s + 1.0
-        self._last_s, self._last = time.monotonic(), processor_times_s()
-        if self._first is None:
-            self._first_s, self._first = self._last_s, self._last
-
-    def report(self) -> dict[str, float]:
-        """Seconds a second, by role."""
-        if self._first is None or self._last_s <= self._first_s:
-            return {}
-        first, over_s = self._first, self._last_s - self._first_s
-        return {role: round((used_s - first.get(role, 0.0)) / over_s, 4) for role, used_s in self._last.items()}
-
-
-def processor_times_s() -> dict[str, float]:
-    """Of this process ("main") and its children by role, since each began."""
-    used = {"main": time.process_time()}
-    for role, pid in children(os.getpid()):
-        with suppress(OSError):
-            used[role] = used.get(role, 0.0) + processor_time_s(pid)
-    return used
-
-
-def children(pid: int) -> list[tuple[str, int]]:
-    """Roles and ids of the processes that a run has started: listener, audio, emulator."""
-    found = []
-    for child in children_of(pid):
-        with suppress(OSError):
-            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8")
-            found += [(role, child) for part, role in _ROLES.items() if part in command]
-    return found
-
-
-def _growth(memory: ResidentMemory) -> dict[str, float]:
-    """Resident memory after a fifth of the time, and how much more of it there was at the end."""
-    settled = memory.resident_mb[len(memory.resident_mb) // 5 :]
-    return {"settled": round(settled[0], 2), "growth": round(settled[-1] - settled[0], 2)} if settled else {}
-
-
-def _load() -> float:
-    return round(os.getloadavg()[0], 2)
-
-
-def words(result: Mapping[str, Any]) -> Sequence[str]:
-    """What the table leaves out, a line each."""
-    told, idle, compared = result["live"], result["idle"], result["file"]
-    stages = ", ".join(f"{name} {ms['p50']}/{ms['p95']}" for name, ms in told["stages_ms"].items())
-    busy = "; other programs have it too, so figures mean little" if idle["busy"] else ""
-    return [
-        f"load {told['load']} on {idle['cores']} cores; empty loop: jitter p99 {idle['jitter_ms']['p99']} ms{busy}",
-        f"hop {told['hop']} frames; p50/p95 ms of its stages: {stages}",
-        f"CPU seconds a second: {told['cpu_s_per_s']}; resident MB: {told['resident_mb']}",
-        f"with a file: {compared['in_time_share']} of ticks in time, jitter p99 {compared['jitter_ms']['p99']} ms, "
-        f"sound to goal p50 {compared['sound_to_goal_ms']['p50']} ms, p95 {compared['sound_to_goal_ms']['p95']} ms",
-    ]

@@ -1,34 +1,41 @@
-"""Where the time goes between a sound and the servos, from the stamps that travel: of samples, frames and plans.
+"""Observers of a measured run: where the time goes between a sound and the servos, memory, processor time.
+
+The stages come from the stamps that travel with samples, frames and plans:
 
     hop      from a sample to the end of the frame that the listener plans with
-    block    until the source had that frame (its own stated latency)
+    block    until the source had that frame (the latency that it states)
     grid     until a tick gave it to the listener
     plan     until a tick had the listener's plan
-    write    until that tick's goals were written
+    write    until the goals of that tick were written
 
-The sum is from a sample at the microphone to the first goal of a plan that knows of it. It is taken for four samples of
-each frame, ten milliseconds apart. A face counts from its packet's arrival.
+Their sum is the time from a sample at the microphone to the first goal of a plan that uses it. It is taken for four
+samples of each frame, ten milliseconds apart. A face counts from the arrival of its packet.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan, SpeakerFrame
-from sfms_robot.ports import Source, Tick
+from sfms_robot.lab.bench.measure import children_of, memory_mb, processor_time_s
+from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.signals.quantiles import Quantiles
 
-SETTLED_S: Final = 5.0  # before that the listener catches up with what was said while it started
+SETTLED_S: Final = 5.0  # until then the listener catches up with speech from before it was ready
 STAGES: Final = ("hop", "block", "grid", "plan", "write")
 _SAMPLES: Final = 4  # of a frame
 _REMEMBERED: Final = 100  # frames
+_ROLES: Final = {"listeners.process": "listener", "sources.worker": "audio", "emulator": "emulator"}
 
 
 class StampedSource(Source):
-    """A source, and the loop's origin in seconds of `now`."""
+    """A source that knows the loop's origin on the clock `now`."""
 
     def __init__(self, inner: Source, now: Callable[[], float] = time.monotonic) -> None:
         self._inner, self._now = inner, now
@@ -37,7 +44,7 @@ class StampedSource(Source):
         self.latency_s, self.missing, self.outlets = inner.latency_s, inner.missing, inner.outlets
 
     def loop_s(self) -> float:
-        """Loop time."""
+        """Return the loop time."""
         return self._now() - self._origin_s
 
     def start(self, origin_s: float) -> None:
@@ -59,17 +66,18 @@ class StampedSource(Source):
         self._inner.close()
 
 
-class Stamps:
-    """`ports.Observer`. Fixed memory, whatever the length of the run.
+class Stamps(Observer):
+    """An observer that adds up the stages. Its memory does not grow with the run.
 
     Args:
-        loop_s: loop time, now.
-        latency_s: what the source says of itself.
+        loop_s: Returns the loop time.
+        latency_s: Returns the latency that the source states.
+        rate_hz: Ticks a second that are due.
     """
 
     def __init__(self, loop_s: Callable[[], float], latency_s: Callable[[], float], rate_hz: float) -> None:
         self._loop_s, self._latency_s, self._rate_hz = loop_s, latency_s, rate_hz
-        self._heard: dict[int, tuple[float, float]] = {}  # frame -> when a tick gave it, latency of the source
+        self._heard: dict[int, tuple[float, float]] = {}  # frame -> tick that gave it, latency of the source
         self._waiting: deque[SpeakerFrame] = deque(maxlen=_REMEMBERED)
         self._plans: list[tuple[float, float]] = []  # of this tick: made at, taken at
         self._stages = {name: Quantiles() for name in STAGES}
@@ -97,11 +105,8 @@ class Stamps:
                 self._followed(made_at_s, taken_s, written_s)
             self._plans = []
 
-    def close(self) -> None:
-        """Nothing is open."""
-
     def _followed(self, made_at_s: float, taken_s: float, written_s: float) -> None:
-        """A plan is on the wire: so is all that it knows of."""
+        """Count every frame up to `made_at_s`: the plan made from them is on the wire."""
         heard_s, latency_s = self._heard.get(round(made_at_s * FRAME_HZ), (made_at_s, 0.0))
         late_s = max(0.0, heard_s - made_at_s)
         block_s = min(latency_s, late_s)
@@ -116,15 +121,13 @@ class Stamps:
                 continue
             for k in range(_SAMPLES):
                 sample_s = frame.time_s - FRAME_S * (1 - k / _SAMPLES)
-                parts_s = (
-                    made_at_s - sample_s, block_s, late_s - block_s, taken_s - heard_s, written_s - taken_s,
-                )  # fmt: skip
+                parts_s = (made_at_s - sample_s, block_s, late_s - block_s, taken_s - heard_s, written_s - taken_s)
                 for name, part_s in zip(STAGES, parts_s, strict=True):
                     self._stages[name].add(max(0.0, part_s) * 1e3)
                 self._sound.add(max(0.0, written_s - sample_s) * 1e3)
 
     def report(self) -> dict[str, Any]:
-        """`ticks`, `missed_ticks`, `sound_to_goal_ms` by stage and in all, `face_to_goal_ms`."""
+        """Return `ticks`, `missed_ticks`, `sound_to_goal_ms`, `stages_ms` and `face_to_goal_ms`."""
         due = 0 if self._first_s is None else round((self._last_s - self._first_s) * self._rate_hz) + 1
         return {
             "ticks": self._ticks,
@@ -133,3 +136,52 @@ class Stamps:
             "stages_ms": {name: each.report(p50=50, p95=95) for name, each in self._stages.items()},
             "face_to_goal_ms": self._face.report(p50=50, p95=95),
         }
+
+
+class ResidentMemory(Observer):
+    """An observer of the resident memory of this process, sampled every `every_s` of loop time."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self.times_s: list[float] = []
+        self.resident_mb: list[float] = []
+
+    def tick(self, seen: Tick) -> None:
+        if seen.time_s >= len(self.times_s) * self._every_s:
+            self.times_s.append(seen.time_s)
+            self.resident_mb.append(memory_mb("VmRSS"))
+
+
+class ProcessorTime(Observer):
+    """An observer of the processor time of this process ("main") and of its children by role, once a second."""
+
+    def __init__(self) -> None:
+        self._next_s = SETTLED_S
+        self._seen: list[tuple[float, dict[str, float]]] = []  # first and newest
+
+    def tick(self, seen: Tick) -> None:
+        if seen.time_s < self._next_s:
+            return
+        self._next_s = seen.time_s + 1.0
+        used = {"main": time.process_time()}
+        for role, pid in children_by_role(os.getpid()):
+            with suppress(OSError):
+                used[role] = used.get(role, 0.0) + processor_time_s(pid)
+        self._seen = [*self._seen[:1], (time.monotonic(), used)]
+
+    def report(self) -> dict[str, float]:
+        """Return processor seconds per second, by role."""
+        if len(self._seen) < 2:
+            return {}
+        (first_s, first), (last_s, last) = self._seen
+        return {role: round((used_s - first.get(role, 0.0)) / (last_s - first_s), 4) for role, used_s in last.items()}
+
+
+def children_by_role(pid: int) -> list[tuple[str, int]]:
+    """Return role (listener, audio, emulator) and id of the processes that a run has started."""
+    found = []
+    for child in children_of(pid):
+        with suppress(OSError):
+            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8")
+            found += [(role, child) for part, role in _ROLES.items() if part in command]
+    return found

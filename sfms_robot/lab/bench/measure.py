@@ -1,4 +1,4 @@
-"""How a bench measures: durations, and a row with the ratio to a peer."""
+"""Tools that the benches share: durations, rows beside a peer, figures of processes, and docs/performance.md."""
 
 from __future__ import annotations
 
@@ -11,29 +11,40 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import BusError, ConfigError, ModelError
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.listeners.engine import EngineName
 from sfms_robot.processes import cores
 
-HEAD = "face28"
-LISTENER = "sfms-small"
+HEAD: Final = "face28"
+LISTENER: Final = "sfms-small"
 Row = dict[str, Any]
-# -P: what the folder of the caller holds is not what is measured.
+# -P: the current folder of the caller must not shadow the installation that is measured.
 MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
+_PAGE: Final = """# Measured by `sfms-robot bench`
+
+Written by `make bench`, {when}, on {machine}, in {minutes:.1f} minutes.
+Speeds are of that machine; what travels is the ratio: each figure beside its peer, both measured in the same run.
+
+| measured | median | p99 | ratio | to | repeats |
+|---|---|---|---|---|---|
+"""
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a bench found.
+class BenchResult:
+    """The outcome of a bench.
 
     Attributes:
-        figures: all of it, as plain data.
-        table: a row per line, for people; `lines` says what it leaves out.
-        passed: whether everything is as it has to be.
+        figures: Everything, as plain data (`--json`).
+        table: The rows that are printed; `lines` are printed below them.
+        passed: False makes the exit code 1.
     """
 
     figures: dict[str, Any]
@@ -42,8 +53,8 @@ class Told:
     passed: bool = True
 
     @classmethod
-    def of_rows(cls, rows: Mapping[str, Row]) -> Told:
-        """Of a bench whose figures are rows with a ratio to a peer; each says on what machine."""
+    def of_rows(cls, rows: Mapping[str, Row]) -> BenchResult:
+        """Return the result of a bench whose figures are rows; each row gets the name of this machine."""
         rows = {name: {**each, "machine": machine()} for name, each in rows.items()}
         columns = {"median": "median", "unit": "unit", "p99": "p99", "ratio": "ratio", "peer": "to"}
         table = [{"measured": name} | {columns[key]: each.get(key) for key in columns} for name, each in rows.items()]
@@ -51,21 +62,19 @@ class Told:
 
 
 def machine() -> str:
-    """The computer that is measured, in a line: cores that this process may use, processor, system, Python."""
-    system = f"{platform.system()} {platform.release()}"
-    return f"{cores()} cores of {_processor()}, {system}, Python {platform.python_version()}"
-
-
-def _processor() -> str:
+    """Return one line about this computer: usable cores, processor, system, Python."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         lines = []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
-    return next(named, "") or platform.processor() or platform.machine()
+    processor = next(named, "") or platform.processor() or platform.machine()
+    system = f"{platform.system()} {platform.release()}"
+    return f"{cores()} cores of {processor}, {system}, Python {platform.python_version()}"
 
 
-def row(ours: list[float], peers: list[float], unit: str, peer: str) -> Row:
+def row(ours: Sequence[float], peers: Sequence[float], unit: str, peer: str) -> Row:
+    """Return median and p99 of our measurements, the median of the peer's, and the ratio of the medians."""
     median, peer_median = float(np.median(ours)), float(np.median(peers))
     return {
         "median": median,
@@ -78,8 +87,12 @@ def row(ours: list[float], peers: list[float], unit: str, peer: str) -> Row:
     }
 
 
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    return {"p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99))}
+
+
 def times(call: Callable[[], object], count: int, clock: Callable[[], float] = time.perf_counter) -> list[float]:
-    """`count` durations of `call` [ms] after a tenth as many to warm up."""
+    """Return `count` durations of `call` [ms], measured after a tenth as many calls to warm up."""
     for _ in range(max(1, count // 10)):
         call()
     out = []
@@ -90,38 +103,165 @@ def times(call: Callable[[], object], count: int, clock: Callable[[], float] = t
     return out
 
 
+# --- another installation -------------------------------------------------------------------------------------------
+
+
 def environment(folder: Path) -> Mapping[str, str]:
-    """That finds the package of another checkout or installation first. Raises ConfigError where there is none."""
+    """Return an environment in which Python finds the package in `folder` first. Raises ConfigError without one."""
     if not (folder / "sfms_robot" / "__init__.py").is_file():
         raise ConfigError(f"--against {folder}: no sfms_robot in it; a checkout, or a folder of packages that has one")
     return {**os.environ, "PYTHONPATH": str(folder.resolve())}
 
 
-def beside(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:
-    """`bench NAME` of this installation and of the one in folder `against`, in turn: rows that both have.
+def compare_installations(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:
+    """Run `bench NAME` of this installation and of the one in `against` in turn; return the rows that both have.
 
-    Raises ConfigError where the other one does not run.
+    Raises ConfigError if the other installation does not run, or the bench has no rows.
     """
     ours: dict[str, list[float]] = {}
     theirs: dict[str, list[float]] = {}
     units: dict[str, str] = {}
     for _ in range(repeats):
         for found, env in ((ours, None), (theirs, environment(against))):
-            for key, each in _rows(name, env).items():
+            done = subprocess.run(
+                [sys.executable, *MAIN, "bench", name, "--json"],
+                capture_output=True, text=True, check=False, env=env,
+                cwd=tempfile.gettempdir(),  # child processes import from their current folder first
+            )  # fmt: skip
+            if done.returncode:
+                raise ConfigError(f"bench {name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+            for key, each in json.loads(done.stdout.splitlines()[-1]).items():
                 if not isinstance(each, dict) or "median" not in each:
-                    raise ConfigError(f"--against {against}: 'bench {name}' has no rows to lay beside others")
+                    raise ConfigError(f"--against {against}: 'bench {name}' has no rows to compare")
                 found.setdefault(key, []).append(each["median"])
                 units[key] = each["unit"]
     return {key: row(ours[key], theirs[key], units[key], str(against)) for key in ours if key in theirs}
 
 
-def _rows(name: str, env: Mapping[str, str] | None) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, *MAIN, "bench", name, "--json"],
-        capture_output=True, text=True, check=False, env=env,
-        cwd=tempfile.gettempdir(),  # processes that it starts look in their own folder first
-    )  # fmt: skip
-    if done.returncode:
-        raise ConfigError(f"bench {name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
-    rows: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return rows
+# --- processes ------------------------------------------------------------------------------------------------------
+
+
+def package_environment() -> dict[str, str]:
+    """Return an environment in which a child process imports what this process imports."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def result_of(returncode: int | None, said: str, out: str, name: str) -> Any:
+    """Return the JSON in the last line of `out`. Raises BusError with the last error line of a child that failed."""
+    lines = out.splitlines()
+    if returncode or not lines:
+        raise BusError(f"bench {name}: the run ended with {returncode}: {said.strip().splitlines()[-1:]}")
+    return json.loads(lines[-1])
+
+
+def processor_time_s(pid: int, thread: int | None = None) -> float:
+    """Return user and kernel time since a process, or one of its threads, began (proc(5)).
+
+    Raises OSError if the process has ended or there is no /proc.
+    """
+    place = f"/proc/{pid}/stat" if thread is None else f"/proc/{pid}/task/{thread}/stat"
+    fields = Path(place).read_text(encoding="utf-8").rpartition(")")[2].split()
+    ticks: float = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return ticks
+
+
+def memory_mb(key: Literal["VmRSS", "VmHWM"], pid: int | Literal["self"] = "self") -> float:
+    """Return resident memory now (VmRSS) or its peak (VmHWM) in MB; NaN for a process that ended, or without /proc."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return float("nan")
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:")), float("nan"))
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the ids of the running processes that `pid` started. Raises OSError as `processor_time_s`."""
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            found += map(int, (task / "children").read_text(encoding="utf-8").split())
+        except OSError:  # this thread has ended meanwhile
+            continue
+    return found
+
+
+# --- a listener in a process ----------------------------------------------------------------------------------------
+
+_LISTENER_STARTS: Final = 3
+_HEARD_FRAMES: Final = 50
+_LISTENER_CHILD: Final = f"from {__name__} import listen_to_silence; listen_to_silence()"
+
+
+@dataclass(frozen=True)
+class ProcessFigures:
+    """Medians over some starts: time to the first plan, resident memory while listening, and its peak."""
+
+    first_plan_s: float
+    resident_mb: float
+    peak_mb: float
+
+
+def listener_process(folder: Path, engine: EngineName, repeats: int = _LISTENER_STARTS) -> ProcessFigures:
+    """Start a process with one listener `repeats` times. Blocks for a second or two each.
+
+    Raises ModelError if the process ends early.
+    """
+    found = []
+    for _ in range(repeats):
+        began_s = time.perf_counter()
+        words = [sys.executable, "-P", "-c", _LISTENER_CHILD, str(folder), engine]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            planned = process.stdout.readline() == "plan\n"
+            first_plan_s = time.perf_counter() - began_s
+            last = process.stdout.readline()
+        if process.returncode or not planned:
+            raise ModelError(f"{folder}: a listener process on {engine} ended with exit code {process.returncode}")
+        found.append((first_plan_s, *json.loads(last)))
+    return ProcessFigures(*np.median(found, axis=0).tolist())
+
+
+def listen_to_silence() -> None:
+    """Run in the child: feed silence to the listener of a folder, on one thread.
+
+    Prints "plan" at the first plan, then a JSON list of resident and peak memory [MB] after `_HEARD_FRAMES` more.
+    """
+    from sfms_robot.listeners.registry import load_listener
+
+    folder, engine = sys.argv[1:]
+    listener = load_listener(Path(folder), engine=cast(EngineName, engine), threads=1)
+    memory: Any = listener.start(0)
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    index, left = 0, None
+    while left != 0:
+        index += 1
+        plan, memory = listener.step(SpeakerFrame(index * FRAME_S, silence), memory)
+        if left is not None:
+            left -= 1
+        elif plan is not None:
+            left = _HEARD_FRAMES
+            sys.stdout.write("plan\n")
+            sys.stdout.flush()
+    sys.stdout.write(json.dumps([memory_mb("VmRSS"), memory_mb("VmHWM")]) + "\n")
+
+
+# --- docs/performance.md --------------------------------------------------------------------------------------------
+
+
+def write_page(file: Path, rows: Mapping[str, Any], minutes: float) -> None:
+    """Write every row, and how it was measured, as a page. Raises ConfigError if the file cannot be written."""
+
+    def number(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3g}"
+
+    lines = [
+        f"| {name} | {each['median']:.4g} {each['unit']} | {number(each.get('p99'))} | {number(each.get('ratio'))} "
+        f"| {each.get('peer', '-')} | {each.get('repeats', '-')} |"
+        for name, each in rows.items()
+        if isinstance(each, Mapping) and "median" in each
+    ]
+    head = _PAGE.format(when=datetime.now(UTC).date().isoformat(), machine=machine(), minutes=minutes)
+    try:
+        file.write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--write {file}: cannot be written: {error.strerror}") from error

@@ -1,8 +1,8 @@
-"""What of the person a head hears while it speaks and moves, and what of itself it takes for the person.
+"""`bench own-voice`: the person missed while a head speaks and moves, and its own sound taken for the person.
 
-Recorded calls of two people become scenes: the caller in a room, the agent from the head's own loudspeaker, gear noise
-after the joint speeds of a recorded run. Who speaks is read off the clean tracks; 100 ms around every change are
-excused.
+Recorded calls of two people become scenes: the caller in a room, the agent from the head's loudspeaker, gear noise from
+the joint speeds of a recorded run. The clean tracks say who speaks; 100 ms around every change do not count. Sound is
+float64 at 16 kHz. Levels are root mean squares over the frames with speech.
 """
 
 from __future__ import annotations
@@ -10,201 +10,294 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate, fftconvolve, lfilter
 
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
-from sfms_robot.lab.bench.acoustics import GEAR_SEED, Bools, Call, Scene, read_call, scene, without_person
-from sfms_robot.lab.bench.measure import Told
+from sfms_robot.errors import ConfigError, optional
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.lab.bench.measure import BenchResult
+from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.echo import EchoCanceller
-from sfms_robot.signals.own_voice_gate import OwnVoiceGate
+from sfms_robot.signals.own_voice_gate import WINDOW, OwnVoiceGate, SpeechProbability
 
-# Never reported on: parameters were chosen on these calls, on gears of this seed that move as another recorded run did.
+Bools = NDArray[np.bool_]
+
+# Parameters were chosen on these calls, which are never reported on, with gears of another seed and other movements.
 CHOSEN_ON: Final = ("hvb_01cefd6f5c044a6f", "hvb_02e41649e7c441fd", "hvb_03a17cc36d474151")
 CHOSEN_ON_GEAR_SEED: Final = 1
-_EXCUSED_FRAMES: Final = 3  # 100 ms, in whole frames
+GEAR_SEED: Final = 0
+_NEAR_FRAMES: Final = 3  # 100 ms, in whole frames
+# Size in metres and the time in which sound decays by 60 dB.
+_ROOMS: Final[Mapping[str, tuple[tuple[float, float, float], float]]] = {
+    "small": ((3.2, 2.8, 2.5), 0.25),
+    "office": ((5.0, 4.0, 2.8), 0.4),
+    "hall": ((8.0, 6.0, 3.2), 0.6),
+}
+_PERSON_DB: Final = -30.0  # at the microphone
+_PERSON_M, _LOUDSPEAKER_M, _MOTORS_M = (1.2, 0.3, 0.2), (0.02, 0.0, -0.12), (0.0, 0.06, -0.05)  # from the microphone
+_LOUDSPEAKER_DELAY: Final = 640  # samples from the reference to the loudspeaker, 40 ms
+_HISS_DB: Final = -72.0
+_ORDER: Final = 30  # of reflections, at most
+_TRUTH_GAINS: Final = (2.0, 16.0)  # for clean speech; independent of the gains of the gate
+_ALTERNATE_FRAMES: Final = 100  # a voice that talks over the person goes on and off at this pace
+_TITLES: Final = {
+    "own_voice_taken": "own voice taken for the person",
+    "person_missed": "person missed",
+    "person_missed_in_double_talk": "missed in double talk",
+    "nobody_taken": "nobody taken for the person",
+    "core_share": "of a core",
+}
 
 
-@dataclass(frozen=True)
-class Condition:
-    """Levels over the person's [dB], None: not there. Without `person` they are the same, but he is not there."""
+@dataclass(frozen=True, kw_only=True)
+class VoiceCondition:
+    """Levels relative to the person's [dB], None: absent. Without `person` the levels are the same, without speech.
 
-    room: str
-    own_db: float | None
-    motors_db: float | None
-    talks_over: bool
+    `talks_over`: the head's voice without its pauses, four seconds on and four off, regardless of the person.
+    """
+
+    room: str = "office"
+    own_db: float | None = None
+    motors_db: float | None = None
+    talks_over: bool = False
     person: bool = True
 
     def __str__(self) -> str:
         over = ", talks over" if self.talks_over else ""
         own = "silent" if self.own_db is None else f"{self.own_db:+.0f} dB{over}"
         motors = "still" if self.motors_db is None else f"{self.motors_db:+.0f} dB"
-        there = "" if self.person else ", nobody there"
-        return f"{self.room} | own voice {own} | motors {motors}{there}"
+        return f"{self.room} | own voice {own} | motors {motors}{'' if self.person else ', nobody there'}"
 
 
 CONDITIONS: Final = (
-    Condition("office", None, None, False),
-    Condition("office", -10.0, None, False),
-    Condition("small", 0.0, None, False),
-    Condition("office", 0.0, None, False),
-    Condition("hall", 0.0, None, False),
-    Condition("office", 10.0, None, False),
-    Condition("office", 0.0, None, True),
-    Condition("office", 10.0, None, True),
-    Condition("office", None, -10.0, False),
-    Condition("office", None, -10.0, False, person=False),
-    Condition("office", None, 0.0, False),
-    Condition("office", None, 0.0, False, person=False),
-    Condition("office", 0.0, -10.0, False),
-    Condition("office", 0.0, 0.0, False),
+    VoiceCondition(),
+    VoiceCondition(own_db=-10.0),
+    VoiceCondition(room="small", own_db=0.0),
+    VoiceCondition(own_db=0.0),
+    VoiceCondition(room="hall", own_db=0.0),
+    VoiceCondition(own_db=10.0),
+    VoiceCondition(own_db=0.0, talks_over=True),
+    VoiceCondition(own_db=10.0, talks_over=True),
+    VoiceCondition(motors_db=-10.0),
+    VoiceCondition(motors_db=-10.0, person=False),
+    VoiceCondition(motors_db=0.0),
+    VoiceCondition(motors_db=0.0, person=False),
+    VoiceCondition(own_db=0.0, motors_db=-10.0),
+    VoiceCondition(own_db=0.0, motors_db=0.0),
 )
 
 
-@dataclass
-class Counts:
-    """Frames of one condition over several calls: how many there are, and how many were judged wrongly."""
-
-    own: int = 0
-    own_taken: int = 0
-    person: int = 0
-    person_missed: int = 0
-    both: int = 0
-    both_missed: int = 0
-    nobody: int = 0
-    nobody_taken: int = 0
-    cpu_s: float = 0.0
-    audio_s: float = 0.0
-
-    def add(self, heard: Scene, voice: Bools, cpu_s: float) -> None:
-        n = len(voice)
-        person, own = heard.person_speaks[:n], heard.own_speaks[:n]
-        counted = ~(_near_change(person) | _near_change(own))
-        self.own += int((counted & own & ~person).sum())
-        self.own_taken += int((counted & own & ~person & voice).sum())
-        self.person += int((counted & person).sum())
-        self.person_missed += int((counted & person & ~voice).sum())
-        self.both += int((counted & person & own).sum())
-        self.both_missed += int((counted & person & own & ~voice).sum())
-        self.nobody += int((counted & ~person & ~own).sum())
-        self.nobody_taken += int((counted & ~person & ~own & voice).sum())
-        self.cpu_s += cpu_s
-        self.audio_s += n * FRAME_S
-
-    def shares(self) -> dict[str, float | None]:
-        """None where there is no such frame."""
-        return {
-            "own_voice_taken": _share(self.own_taken, self.own),
-            "person_missed": _share(self.person_missed, self.person),
-            "person_missed_in_double_talk": _share(self.both_missed, self.both),
-            "nobody_taken": _share(self.nobody_taken, self.nobody),
-            "core_share": _share(self.cpu_s, self.audio_s),
-        }
+def measure(data: Path | None = None) -> BenchResult:
+    """Measure every condition over the calls in folder `data`."""
+    result = own_voice(data)
+    chosen_on = ", ".join(result["chosen_on"]["calls"])
+    table = [
+        {"condition": found["condition"]}
+        | {title: "-" if found[key] is None else f"{100 * found[key]:.1f} %" for key, title in _TITLES.items()}
+        for found in result["conditions"]
+    ]
+    lines = [
+        f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms",
+        f"parameters were chosen on other calls ({chosen_on}), gears and movements",
+    ]
+    return BenchResult(result, table, lines)
 
 
-def own_voice(folder: Path | None = None, conditions: Sequence[Condition] = CONDITIONS) -> dict[str, Any]:
-    """Every condition over the calls of `folder` (NAME_caller, NAME_agent), or over the two that ship.
+def own_voice(folder: Path | None = None, conditions: Sequence[VoiceCondition] = CONDITIONS) -> dict[str, Any]:
+    """Measure conditions over the calls of `folder` (NAME_caller, NAME_agent), or over the two that ship.
 
-    Calls on which parameters were chosen are left out. Raises ConfigError where none is left.
+    Calls on which parameters were chosen are left out. Raises ConfigError if no call is left.
     """
     folder = data_dir("sim") / "conversations" if folder is None else folder
-    calls = [read_call(folder, name) for name in call_names(folder)]
-    rows = []
-    for condition in conditions:
-        counts = Counts()
-        for call in calls:
-            _listen(call, condition, counts)
-        rows.append({"condition": str(condition), **counts.shares()})
+    calls = [Call(folder, name) for name in call_names(folder)]
     return {
         "calls": [call.name for call in calls],
         "gear_seed": GEAR_SEED,
         "chosen_on": {"calls": list(CHOSEN_ON), "gear_seed": CHOSEN_ON_GEAR_SEED},
-        "echo_latency_ms": echo_latency_ms(calls[0]),
-        "conditions": rows,
+        "echo_latency_ms": _echo_latency_ms(calls[0]),
+        "conditions": [{"condition": str(each), **_shares(calls, each)} for each in conditions],
     }
 
 
 def call_names(folder: Path) -> list[str]:
-    """Calls in a folder on which nothing was chosen."""
+    """Return the calls in a folder, without those that parameters were chosen on."""
     names = sorted({path.stem.removesuffix("_caller") for path in folder.glob("*_caller.*")} - set(CHOSEN_ON))
     if not names:
         raise ConfigError(f"{folder}: has no NAME_caller.flac with NAME_agent.flac (or .wav) to report on")
     return names
 
 
-def echo_latency_ms(call: Call) -> float:
-    """Of echo cancellation while own voice talks over: where the person's cross-correlation is highest."""
-    heard = scene(call, "office", own_db=0.0, talks_over=True)
-    alone = scene(call, "office")
+def _echo_latency_ms(call: Call) -> float:
+    """Return the delay of echo cancellation under own voice: the peak of the person's cross-correlation."""
+    heard = HeardScene(call, VoiceCondition(own_db=0.0, talks_over=True))
     after = EchoCanceller().push(heard.mic, heard.reference).audio
-    before = alone.mic[: len(after)]
-    size = 1 << (2 * len(after) - 1).bit_length()
-    likeness = np.fft.irfft(np.fft.rfft(after, size) * np.fft.rfft(before, size).conj(), size)
+    before = HeardScene(call, VoiceCondition()).mic[: len(after)]
+    likeness = correlate(after, before, method="fft")[len(before) - 1 :]  # lags from 0 on
     return float(np.argmax(likeness[: AUDIO_HZ // 10])) / AUDIO_HZ * 1e3
 
 
-def measure(data: Path | None = None) -> Told:
-    """`own_voice` over the calls in folder `data`, as `bench` tells it."""
-    result = own_voice(data)
-    chosen_on = ", ".join(result["chosen_on"]["calls"])
-    lines = [
-        f"calls: {', '.join(result['calls'])}; echo cancellation adds {result['echo_latency_ms']:.1f} ms",
-        f"parameters were chosen on other calls ({chosen_on}), gears and movements",
-    ]
-    return Told(result, table(result), lines)
+def _shares(calls: Sequence[Call], condition: VoiceCondition) -> dict[str, float | None]:
+    """Return shares of the frames, over all calls, that the gate judges wrongly; None without such frames."""
+    parts, cpu_s = [], 0.0
+    for call in calls:
+        heard = HeardScene(call, condition)
+        gate = OwnVoiceGate(speaks=condition.own_db is not None)
+        began_s = time.process_time()
+        voice = [
+            frame.voice
+            for mic, own, speed in zip(_framed(heard.mic), _framed(heard.reference), heard.speed_rad_s, strict=True)
+            for frame in gate.push(mic, own if gate.latency_s else None, speed)
+        ]
+        cpu_s += time.process_time() - began_s
+        n = len(voice)
+        parts.append(np.stack([np.array(voice), heard.person_speaks[:n], heard.own_speaks[:n]]))
+    near = np.concatenate([_near_change(person) | _near_change(own) for _, person, own in parts])
+    taken, person, own = np.concatenate(parts, axis=1)
 
+    def share(of: Bools, wrong: Bools) -> float | None:
+        frames = of & ~near
+        return float((frames & wrong).sum() / frames.sum()) if frames.any() else None
 
-def table(result: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Rows for a person to read, in percent."""
-    titles = {
-        "own_voice_taken": "own voice taken for the person",
-        "person_missed": "person missed",
-        "person_missed_in_double_talk": "missed in double talk",
-        "nobody_taken": "nobody taken for the person",
-        "core_share": "of a core",
+    return {
+        "own_voice_taken": share(own & ~person, taken),
+        "person_missed": share(person, ~taken),
+        "person_missed_in_double_talk": share(person & own, ~taken),
+        "nobody_taken": share(~person & ~own, taken),
+        "core_share": cpu_s / (len(taken) * FRAME_S) if len(taken) else None,
     }
-    return [
-        {"condition": row["condition"], **{titles[key]: _percent(row[key]) for key in titles}}
-        for row in result["conditions"]
-    ]
 
 
-def _listen(call: Call, condition: Condition, counts: Counts) -> None:
-    heard = scene(
-        call if condition.person else without_person(call),
-        condition.room,
-        condition.own_db,
-        condition.motors_db,
-        condition.talks_over,
-    )
-    gate = OwnVoiceGate(speaks=condition.own_db is not None)
-    began = time.process_time()
-    voice = [
-        frame.voice
-        for k, speed in enumerate(heard.speed_rad_s)
-        for frame in gate.push(_frame(heard.mic, k), _frame(heard.reference, k) if gate.latency_s else None, speed)
-    ]
-    counts.add(heard, np.array(voice), time.process_time() - began)
-
-
-def _frame(samples: Floats, k: int) -> Floats:
-    return samples[k * FRAME_SAMPLES : (k + 1) * FRAME_SAMPLES]
+def _framed(samples: Floats) -> Floats:
+    return samples.reshape(-1, FRAME_SAMPLES)
 
 
 def _near_change(active: Bools) -> Bools:
+    """Return the frames (n,) within `_NEAR_FRAMES` of a change, before it or from it on."""
     near = np.zeros(len(active), bool)
-    for change in np.flatnonzero(np.diff(active.astype(np.int8))) + 1:
-        near[max(0, change - _EXCUSED_FRAMES) : change + _EXCUSED_FRAMES] = True
+    for change in np.flatnonzero(active[1:] != active[:-1]) + 1:
+        near[max(0, change - _NEAR_FRAMES) : change + _NEAR_FRAMES] = True
     return near
 
 
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
+# --- scenes ---------------------------------------------------------------------------------------------------------
 
 
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+class Call:
+    """Two people on one clock: samples (n * 640,), and who speaks in each of n frames, from the clean tracks.
+
+    NAME_caller is the person and NAME_agent the head, as .flac or .wav. Raises ConfigError if one is missing.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        person, own = (_track(folder, f"{name}_{who}") for who in ("caller", "agent"))
+        n = min(len(person), len(own)) // FRAME_SAMPLES * FRAME_SAMPLES
+        self.name, self.person, self.own = name, person[:n], own[:n]
+        self.person_speaks, self.own_speaks = _speaks(self.person), _speaks(self.own)
+
+
+def _track(folder: Path, name: str) -> Doubles:
+    for suffix in (".flac", ".wav"):
+        if (file := folder / (name + suffix)).is_file():
+            return read_audio(file).astype(np.float64)
+    raise ConfigError(f"{folder}: has no {name}.flac or {name}.wav")
+
+
+def _speaks(track: Doubles) -> Bools:
+    """Return (n,) of a clean track (n * 640,): the network finds speech likely around the middle of the frame."""
+    loud = track / max(1e-9, float(np.sqrt(np.mean(track**2)))) * 10 ** (-26 / 20)
+    found = np.array(SpeechProbability(_TRUTH_GAINS).push(loud.astype(np.float32)))
+    middles = (np.arange(len(track) // FRAME_SAMPLES) + 0.5) * FRAME_SAMPLES / WINDOW - 0.5
+    likely: Bools = np.interp(middles, np.arange(len(found)), found) > 0.5
+    return likely
+
+
+class HeardScene:
+    """A call as the head's microphone hears it.
+
+    Attributes:
+        mic, reference: (n * 640,) float32.
+        speed_rad_s: (n, J) joint speeds.
+        person_speaks, own_speaks: (n,) truth.
+    """
+
+    def __init__(self, call: Call, condition: VoiceCondition) -> None:
+        person_echo, own_echo, motor_echo = _responses(condition.room)
+        n = len(call.person_speaks)
+        mic = np.random.default_rng(0).standard_normal(n * FRAME_SAMPLES) * 10 ** (_HISS_DB / 20)
+        self.person_speaks = call.person_speaks & condition.person
+        mic += _at_level(call.person * condition.person, person_echo, self.person_speaks, 0.0)
+        own, self.own_speaks, self.speed_rad_s = np.zeros(n * FRAME_SAMPLES), np.zeros(n, bool), np.zeros((n, 1))
+        if condition.own_db is not None:
+            own, self.own_speaks = call.own, call.own_speaks
+            if condition.talks_over:
+                talk = own.reshape(n, FRAME_SAMPLES)[self.own_speaks]
+                self.own_speaks = np.arange(n) // _ALTERNATE_FRAMES % 2 == 0
+                own = (np.resize(talk, (n, FRAME_SAMPLES)) * self.own_speaks[:, None]).ravel()
+            own = 0.5 * own / np.abs(own).max()
+            late = np.concatenate([np.zeros(_LOUDSPEAKER_DELAY), own])[: len(own)]
+            mic += _at_level(late, own_echo, self.own_speaks, condition.own_db)
+        if condition.motors_db is not None:
+            self.speed_rad_s = _joint_speeds(n)
+            total = self.speed_rad_s.sum(axis=1)
+            mic += _at_level(gear_noise(self.speed_rad_s), motor_echo, total > 0.2 * total.mean(), condition.motors_db)
+        self.mic, self.reference = mic.astype(np.float32), own.astype(np.float32)
+
+
+def _joint_speeds(n: int) -> Doubles:
+    """Return (n, 28) speeds [rad/s] commanded to a listening head, forward and backward in time in turn."""
+    speed = np.load(data_dir("sim") / "conversations" / "joint_speeds.npz")["speed_rad_s"].astype(np.float64)
+    return np.resize(np.concatenate([speed, speed[::-1]]), (n, speed.shape[1]))
+
+
+def gear_noise(speed_rad_s: Doubles, seed: int = GEAR_SEED) -> Doubles:
+    """Return (n * 640,) noise of gears at speeds (n, J).
+
+    Each joint has a whine of four harmonics, its pitch proportional to the speed, and a hiss; both are louder at speed.
+    """
+    rng = np.random.default_rng(seed)
+    frames, joints = speed_rad_s.shape
+    at = np.arange(frames * FRAME_SAMPLES) / FRAME_SAMPLES - 0.5
+    noise = np.zeros(len(at))
+    for joint in range(joints):
+        speed = np.interp(at, np.arange(frames), speed_rad_s[:, joint])
+        turns = np.cumsum(speed) / AUDIO_HZ * rng.uniform(900, 1600)
+        whine = sum(
+            size * np.sin(k * turns + rng.uniform(0, 6)) for k, size in ((1, 1.0), (2, 0.6), (3, 0.4), (5, 0.2))
+        )
+        pole = rng.uniform(0.3, 0.8)
+        hiss = lfilter([1 - pole], [1, -pole], rng.standard_normal(len(at)))
+        noise += speed / (1 + speed) * (0.5 * whine + hiss) * rng.uniform(0.5, 1.5)
+    return noise
+
+
+def _at_level(sound: Doubles, response: Doubles, active: Bools, over_db: float) -> Doubles:
+    """Return the sound in the room, its active frames at a level relative to the person's."""
+    heard: Doubles = fftconvolve(sound, response)[: len(sound)]
+    if not active.any():
+        return heard
+    loud = heard.reshape(-1, FRAME_SAMPLES)[active]
+    return heard * 10 ** ((_PERSON_DB + over_db) / 20) / max(1e-9, float(np.sqrt(np.mean(loud**2))))
+
+
+@cache
+def _responses(room: str) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the responses from the person, the loudspeaker and the motors to the microphone (image sources)."""
+    with optional("bench own-voice"):
+        import pyroomacoustics
+    size, decay_s = _ROOMS[room]
+    absorption, order = pyroomacoustics.inverse_sabine(decay_s, size)
+    material = pyroomacoustics.Material(absorption)
+    shoebox = pyroomacoustics.ShoeBox(size, fs=AUDIO_HZ, materials=material, max_order=min(order, _ORDER))
+    microphone = np.array([0.45 * size[0], 0.4 * size[1], 1.2])
+    for place in (_PERSON_M, _LOUDSPEAKER_M, _MOTORS_M):
+        shoebox.add_source(microphone + place)
+    shoebox.add_microphone(microphone)
+    shoebox.compute_rir()
+    person, loudspeaker, motors = (np.asarray(response, np.float64) for response in shoebox.rir[0])
+    return person, loudspeaker, motors

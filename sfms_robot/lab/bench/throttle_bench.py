@@ -1,41 +1,58 @@
 """`bench throttle`: a head that listens on a quarter of one core, beside the same on all of this machine.
 
     free    the default head listens to a recorded person, in real time
-    held    the same, the run and its listener held to `SHARE` of one core (`throttled_tree`)
+    held    the same, with the run and its listener held to `SHARE` of one core
 
-Servos are emulated outside of what is held: real ones are not slower either. From there they are looked at, past the
-bus. However slow the computer is, no command outside the limits may reach them, and the states have to be what
-docs/safety.md says they are. An arrow that its table has not, a listener that is silent or always late and not named, a
-reason that is not told, torque that is left on: a line each, and exit code 1.
+A process and everything it starts stay on one core and run for a share of every `_SLICE_S`; SIGSTOP and SIGCONT stop
+them for the rest. A slower computer is slow evenly; here a tick may find its process stopped and be late by up to a
+slice for that alone. A process that was late gets no extra time, so the share is never exceeded. Linux.
+
+The servos are emulated outside of the held processes, as real servos are not slower either, and are observed there.
+However slow the computer is, no command outside the limits may reach them, and the states have to be those of
+docs/safety.md. Each transition that its table lacks, each silent or late listener that is not named, each missing
+reason and torque that is left on is one line, and makes the exit code 1.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
 
 from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
 from sfms_robot.app.wiring import calibration_of, emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
-from sfms_robot.errors import BusError
+from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan
 from sfms_robot.lab.bench.live_bench import patient_head
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, Row, Told, row
-from sfms_robot.lab.bench.throttled_tree import Tree, check
+from sfms_robot.lab.bench.measure import (
+    HEAD,
+    LISTENER,
+    BenchResult,
+    Row,
+    children_of,
+    package_environment,
+    processor_time_s,
+    result_of,
+    row,
+)
 from sfms_robot.listeners.thread import HUNG_S, LATE_S
 from sfms_robot.ports import Observer, Tick
+from sfms_robot.processes import realtime_priority
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.runtime.states import ARROWS
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
@@ -43,25 +60,26 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 Change = tuple[float, str, tuple[str, ...]]  # time_s, state, why
 
 SHARE: Final = 0.25
-RUN_S: Final = 20.0
-TOLERANCE_S: Final = 0.5  # of a state: the loop looks when it is awake
+_RUN_S: Final = 20.0
+_TOLERANCE_S: Final = 0.5  # of a state: the loop checks when it is awake
 _LOOK_S: Final = 0.5  # between two looks at the servos
-_LIMIT_S: Final = 120.0  # for a run, its start with it
-_OUTSIDE_S: Final = 2.0  # more to ease in, for joints found outside their range
-_PEER: Final = "the same run on all cores"
+_LIMIT_S: Final = 120.0  # for a run and its start
+_OUTSIDE_S: Final = 2.0  # more time to ease in, for joints found outside their range
+_SLICE_S: Final = 0.008  # not a multiple of a tick, so that ticks meet different places of a slice
+_PROCESSES_S: Final = 0.2  # between two looks for new processes
 _CHILD: Final = "from sfms_robot.lab.bench.throttle_bench import observed_run; observed_run()"
 
 
-@dataclass(frozen=True)
-class Seen:
+@dataclass(frozen=True, kw_only=True)
+class ObservedRun:
     """A run.
 
     Attributes:
-        report: its own.
-        plans_s: when plans came, and the last of their frames, loop time.
-        looks, outside: at servos, and how many of them held a goal outside their joint's range.
-        torque: servos that have torque when it is over.
-        core_share: of one core that it used, its start with it.
+        report: The report of the run.
+        plans_s: Arrival of each plan, and its last frame, in loop time.
+        looks, outside: Looks at servos, and how many of them found a goal outside the joint's range.
+        torque: Servos that have torque after the run.
+        core_share: Share of one core that the run used, its start included.
     """
 
     report: Mapping[str, Any]
@@ -73,53 +91,52 @@ class Seen:
 
     @property
     def in_time(self) -> float:
-        """The share of ticks that were due and came in time."""
+        """Return the share of the due ticks that came in time."""
         tick = self.report["tick"]
         punctual = 1 - float(tick["late"]) / float(self.report["ticks"])
         return punctual * min(1.0, float(tick["achieved_hz"]) / float(tick["target_hz"]))
 
 
-def measure(say: Callable[[str], None]) -> Told:
-    """Both runs, a minute. Raises ConfigError where processes cannot be held, BusError when a run does not come to
-    its end.
+def measure(say: Callable[[str], None]) -> BenchResult:
+    """Measure both runs; takes a minute.
+
+    Raises ConfigError if processes cannot be held here, BusError if a run fails.
     """
     check()
-    say(f"{RUN_S:g} s on all of this machine")
-    free = _seen(None)
-    say(f"{RUN_S:g} s on {SHARE:g} of one core")
-    held = _seen(SHARE)
+    say(f"{_RUN_S:g} s on all of this machine")
+    free = _observed(None)
+    say(f"{_RUN_S:g} s on {SHARE:g} of one core")
+    held = _observed(SHARE)
     problems = [f"{name}: {each}" for name, seen in (("all", free), ("held", held)) for each in problems_of(seen)]
-    figures: dict[str, Any] = {**_rows(free, held), "share": SHARE, "problems": problems}
-    figures |= {name: _figures(seen) for name, seen in (("free", free), ("held", held))}
-    told = [
-        {"measured": key, "all cores": value, f"{SHARE:g} of one": figures["held"][key]}
-        for key, value in figures["free"].items()
-        if not isinstance(value, dict)
-    ]
-    states = [
-        {"measured": f"% of the time {name}", "all cores": all_s, f"{SHARE:g} of one": held_s}
-        for name, all_s, held_s in _beside(figures["free"]["states"], figures["held"]["states"])
-    ]
-    return Told(
-        figures, [*told, *states], problems or ["commands inside limits, states as docs/safety.md says"], not problems
-    )
 
+    def beside(figure: Callable[[ObservedRun], float], unit: str) -> Row:
+        return row([figure(held)], [figure(free)], unit, "the same run on all cores")
 
-def _rows(free: Seen, held: Seen) -> dict[str, Row]:
-    def beside(figure: Callable[[Seen], float], unit: str) -> Row:
-        return row([figure(held)], [figure(free)], unit, _PEER)
-
-    return {
+    all_cores, quarter = _figures(free), _figures(held)
+    figures = {
         "throttle.in_time": beside(lambda seen: 100 * seen.in_time, "% of ticks"),
         "throttle.rate": beside(lambda seen: float(seen.report["tick"]["achieved_hz"]), "ticks a second"),
         "throttle.plans": beside(lambda seen: len(seen.plans_s) / seen.report["duration_s"], "plans a second"),
+        "share": SHARE,
+        "problems": problems,
+        "free": all_cores,
+        "held": quarter,
     }
+    columns = ("measured", "all cores", f"{SHARE:g} of one")
+    lines = [(key, value, quarter[key]) for key, value in all_cores.items() if key != "states"]
+    lines += [
+        (f"% of the time {name}", all_cores["states"].get(name, 0.0), quarter["states"].get(name, 0.0))
+        for name in dict.fromkeys([*all_cores["states"], *quarter["states"]])
+    ]
+    table = [dict(zip(columns, line, strict=True)) for line in lines]
+    return BenchResult(
+        figures, table, problems or ["commands inside limits, states as docs/safety.md says"], not problems
+    )
 
 
-def _figures(seen: Seen) -> dict[str, Any]:
-    """What a run did, and what it gave up."""
+def _figures(seen: ObservedRun) -> dict[str, Any]:
     report = seen.report
-    total_s = sum(report["states"]["seconds"].values())
+    seconds = report["states"]["seconds"]
     return {
         "core share used": round(seen.core_share, 2),
         "ticks in time %": round(100 * seen.in_time, 1),
@@ -136,20 +153,15 @@ def _figures(seen: Seen) -> dict[str, Any]:
         "listener started anew": report["listener_state"]["restarts"],
         "limit violations": report["limits"]["violations"],
         "goals outside": seen.outside,
-        "states": {name: round(100 * of_s / total_s, 1) for name, of_s in report["states"]["seconds"].items()},
+        "states": {name: round(100 * of_s / sum(seconds.values()), 1) for name, of_s in seconds.items()},
     }
 
 
-def _beside(free: Mapping[str, float], held: Mapping[str, float]) -> Iterator[tuple[str, float, float]]:
-    for name in dict.fromkeys([*free, *held]):
-        yield name, free.get(name, 0.0), held.get(name, 0.0)
+# --- problems -------------------------------------------------------------------------------------------------------
 
 
-# --- what must not be -----------------------------------------------------------------------------------------------
-
-
-def problems_of(seen: Seen) -> list[str]:
-    """A line for everything that is not as docs/safety.md says; none: all is."""
+def problems_of(seen: ObservedRun) -> list[str]:
+    """Return one line for each deviation from docs/safety.md."""
     report = seen.report
     found = [f"the run ended by itself: {report['exit']} {report['error'] or ''}"] if report["exit"] != "done" else []
     if report["limits"]["violations"]:
@@ -163,63 +175,61 @@ def problems_of(seen: Seen) -> list[str]:
 
 
 def state_problems(changes: Sequence[Change], plans_s: Sequence[tuple[float, float]]) -> list[str]:
-    """A line for everything about the states of a run that its table has not.
+    """Return one line for each state, transition or reason of a run that the table of docs/safety.md lacks.
 
     Args:
-        changes: in order.
-        plans_s: when plans came, and the last of their frames.
+        changes: State changes, in order.
+        plans_s: Arrival of each plan, and its last frame.
     """
     found = []
     for (_, before, _), (at_s, after, _) in pairwise(changes):
         if before != after and (before, after) not in ARROWS:
-            found.append(f"{before} to {after} at {at_s:.2f} s is no arrow of the table")
+            found.append(f"{before} to {after} at {at_s:.2f} s is not a transition of the table")
     for at_s, name, why in changes:
         if bool(why) != (name in ("degraded", "halted", "fault")):
-            found.append(f"{name} at {at_s:.2f} s says {why or 'nothing'}")
+            found.append(f"{name} at {at_s:.2f} s has the reason {why or 'none'}")
     if [name for _, name, _ in changes][-2:] != ["stopping", "stopped"]:
         found.append(f"it ends {changes[-1][1]}")
-    easing_s = EASE_S + _OUTSIDE_S + TOLERANCE_S
+    easing_s = EASE_S + _OUTSIDE_S + _TOLERANCE_S
     if len(changes) > 1 and changes[0][1] == "starting" and changes[1][0] - changes[0][0] > easing_s:
         found.append(f"starting for {changes[1][0] - changes[0][0]:.1f} s, {easing_s:g} at most")
-    return found + [
-        f"no plan in time from {since_s:.2f} to {until_s:.2f} s, and the listener is not named"
-        for since_s, until_s in _silences(changes, plans_s)
-        if not _named("listener", since_s, until_s, changes)
-    ]
+    ends_s = [at_s for at_s, _, _ in changes[1:]] + [float("inf")]
+    for since_s, until_s in _silences(changes, plans_s):
+        if not any(
+            "listener" in why and at_s <= until_s and end_s >= since_s
+            for (at_s, _, why), end_s in zip(changes, ends_s, strict=True)
+        ):
+            found.append(f"no plan in time from {since_s:.2f} to {until_s:.2f} s, and the listener is not named")
+    return found
 
 
 def _silences(changes: Sequence[Change], plans_s: Sequence[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """From the last plan in time to the next, where that is longer than it may stay without a name, once there was a
-    plan at all. A plan that comes late shows that the listener is late only when it comes, hence two of these times.
+    """Yield the times from a plan in time to the next, after the first plan, that are too long to stay unnamed.
+
+    A late plan shows that the listener is late only when it arrives, so the limit is the sum of both times.
     """
     if not plans_s:
         return
     ends_s = next(at_s for at_s, name, _ in changes if name in ("stopping", "stopped", "fault"))
     in_time_s = [plans_s[0][0], *(came_s for came_s, last_s in plans_s[1:] if came_s <= last_s), ends_s]
     for before_s, next_s in pairwise(in_time_s):
-        if next_s - before_s > HUNG_S + LATE_S + TOLERANCE_S:
+        if next_s - before_s > HUNG_S + LATE_S + _TOLERANCE_S:
             yield before_s, next_s
-
-
-def _named(why: str, since_s: float, until_s: float, changes: Sequence[Change]) -> bool:
-    """Whether a state between two times says so."""
-    ends_s = [at_s for at_s, _, _ in changes[1:]] + [float("inf")]
-    return any(
-        why in told and at_s <= until_s and end_s >= since_s
-        for (at_s, _, told), end_s in zip(changes, ends_s, strict=True)
-    )
 
 
 # --- a run ----------------------------------------------------------------------------------------------------------
 
 
-def _seen(share: float | None) -> Seen:
-    """A run to its end. Raises BusError with the last it said when there is none."""
-    head = load_head(HEAD)
-    with TemporaryDirectory() as name, launch(emulated(head)["main"]) as chain:
+def _observed(share: float | None) -> ObservedRun:
+    """Start a run, observe its servos, and return what was seen. Raises BusError if the run fails."""
+    with TemporaryDirectory() as name, launch(emulated(load_head(HEAD))["main"]) as chain:
         folder, goals = Path(name), _Goals(chain)
-        options = {"head": str(patient_head(folder)), "port": chain.device}
-        with _started(options, share, folder) as tree:
+        words = ["-P", "-c", _CHILD, json.dumps({"head": str(patient_head(folder)), "port": chain.device})]
+        with (
+            (folder / "out").open("wb") as out,
+            (folder / "said").open("wb") as said,
+            Tree(words, share, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=package_environment()) as tree,
+        ):
             began_s = time.monotonic()
             while tree.process.poll() is None:
                 if time.monotonic() - began_s > _LIMIT_S:
@@ -227,17 +237,14 @@ def _seen(share: float | None) -> Seen:
                 goals.look()
                 time.sleep(_LOOK_S)
             core_share = tree.used_s / (time.monotonic() - began_s)
-        lines = (folder / "out").read_text(encoding="utf-8").splitlines()
-        if tree.process.returncode or not lines:
-            said = (folder / "said").read_text(encoding="utf-8").strip().splitlines()
-            raise BusError(f"bench throttle: the run ended with {tree.process.returncode}: {said[-1:]}")
-        told = json.loads(lines[-1])
+        printed, errors = ((folder / file).read_text(encoding="utf-8") for file in ("out", "said"))
+        found = result_of(tree.process.returncode, errors, printed, "throttle")
         torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
-    return Seen(told["report"], told["plans_s"], goals.looks, goals.outside, torque, core_share)
+    return ObservedRun(**found, looks=goals.looks, outside=goals.outside, torque=torque, core_share=core_share)
 
 
 class _Goals:
-    """What servos hold, seen past the bus."""
+    """Counts goals of the emulated servos outside their joints' ranges, bypassing the bus."""
 
     def __init__(self, chain: Chain) -> None:
         joints = load_head(HEAD).joints
@@ -245,7 +252,7 @@ class _Goals:
         self._chain = chain
         self._ranges = []
         for joint, low, high in zip(joints.values(), ticks.low_ticks, ticks.high_ticks, strict=True):
-            found = round(chain.state(joint.id)["position"])  # one found outside its range comes in from there
+            found = round(chain.state(joint.id)["position"])  # a joint found outside its range moves in from there
             self._ranges.append((joint.id, min(low, found), max(high, found)))
         self.looks = self.outside = 0
 
@@ -257,28 +264,16 @@ class _Goals:
                 self.outside += not low <= state["goal"] <= high
 
 
-@contextmanager
-def _started(options: Mapping[str, Any], share: float | None, folder: Path) -> Iterator[Tree]:
-    """`observed_run` in a process; what it prints is in the folder's out and said."""
-    with (folder / "out").open("wb") as out, (folder / "said").open("wb") as said:
-        paths = os.pathsep.join(filter(None, sys.path))
-        with Tree(
-            ["-P", "-c", _CHILD, json.dumps(options)], share, stdin=subprocess.DEVNULL, stdout=out, stderr=said,
-            env={**os.environ, "PYTHONPATH": paths},
-        ) as tree:  # fmt: skip
-            yield tree
-
-
 def observed_run() -> None:
-    """In a process of its own: run what the first argument says, as JSON, and print report and arrivals of plans."""
+    """Run in the child: a session with the options of the first argument (JSON); print report and plan arrivals."""
     plans = _Plans()
-    options = RunOptions(listener=LISTENER, audio=DEFAULT_SPEAKER, duration_s=RUN_S, **json.loads(sys.argv[1]))
+    options = RunOptions(listener=LISTENER, audio=DEFAULT_SPEAKER, duration_s=_RUN_S, **json.loads(sys.argv[1]))
     report = run(options, observers=[plans])
     sys.stdout.write(json.dumps({"report": report, "plans_s": plans.came_s}) + "\n")
 
 
 class _Plans(Observer):
-    """When plans came, and the last of their frames."""
+    """An observer of when plans arrived, and of their last frames."""
 
     def __init__(self) -> None:
         self.came_s: list[tuple[float, float]] = []
@@ -289,3 +284,108 @@ class _Plans(Observer):
 
     def planned(self, plan: Plan) -> None:
         self.came_s.append((round(self._now_s, 3), round(float(plan.times_s[-1]), 3)))
+
+
+# --- processes that are held ----------------------------------------------------------------------------------------
+
+
+def check() -> None:
+    """Raise ConfigError if processes cannot be held here."""
+    if not Path("/proc/self/task").is_dir() or not hasattr(os, "sched_setaffinity"):
+        raise ConfigError("bench throttle: holding processes to a share of a core takes Linux (/proc, SIGSTOP)")
+    if len(os.sched_getaffinity(0)) < 2:
+        raise ConfigError("bench throttle: takes two cores, one for the run, one for this program and the servos")
+
+
+@contextmanager
+def _on_cores(cores: set[int]) -> Iterator[None]:
+    """Keep this thread, and everything it starts, on these cores while inside."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def processes_of(pid: int) -> list[int]:
+    """Return a process and all its running descendants."""
+    found, ahead = [], [pid]
+    while ahead:
+        one = ahead.pop()
+        found.append(one)
+        with suppress(OSError):
+            ahead += children_of(one)
+    return found
+
+
+class Tree:
+    """`sys.executable ARGUMENTS` and all its descendants, held from its first instruction on.
+
+    Args:
+        arguments: The command.
+        share: Share of a core; None: no limit.
+        popen: Options of `subprocess.Popen`.
+    """
+
+    def __init__(self, arguments: Sequence[str], share: float | None, **popen: Any) -> None:
+        if share is not None:
+            check()
+        cores = os.sched_getaffinity(0)
+        with _on_cores(cores if share is None else {min(cores)}):
+            self.process = subprocess.Popen([sys.executable, *arguments], **popen)
+        self._share = share
+        self._pids = [self.process.pid]
+        self._used_s: dict[int, float] = {}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._hold, args=(cores - {min(cores)},), daemon=True)
+        self._thread.start()
+
+    @property
+    def used_s(self) -> float:
+        """Return the processor time of all processes, as of the last look."""
+        return sum(self._used_s.values())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+        self._over.set()
+        self._thread.join()
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+    def _hold(self, cores: set[int]) -> None:
+        """Stop and continue the processes until the end; leave them running."""
+        if self._share is None:
+            while not self._over.wait(_PROCESSES_S):
+                self._look()
+            return
+        awake_s = self._share * _SLICE_S
+        with _on_cores(cores), realtime_priority():
+            begins_s = looked_s = time.monotonic()
+            try:
+                while not self._over.is_set() and self.process.poll() is None:
+                    self._send(signal.SIGCONT)
+                    time.sleep(awake_s)
+                    self._send(signal.SIGSTOP)
+                    now_s = time.monotonic()
+                    if now_s - looked_s >= _PROCESSES_S:
+                        looked_s = now_s
+                        self._look()
+                    begins_s = max(begins_s + _SLICE_S, now_s)
+                    time.sleep(max(0.0, begins_s - time.monotonic()))
+            finally:
+                self._send(signal.SIGCONT)
+
+    def _look(self) -> None:
+        self._pids = processes_of(self.process.pid)
+        for pid in self._pids:
+            with suppress(OSError):
+                self._used_s[pid] = processor_time_s(pid)
+
+    def _send(self, number: signal.Signals) -> None:
+        for pid in self._pids:
+            with suppress(OSError):
+                os.kill(pid, number)

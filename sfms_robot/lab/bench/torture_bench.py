@@ -1,15 +1,15 @@
-"""A live run to which everything happens, in real time: what it misses, what it says, and how it ends.
+"""`bench live --torture`: a live run with faults in real time: what it misses, what it reports, how it ends.
 
-At random, in turn:
+In random order:
 
     killed    the listener's process gets SIGKILL
-    stopped   it gets SIGSTOP, and nobody wakes it
-    cut       a source is gone for some seconds: the microphone is unplugged, and next time the phone silent
+    stopped   it gets SIGSTOP and no SIGCONT
+    cut       a source is gone for some seconds: in turn the microphone is unplugged and the phone falls silent
     unplugged a servo falls silent for some seconds
 
-After each the run has to be `degraded` for that reason within the time of docs/safety.md, and be well again before the
-next; no tick may be missed that an idle stretch would not miss; at the end the recording tells the same states, and
-every servo's torque is off.
+After each fault the run has to become `degraded` for that reason within the time of docs/safety.md, and recover before
+the next fault. It must not miss more ticks than a calm stretch does. At the end the recording must hold the same
+states, and the torque of every servo must be off.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -37,42 +36,43 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
-from sfms_robot.lab.bench import live_bench
 from sfms_robot.lab.bench.live_bench import (
     SINK,
     Audio,
     LivePerson,
     Say,
     check_audio,
-    children,
     free_port,
     idle_loop,
+    live,
     live_person,
+    load,
     patient_head,
 )
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, Told
+from sfms_robot.lab.bench.live_stamps import children_by_role
+from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, package_environment
 
-MINUTES: Final = 30.0
-EACH: Final = 20  # of a kind, in half an hour
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
 LONGEST_S: Final[Mapping[str, float]] = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
-LOOK_S: Final = 0.1  # between two looks at the status, all the time: a state may be seen so much later
+_MINUTES: Final = 30.0
+_EACH: Final = 20  # of a kind, in half an hour
+_LOOK_S: Final = 0.1  # between two looks at the status: a state may be seen that much late
 _TOLERANCE_S: Final = 0.3
 _AWAY_S: Final = 3.0  # of a source or a servo
 _START_S: Final = 60.0
-_AFTER_S: Final = 2.0  # ticks missed within this time after something happened count as its own
+_AFTER_S: Final = 2.0  # ticks missed within this time after a blow belong to it
 _END_S: Final = 30.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Blow:
-    """One thing that happened. Times in seconds; None: not within its slot.
+    """One fault. Times in seconds; None: not within its slot.
 
     Attributes:
-        why: by which name the run has to be degraded.
-        at_s: loop time.
-        degraded_s: until the run said so, with the right reason.
-        well_s: from then on, or from the moment that the source or servo was back, until that reason was gone.
+        why: The reason with which the run has to be degraded.
+        at_s: Loop time.
+        degraded_s: Until the run reported the right reason.
+        well_s: From then, or from the return of the source or servo, until that reason was gone.
     """
 
     kind: str
@@ -88,48 +88,66 @@ class Blow:
         return in_time and self.well_s is not None
 
 
-def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, Any]:
-    """Half an hour, or another time with as many blows as fit; Linux only. Blocks.
+def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool = False) -> BenchResult:
+    """Measure a live run, with faults if `torture`. 0 minutes: the usual length."""
+    if not torture:
+        return live(minutes, audio, say)
+    result = tortured(minutes or _MINUTES, audio, say)
+    missed = result["missed_ticks"]
+    lines = [
+        f"load {result['load']}, an empty loop has a jitter p99 of {result['idle']['jitter_ms']['p99']} ms",
+        f"{result['ticks']} ticks; missed within {_AFTER_S:g} s of a blow {missed['after_a_blow']}, otherwise "
+        f"{missed['otherwise']}; torque left on: {result['torque_left_on'] or 'none'}; the run ended: {result['exit']}",
+        "passed" if result["passed"] else "not passed",
+    ]
+    table = [{"what": kind, **row} for kind, row in result["counts"].items()]
+    return BenchResult(result, table, lines, result["passed"])
 
-    Raises ConfigError without PulseAudio, BusError when the run does not begin.
+
+def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, Any]:
+    """Run for `minutes` with faults in proportion to the time; Linux only. Blocks.
+
+    Raises ConfigError without PulseAudio, BusError if the run does not begin.
     """
     check_audio(audio)
     idle = idle_loop(3.0)
-    each = max(1, round(EACH * minutes / MINUTES))
-    order = [kind for kind in KINDS for _ in range(each)]
+    order = [kind for kind in KINDS for _ in range(max(1, round(_EACH * minutes / _MINUTES)))]
     random.Random(seed).shuffle(order)
-    config = load_head(HEAD)
+    head = load_head(HEAD)
     with TemporaryDirectory() as name, live_person(Path(name), audio) as person:
         folder = Path(name)
-        with launch(emulated(config)["main"], timing="wire") as chain:
-            with _running(folder, chain, person, audio) as command:
-                blows = _strike(_Victim(command, chain, config, person), order, minutes * 60, seed, say)
-                report = _ended(command)
+        with launch(emulated(head)["main"], timing="wire") as chain:
+            with _running(folder, chain, person, audio) as (process, port):
+                victim = _Victim(process=process, port=port, chain=chain, head=head, person=person)
+                blows = _strike(victim, order, minutes * 60, seed, say)
+                report = _ended(process, folder)
             torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
         result = _judged(blows, report, folder / "run", torque)
-    return {"minutes": minutes, "audio": audio, "idle": idle, "load": round(os.getloadavg()[0], 2), **result}
+    return {"minutes": minutes, "audio": audio, "idle": idle, "load": load(), **result}
 
 
+@dataclass(kw_only=True)
 class _Victim:
-    """The run, what it hangs on, and what it says."""
+    """The run, the devices that it uses, and its status."""
 
-    def __init__(self, command: _Command, chain: Chain, head: Head, person: LivePerson) -> None:
-        self.command, self.chain, self.head, self.person = command, chain, head, person
-        self._cuts = 0
+    process: subprocess.Popen[bytes]
+    port: int
+    chain: Chain
+    head: Head
+    person: LivePerson
+    cuts: int = 0
 
     def status(self) -> dict[str, Any]:
-        """Raises BusError when the run is over."""
+        """Return the status document. Raises BusError when the run is over."""
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.command.port}/", timeout=5) as answer:
-                document: dict[str, Any] = json.load(answer)
-                return document
+            return _status(self.port)
         except OSError as error:
-            raise BusError(f"bench live: the run tells no status any more: {error}") from error
+            raise BusError(f"bench live: the run answers no status request any more: {error}") from error
 
     def strike(self, kind: str, chance: random.Random) -> tuple[str, str, Callable[[], None] | None]:
-        """Do it: what was hit, how the run calls it, and what ends it; None: the run helps itself."""
+        """Cause a fault. Return the thing hit, the run's name for it, and a function that ends the fault, if needed."""
         if kind in ("killed", "stopped"):
-            (pid,) = [pid for role, pid in children(self.command.process.pid) if role == "listener"]
+            (pid,) = [pid for role, pid in children_by_role(self.process.pid) if role == "listener"]
             os.kill(pid, signal.SIGKILL if kind == "killed" else signal.SIGSTOP)
             return "listener", "listener", None
         if kind == "unplugged":
@@ -137,110 +155,109 @@ class _Victim:
             servo = self.head.joints[joint].id
             self.chain.kill(servo)
             return joint, joint, lambda: self.chain.revive(servo)
-        self._cuts += 1
-        if (server := self.person.server) is not None and self._cuts % 2:
+        self.cuts += 1
+        if (server := self.person.server) is not None and self.cuts % 2:
             server.unplug(SINK)
             return "microphone", "voice", lambda: server.plug(SINK)
         self.person.phone_silent.set()
         return "phone", "face", self.person.phone_silent.clear
 
-    def until(self, wanted: Callable[[dict[str, Any]], bool], limit_s: float) -> float | None:
-        """Seconds until the status is as wanted; None: not within the limit."""
+    def watch(self, limit_s: float, why: str = "", wanted: bool = True) -> float | None:
+        """Return after how many seconds the run is degraded by `why` (or, not `wanted`, is not); None after the limit.
+
+        Without `why` watch the status for `limit_s`.
+        """
         began_s = time.monotonic()
         while (taken_s := time.monotonic() - began_s) < limit_s:
-            if wanted(self.status()):
-                return taken_s
-            time.sleep(LOOK_S)
+            if (why in self.status()["why"]) == wanted:
+                return round(taken_s, 2)
+            time.sleep(_LOOK_S)
         return None
 
 
+def _status(port: int) -> dict[str, Any]:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as answer:
+        document: dict[str, Any] = json.load(answer)
+    return document
+
+
 def _strike(victim: _Victim, order: Sequence[str], duration_s: float, seed: int, say: Say) -> list[Blow]:
-    """Each in a slot of its own, at a random time in the first fifth of it."""
+    """Cause each fault in its slot of the time, at a random moment in the first fifth of the slot."""
     chance, slot_s = random.Random(seed), duration_s / len(order)
     blows = []
     for number, kind in enumerate(order):
         ends_s = time.monotonic() + slot_s
-        victim.until(_never, chance.uniform(0.0, slot_s / 5))
+        victim.watch(chance.uniform(0.0, slot_s / 5))
         at_s = victim.status()["time_s"]
         began_s = time.monotonic()
         what, why, end = victim.strike(kind, chance)
-        degraded_s = victim.until(partial(_degraded_by, why, True), slot_s / 2)
+        degraded_s = victim.watch(slot_s / 2, why)
         if end is not None:
-            victim.until(_never, began_s + _AWAY_S - time.monotonic())
+            victim.watch(began_s + _AWAY_S - time.monotonic())
             end()
-        well_s = victim.until(partial(_degraded_by, why, False), max(1.0, ends_s - time.monotonic()))
-        blow = Blow(kind, what, why, at_s, _rounded(degraded_s), _rounded(well_s))
-        blows.append(blow)
-        told = f"degraded after {blow.degraded_s} s, well after {blow.well_s} s"
-        say(f"{number + 1} of {len(order)}: {kind} {what}: {told}")
-        victim.until(_never, ends_s - time.monotonic())
+        well_s = victim.watch(max(1.0, ends_s - time.monotonic()), why, wanted=False)
+        blows.append(Blow(kind=kind, what=what, why=why, at_s=at_s, degraded_s=degraded_s, well_s=well_s))
+        say(f"{number + 1} of {len(order)}: {kind} {what}: degraded after {degraded_s} s, well after {well_s} s")
+        victim.watch(ends_s - time.monotonic())
     return blows
 
 
-def _never(_: Mapping[str, Any]) -> bool:
-    return False
-
-
-def _degraded_by(why: str, wanted: bool, status: Mapping[str, Any]) -> bool:
-    return (why in status["why"]) == wanted
-
-
 def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torque: Sequence[int]) -> dict[str, Any]:
-    recording = read_recording(folder)
-    missed = missed_ticks(recording.times_s, [blow.at_s for blow in blows])
-    near = {kind: missed_ticks(recording.times_s, [blow.at_s for blow in blows if blow.kind == kind]) for kind in KINDS}
-    states = states_of(folder)
-    recorded = sum(_recorded(blow, states) for blow in blows)
-    changes = [each["state"] for each in report["states"]["changes"]]
+    recording, states = read_recording(folder), states_of(folder)
+    by_kind = {kind: [blow for blow in blows if blow.kind == kind] for kind in KINDS}
+
+    def missed(of: Sequence[Blow]) -> dict[str, float]:
+        return missed_ticks(recording.times_s, [blow.at_s for blow in of])
+
+    def recorded(blow: Blow) -> bool:
+        until_s = blow.at_s + LONGEST_S[blow.kind] + _TOLERANCE_S
+        return any(
+            state == "degraded" and blow.at_s <= at_s <= until_s and blow.why in why for at_s, state, why in states
+        )
+
     counts = {
         kind: {
-            "done": len(of_kind := [blow for blow in blows if blow.kind == kind]),
-            "passed": sum(blow.passed for blow in of_kind),
-            "degraded_s": max((blow.degraded_s for blow in of_kind if blow.degraded_s is not None), default=None),
-            "well_s": max((blow.well_s for blow in of_kind if blow.well_s is not None), default=None),
-            "missed_ticks": near[kind]["after_a_blow"],
+            "done": len(found),
+            "passed": sum(blow.passed for blow in found),
+            "degraded_s": max((blow.degraded_s for blow in found if blow.degraded_s is not None), default=None),
+            "well_s": max((blow.well_s for blow in found if blow.well_s is not None), default=None),
+            "missed_ticks": missed(found)["after_a_blow"],
         }
-        for kind in KINDS
+        for kind, found in by_kind.items()
     }
+    every, seen = missed(blows), sum(map(recorded, blows))
     passed = (
         all(blow.passed for blow in blows)
-        and missed["after_a_blow"] <= missed["expected_after_a_blow"]
+        and every["after_a_blow"] <= every["expected_after_a_blow"]
         and not torque
         and recording.whole
         and report["exit"] == "interrupted"
-        and recorded == len(blows)
+        and seen == len(blows)
     )
     return {
         "passed": passed,
         "counts": counts,
-        "missed_ticks": missed,
+        "missed_ticks": every,
         "late_ticks": report["tick"]["late"],
         "jitter_ms": report["tick"]["jitter_ms"],
         "ticks": report["ticks"],
         "exit": report["exit"],
         "torque_left_on": list(torque),
-        "recording": {"whole": recording.whole, "ticks": len(recording.times_s), "blows": recorded},
-        "states": {"changes": len(changes), "seconds": report["states"]["seconds"]},
+        "recording": {"whole": recording.whole, "ticks": len(recording.times_s), "blows": seen},
+        "states": {"changes": len(report["states"]["changes"]), "seconds": report["states"]["seconds"]},
         "listener": report["listener_state"],
         "violations": report["limits"]["violations"],
         "blows": [asdict(blow) | {"passed": blow.passed} for blow in blows],
     }
 
 
-def _recorded(blow: Blow, states: Sequence[tuple[float, str, tuple[str, ...]]]) -> bool:
-    """Whether the recording holds that the run was degraded by it, in time."""
-    until_s = blow.at_s + LONGEST_S[blow.kind] + _TOLERANCE_S
-    return any(blow.at_s <= at_s <= until_s and blow.why in why for at_s, state, why in states if state == "degraded")
-
-
 def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
-    """Ticks that are not in the recording, near blows and elsewhere, and how many the rest would lead to expect there.
+    """Count ticks missing from the recording near blows and elsewhere, and how many chance explains near blows.
 
-    Expected is the mean of the rest and three standard deviations of a Poisson count.
+    Expected is the mean of the rest plus three standard deviations of a Poisson count.
     """
     gaps = np.diff(times_s)
-    period_s = float(np.median(gaps))
-    lost = np.round(gaps / period_s).astype(int) - 1
+    lost = np.round(gaps / float(np.median(gaps))).astype(int) - 1
     near = np.zeros(len(gaps), bool)
     for at_s in blows_s:
         near |= (times_s[1:] >= at_s) & (times_s[:-1] <= at_s + _AFTER_S)
@@ -252,95 +269,53 @@ def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
 # --- the run --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Command:
-    """`run`, its status port, and where it says something."""
-
-    process: subprocess.Popen[bytes]
-    port: int
-    said: Path
-
-
 @contextmanager
-def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> Iterator[_Command]:
-    port, said = free_port(), folder / "said"
+def _running(
+    folder: Path, chain: Chain, person: LivePerson, audio: Audio
+) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Start `run` and yield its process and status port once the listener listens."""
+    port = free_port()
     words = [
         "run", "--head", str(patient_head(folder, chain.read_deadline_s)), "--port", chain.device,
         "--listener", LISTENER, "--audio", audio,
         "--face", person.face, "--record", str(folder / "run"), "--status", str(port), "--json", "--yes",
     ]  # fmt: skip
-    paths = os.pathsep.join(filter(None, sys.path))
-    with ExitStack() as stack:
-        out = stack.enter_context((folder / "out").open("wb"))
-        err = stack.enter_context(said.open("wb"))
+    with (folder / "out").open("wb") as out, (folder / "said").open("wb") as err:
         process = subprocess.Popen(
             [sys.executable, *MAIN, *words], stdout=out, stderr=err, stdin=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths, **person.environment},
+            env={**package_environment(), **person.environment},
         )  # fmt: skip
-        command = _Command(process, port, said)
         try:
-            _wait_listening(command)
-            yield command
+            _wait_listening(process, port, folder / "said")
+            yield process, port
         finally:
             if process.poll() is None:
                 process.kill()
             process.wait()
 
 
-def _wait_listening(command: _Command) -> None:
-    """Block until the listener listens. Raises BusError when the run ends, or that takes too long."""
+def _wait_listening(process: subprocess.Popen[bytes], port: int, said: Path) -> None:
+    """Block until the listener listens. Raises BusError when the run ends or that takes too long."""
     ends_s = time.monotonic() + _START_S
-    while time.monotonic() < ends_s and command.process.poll() is None:
+    while time.monotonic() < ends_s and process.poll() is None:
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{command.port}/", timeout=5) as answer:
-                told = json.load(answer)
-            if told.get("listener_state", {}).get("state") == "listening" and told["state"] not in (
-                "starting",
-                "degraded",
-            ):
+            status = _status(port)
+        except OSError:  # the server is not up yet
+            status = {}
+        if status.get("listener_state", {}).get("state") == "listening":
+            if status["state"] not in ("starting", "degraded"):
                 return
-        except OSError:
-            pass  # not yet
-        time.sleep(LOOK_S)
-    lines = command.said.read_text(encoding="utf-8").strip().splitlines()
+        time.sleep(_LOOK_S)
+    lines = said.read_text(encoding="utf-8").strip().splitlines()
     raise BusError(f"bench live: the run did not begin to listen: {lines[-1:]}")
 
 
-def _ended(command: _Command) -> dict[str, Any]:
-    """Interrupt the run; its report. Blocks until it is over."""
-    command.process.send_signal(signal.SIGINT)
+def _ended(process: subprocess.Popen[bytes], folder: Path) -> dict[str, Any]:
+    """Interrupt the run and return its report. Blocks until it is over."""
+    process.send_signal(signal.SIGINT)
     try:
-        command.process.wait(_END_S)
+        process.wait(_END_S)
     except subprocess.TimeoutExpired as error:
         raise BusError(f"bench live: the run did not end within {_END_S:g} s of Ctrl-C") from error
-    report: dict[str, Any] = json.loads((command.said.parent / "out").read_text(encoding="utf-8").splitlines()[-1])
+    report: dict[str, Any] = json.loads((folder / "out").read_text(encoding="utf-8").splitlines()[-1])
     return report
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)
-
-
-def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool = False) -> Told:
-    """A live run, tortured or not, as `bench` tells it; 0 minutes: as many as it mostly takes."""
-    if torture:
-        blows = tortured(minutes or MINUTES, audio, say)
-        return Told(blows, table(blows), words(blows), blows["passed"])
-    result = live_bench.live(minutes or live_bench.MINUTES, audio, say)
-    return Told(result, live_bench.table(result), live_bench.words(result))
-
-
-def table(result: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A row per kind, for people."""
-    return [{"what": kind, **row} for kind, row in result["counts"].items()]
-
-
-def words(result: Mapping[str, Any]) -> Sequence[str]:
-    """What the table leaves out, a line each."""
-    missed = result["missed_ticks"]
-    return [
-        f"load {result['load']}, an empty loop has a jitter p99 of {result['idle']['jitter_ms']['p99']} ms",
-        f"{result['ticks']} ticks; missed within {_AFTER_S:g} s of a blow {missed['after_a_blow']}, otherwise "
-        f"{missed['otherwise']}; torque left on: {result['torque_left_on'] or 'none'}; the run ended: {result['exit']}",
-        "passed" if result["passed"] else "not passed",
-    ]

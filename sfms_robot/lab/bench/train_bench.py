@@ -1,9 +1,8 @@
 """`bench train`: a step of every stage of the trainings that fit this machine, beside plain matrix products.
 
-A step is the whole of it, as `train` makes it: data drawn, loss, gradients, clipping, optimizer. Its multiplications
-and additions in products are counted (`operation_count`), and the peer is so many of them in one product of square
-matrices after the other: what torch makes of this machine when nothing else is to be done. Frames are made up: what a
-step costs does not depend on what is in them.
+A step is the whole of it, as in `train`: drawing data, loss, gradients, clipping, optimizer. The peer is as many
+operations in products of square matrices, one after the other: the best that torch reaches on this machine. The frames
+are random, since the cost of a step does not depend on them.
 """
 
 from __future__ import annotations
@@ -25,18 +24,19 @@ from sfms_robot.lab.learning.job import Job
 from sfms_robot.lab.learning.process_group import ProcessGroup
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
 
-FILES: Final = ("sfms-small", "arig")
-STEPS: Final = 8
-LIMIT_S: Final = 8.0  # for the steps of one stage
-SIDE: Final = 768  # of the peer's matrices: they fit no cache of one core, and are large enough to be quick
+_FILES: Final = ("sfms-small", "arig")
+_STEPS: Final = 8
+_LIMIT_S: Final = 8.0  # for the steps of one stage
+_SIDE: Final = 768  # of the peer's matrices: they fit no cache of one core, and are large enough to be quick
 _PRODUCTS: Final = 20
 
 
 def measure(say: Callable[[str], None]) -> dict[str, Row]:
-    """A row a stage, a minute in all."""
-    product_s = _product_s()
+    """Return one row per stage; takes a minute."""
+    left, right = torch.rand(_SIDE, _SIDE), torch.rand(_SIDE, _SIDE)  # fp32, with the threads of a training
+    product_s = sorted(times(lambda: left @ right, _PRODUCTS))[_PRODUCTS // 2] * 1e-3
     rows = {}
-    for file in FILES:
+    for file in _FILES:
         settings = load_training(data_dir("configs") / "training" / f"{file}.yaml")
         for stage, job, _ in jobs_of(settings):
             name = f"train.{file}" if stage == "arig" else f"train.{file}.{stage}"
@@ -46,7 +46,7 @@ def measure(say: Callable[[str], None]) -> dict[str, Row]:
 
 
 def _steps(job: Job, product_s: float) -> Row:
-    """Durations of steps beside products of as many operations."""
+    """Measure steps of one stage beside products of as many operations."""
     generator = torch.Generator().manual_seed(job.seed)
     job.model.train()
     with TemporaryDirectory() as scratch:
@@ -55,19 +55,13 @@ def _steps(job: Job, product_s: float) -> Row:
             make_step(gradients, 0, generator)
         taken_ms: list[float] = []
         began_s = time.perf_counter()
-        while len(taken_ms) < STEPS and time.perf_counter() - began_s < LIMIT_S:
+        while len(taken_ms) < _STEPS and time.perf_counter() - began_s < _LIMIT_S:
             step_s = time.perf_counter()
             make_step(gradients, 1 + len(taken_ms), generator)
             taken_ms.append((time.perf_counter() - step_s) * 1e3)
-    products_ms = count.matrix / (2 * SIDE**3) * product_s * 1e3
+    products_ms = count.matrix / (2 * _SIDE**3) * product_s * 1e3
     found = row(taken_ms, [products_ms], "ms a step", f"{count.matrix / 1e9:.1f} GFLOP as plain products")
     return found | {
         "steps_per_s": round(1e3 / found["median"], 2),
         "frames_per_s": round(1e3 / found["median"] * job.frames_per_step),
     }
-
-
-def _product_s() -> float:
-    """One product of square matrices, in fp32, with the threads that a training has."""
-    left, right = torch.rand(SIDE, SIDE), torch.rand(SIDE, SIDE)
-    return sorted(times(lambda: left @ right, _PRODUCTS))[_PRODUCTS // 2] * 1e-3

@@ -1,14 +1,14 @@
-"""The page beside the servo loop: what three who look cost, and how soon a halt from the page is on the wire.
+"""`bench view`: the cost of three visitors of the page, and the delay of a halt from the page.
 
-    without    nobody looks, and the run tells its page nothing
-    with       it tells the page everything, and three plain WebSocket clients in a process of their own read all of it
+    without    no visitor, and the run sends its page no data
+    with       it sends the page everything, and three plain WebSocket clients in a separate process read all of it
 
-Windows of the default head's run on emulated servos, by turns and within one run: two runs that do the same work differ
-by several times what a page costs. What looking costs is the processor time of the page's process, of the loop's thread
-while it tells the page, and of the threads that send. Whole windows differ by chance more than by that; beside it
-stands what the run's process took in each window with clients, less the mean of its two neighbours. The listener, the
-servos and the clients have processes of their own and are not counted. A halt counts from the click, a message that
-leaves a fourth client, until the goals of the first braking tick are written.
+These are alternating windows within one run of the default head on emulated servos: two runs that do the same work
+differ by several times the cost of a page. The cost is the processor time of the page's process, of the loop's thread
+while it updates the page, and of the threads that send. Whole windows differ by chance more than by that; the figure
+`run_apart` is the time that the run's process took in each window with clients, less the mean of the two neighbours.
+The listener, the servos and the clients have separate processes, which are not counted. A halt counts from the click, a
+message of a fourth client, until the goals of the first braking tick are written.
 """
 
 from __future__ import annotations
@@ -33,95 +33,97 @@ from sfms_robot.app.session import Document, run
 from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.lab.bench.measure import HEAD, Told, machine, row
-from sfms_robot.lab.bench.procfs import processor_time_s
+from sfms_robot.lab.bench.measure import HEAD, BenchResult, machine, processor_time_s, row
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import Child, ParentPipe
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import THREAD, PageProcess
 
-SETTLE_S: Final = 4.0
-PAUSE_S: Final = 1.0  # after a turn: who comes gets a hello, who goes says good-bye
-WINDOW_S: Final = 4.0
-PAIRS: Final = 10
-HALTS: Final = 8
-CLIENTS: Final = 3
-MOST_CPU: Final = 3.0  # % of a core
-MOST_HALT_MS: Final = 100.0
-_BETWEEN_S: Final = 2.3  # a halt, and the head is led back into the face; no multiple of a tick
+_SETTLE_S: Final = 4.0
+_PAUSE_S: Final = 1.0  # after a change: clients connect or leave
+_WINDOW_S: Final = 4.0
+_PAIRS: Final = 10
+_HALTS: Final = 8
+_CLIENTS: Final = 3
+_MOST_CPU: Final = 3.0  # % of a core
+_MOST_HALT_MS: Final = 100.0
+_BETWEEN_S: Final = 2.3  # a halt and the way back to the face; not a multiple of a tick
 _LIMIT_S: Final = 60.0
 _CLOSE_S: Final = 5.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Window:
-    """`WINDOW_S` of a run: processor time [% of a core] of its process, of what it does for the page, and of the page's
-    process, and ticks that came late."""
+    """`_WINDOW_S` of a run: processor time in % of a core, and late ticks.
 
-    looked_at: bool
+    Attributes:
+        run_share: Of the run's process.
+        telling_share: The part of it that serves the page.
+        page_share: Of the page's process.
+    """
+
     run_share: float
     telling_share: float
     page_share: float
     late: int
 
 
-def measure(say: Callable[[str], None]) -> Told:
-    """Both runs, two and a half minutes. Linux only. Raises ConfigError elsewhere, BusError when a run ends early."""
+def measure(say: Callable[[str], None]) -> BenchResult:
+    """Measure both runs; takes two and a half minutes. Linux only.
+
+    Raises ConfigError elsewhere, BusError when a run ends early.
+    """
     if not Path("/proc/self/stat").is_file():
         raise ConfigError("bench view: processor time of the page's process is read from /proc (Linux)")
-    say(f"{PAIRS} times {PAUSE_S + WINDOW_S:g} s with {CLIENTS} clients, and without a page before and after")
+    say(f"{_PAIRS} times {_PAUSE_S + _WINDOW_S:g} s with {_CLIENTS} clients, and without a page before and after")
     windows = _windows()
-    say(f"{HALTS} halts")
+    say(f"{_HALTS} halts")
     figures = cost_figures(windows) | {
-        "view.halt": row(_halts(), [MOST_HALT_MS], "ms", "what there is time for"),
+        "view.halt": row(_halts(), [_MOST_HALT_MS], "ms", "what there is time for"),
         "machine": machine(),
     }
     cost, apart, late = figures["cost"], figures["run_apart"], figures["late_ticks"]
-    rows = Told.of_rows({name: figures[name] for name in ("view.cpu", "view.halt")}).table
+    rows = BenchResult.of_rows({name: figures[name] for name in ("view.cpu", "view.halt")}).table
     lines = [
-        f"{CLIENTS} clients: {cost['share']:.2f} % of a core: the page's process {cost['page_share']:.2f}, telling it "
+        f"{_CLIENTS} clients: {cost['share']:.2f} % of a core: the page's process {cost['page_share']:.2f}, telling it "
         f"{cost['telling_share']:.2f}",
         f"the run's process beside that without a page: {apart['median']:+.2f} (half of the windows "
         f"{apart['quartiles'][0]:+.2f} to {apart['quartiles'][1]:+.2f})",
         f"late ticks: {late['with']}, without a page {late['without']}",
     ]
-    return Told(figures, rows, lines)
+    return BenchResult(figures, rows, lines)
 
 
 def cost_figures(windows: Sequence[Window]) -> dict[str, Any]:
-    """What looking costs. `windows` are without and with clients by turns; the first and the last are without."""
-    before, looked, after = windows[:-2:2], windows[1::2], windows[2::2]
-    apart = [
-        one.run_share - (left.run_share + right.run_share) / 2
-        for left, one, right in zip(before, looked, after, strict=True)
-    ]
-    page, telling = (
-        float(np.mean(shares)) for shares in zip(*[(w.page_share, w.telling_share) for w in looked], strict=True)
-    )
+    """Return the figures of alternating windows without and with clients; the first and the last are without."""
+    looked, without = windows[1::2], windows[::2]
+    neighbours = np.array([one.run_share for one in without])
+    apart = np.array([one.run_share for one in looked]) - (neighbours[:-1] + neighbours[1:]) / 2
+    page, telling = (float(np.mean([getattr(one, name) for one in looked])) for name in ("page_share", "telling_share"))
     whole = [one.run_share + one.page_share for one in looked]
     return {
-        "view.cpu": row(whole, [one.run_share for one in windows[::2]], "% of a core", "the same run without a page"),
+        "view.cpu": row(whole, neighbours.tolist(), "% of a core", "the same run without a page"),
         "cost": {
             "share": round(page + telling, 3), "page_share": round(page, 3), "telling_share": round(telling, 3),
-            "unit": "% of a core", "clients": CLIENTS, "wanted": MOST_CPU,
+            "unit": "% of a core", "clients": _CLIENTS, "wanted": _MOST_CPU,
         },
         "run_apart": {
             "median": round(float(np.median(apart)), 3),
             "quartiles": [round(float(each), 3) for each in np.percentile(apart, [25, 75])], "unit": "% of a core",
         },
         "late_ticks": {
-            "without": sum(one.late for one in windows[2::2]),  # as many windows as with
+            "without": sum(one.late for one in without[1:]),  # as many windows as with
             "with": sum(one.late for one in looked),
         },
     }  # fmt: skip
 
 
 class _Turns(Observer):
-    """Tells an observer what happens while `on`.
+    """Forwards the run to another observer while `on`.
 
     Attributes:
-        settled: set once the run is under way.
-        spent_s: processor time of the loop's thread in `inner`.
+        settled: Set once the run is under way.
+        spent_s: Processor time of the loop's thread in the inner observer.
     """
 
     def __init__(self, inner: Observer) -> None:
@@ -129,28 +131,28 @@ class _Turns(Observer):
         self._inner = inner
 
     def tick(self, seen: Tick) -> None:
-        if seen.time_s >= SETTLE_S:
+        if seen.time_s >= _SETTLE_S:
             self.settled.set()
-        self._tell(self._inner.tick, seen)
+        self._forward(self._inner.tick, seen)
 
     def heard(self, frame: SpeakerFrame) -> None:
-        self._tell(self._inner.heard, frame)
+        self._forward(self._inner.heard, frame)
 
     def planned(self, plan: Plan) -> None:
-        self._tell(self._inner.planned, plan)
+        self._forward(self._inner.planned, plan)
 
-    def _tell(self, hear: Callable[[Any], None], what: object) -> None:
+    def _forward(self, method: Callable[[Any], None], what: object) -> None:
         if self.on:
             began_s = time.thread_time()
-            hear(what)
+            method(what)
             self.spent_s += time.thread_time() - began_s
 
 
 class _Halted(Observer):
-    """Says when the run was under way, and when the first braking goals were written.
+    """Notes when the run is under way and when the first braking goals were written.
 
     Attributes:
-        halted: set at the first tick that brakes, which was at `halted_s` of `time.monotonic`.
+        halted: Set at the first tick that brakes, at `halted_s` of `time.monotonic`.
     """
 
     def __init__(self) -> None:
@@ -164,12 +166,12 @@ class _Halted(Observer):
             if seen.state == "halted":
                 self.halted_s = time.monotonic()
                 self.halted.set()
-        if seen.time_s >= SETTLE_S:
+        if seen.time_s >= _SETTLE_S:
             self.settled.set()
 
 
 def _windows() -> list[Window]:
-    """One run, without and with clients by turns."""
+    """Run once, and return its windows without and with clients in turn."""
     found: list[Window] = []
     page = begin_page("0")
     assert page is not None
@@ -182,32 +184,39 @@ def _windows() -> list[Window]:
         @contextmanager
         def sampled(document: Document, *_: object) -> Iterator[None]:
             watcher.document = document
-            by_turns = threading.Thread(target=_sample, args=(document, turns, page, look, found), daemon=True)
-            by_turns.start()
+            threading.Thread(target=_sample, args=(document, turns, page, look, found), daemon=True).start()
             yield
 
-        duration_s = SETTLE_S + (2 * PAIRS + 1) * (PAUSE_S + WINDOW_S) + PAUSE_S
-        _finished(run(_options(duration_s), sampled, observers=[turns]))
-    if len(found) < 2 * PAIRS + 1:
-        raise BusError(f"the run ended after {len(found)} of {2 * PAIRS + 1} windows")
+        duration_s = _SETTLE_S + (2 * _PAIRS + 1) * (_PAUSE_S + _WINDOW_S) + _PAUSE_S
+        _check_finished(run(_options(duration_s), sampled, observers=[turns]))
+    if len(found) < 2 * _PAIRS + 1:
+        raise BusError(f"bench view: the run ended after {len(found)} of {2 * _PAIRS + 1} windows")
     return found
 
 
 def _sample(
     document: Document, turns: _Turns, page: PageProcess, look: Callable[[str | None], None], found: list[Window]
 ) -> None:
-    """The windows of a run, in a thread of their own."""
+    """Measure the windows of a run, in a separate thread."""
+
+    def used() -> tuple[float, float, float]:
+        """Return the processor time of this process, of its part for the page, and of the page's process."""
+        senders = [each.native_id for each in threading.enumerate() if each.name == THREAD]
+        sending_s = sum(processor_time_s(os.getpid(), thread) for thread in senders)
+        return time.process_time(), turns.spent_s + sending_s, processor_time_s(page.process_id)
+
     if not turns.settled.wait(_LIMIT_S):
         return
-    for number in range(2 * PAIRS + 1):
+    for number in range(2 * _PAIRS + 1):
         turns.on = number % 2 == 1
         look(page.url if turns.on else None)
-        time.sleep(PAUSE_S)
-        late, began_s, before_s = _late(document), time.monotonic(), _spent_s(turns, page)
-        time.sleep(WINDOW_S)
+        time.sleep(_PAUSE_S)
+        late, began_s, before_s = document()["tick"]["late"], time.monotonic(), used()
+        time.sleep(_WINDOW_S)
         share = 100 / (time.monotonic() - began_s)
-        run_s, telling_s, page_s = (now - before for now, before in zip(_spent_s(turns, page), before_s, strict=True))
-        found.append(Window(turns.on, share * run_s, share * telling_s, share * page_s, _late(document) - late))
+        run_s, telling_s, page_s = (share * (now - before) for now, before in zip(used(), before_s, strict=True))
+        late = document()["tick"]["late"] - late
+        found.append(Window(run_share=run_s, telling_share=telling_s, page_share=page_s, late=late))
     look(None)
 
 
@@ -215,9 +224,14 @@ def _options(duration_s: float) -> RunOptions:
     return RunOptions(head=HEAD, audio=DEFAULT_SPEAKER, duration_s=duration_s)
 
 
+def _check_finished(report: dict[str, Any]) -> None:
+    if report["exit"] != "done":
+        raise BusError(f"bench view: the run ended early: {report['exit']} {report['error'] or ''}")
+
+
 def _halts() -> list[float]:
-    """How long each halt took [ms], of a run with a page that others look at too."""
-    options = _options(SETTLE_S + (HALTS + 1) * _BETWEEN_S + 1)
+    """Return the duration of each halt [ms], in a run whose page has other visitors too."""
+    options = _options(_SETTLE_S + (_HALTS + 1) * _BETWEEN_S + 1)
     page = begin_page("0")
     assert page is not None
     clicks_ms: list[float] = []
@@ -226,19 +240,18 @@ def _halts() -> list[float]:
         watch = _Halted()
         clicker = threading.Thread(target=_click, args=(page.url, watch, clicks_ms), daemon=True)
         clicker.start()
-        _finished(pages.run(observers=[watch]))
+        _check_finished(pages.run(observers=[watch]))
         clicker.join(_LIMIT_S)
     return clicks_ms
 
 
 def _click(url: str, watch: _Halted, clicks_ms: list[float]) -> None:
-    """Halt again and again."""
+    """Halt and resume the run `_HALTS` times."""
     if not watch.settled.wait(_LIMIT_S):
         return
     with suppress(WebSocketException), _visitor(url) as visitor:
-        reader = threading.Thread(target=_read_all, args=(visitor,), daemon=True)
-        reader.start()
-        for _ in range(HALTS):
+        threading.Thread(target=_read_all, args=(visitor,), daemon=True).start()
+        for _ in range(_HALTS):
             watch.halted.clear()
             clicked_s = time.monotonic()
             visitor.send('{"type": "halt"}')
@@ -249,23 +262,7 @@ def _click(url: str, watch: _Halted, clicks_ms: list[float]) -> None:
             time.sleep(_BETWEEN_S)
 
 
-def _finished(report: dict[str, Any]) -> dict[str, Any]:
-    if report["exit"] != "done":
-        raise BusError(f"the run ended by itself: {report['exit']} {report['error'] or ''}")
-    return report
-
-
-def _spent_s(turns: _Turns, page: PageProcess) -> tuple[float, float, float]:
-    """Processor time so far: of this process, of what it does for the page, and of the page's process."""
-    senders = [each.native_id for each in threading.enumerate() if each.name.startswith(THREAD)]
-    sending_s = sum(processor_time_s(os.getpid(), thread) for thread in senders)
-    return time.process_time(), turns.spent_s + sending_s, processor_time_s(page.process_id)
-
-
-def _late(document: Document) -> int:
-    """Ticks that came late so far."""
-    late: int = document()["tick"]["late"]
-    return late
+# --- clients --------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -295,6 +292,6 @@ def clients() -> None:
         url = parent.receive()
         for visitor in visitors:
             visitor.close()
-        visitors = [] if url is None else [_visitor(url) for _ in range(CLIENTS)]
+        visitors = [] if url is None else [_visitor(url) for _ in range(_CLIENTS)]
         for visitor in visitors:
             threading.Thread(target=_read_all, args=(visitor,), daemon=True).start()

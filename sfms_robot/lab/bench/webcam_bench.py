@@ -1,39 +1,41 @@
-"""What `--face webcam` makes of a face that is known: the virtual human's, drawn as a camera sees it.
+"""`bench webcam`: the output of `--face webcam` for a known face, the virtual human's, drawn as a camera sees it.
 
-Every channel goes up and down by itself, with the head straight ahead and turned aside, on pictures with a
-camera's noise. Of what comes back, less what comes at rest: does it follow (correlation), how far (slope), what else
-moves with it, and how it trembles while nothing moves (standard deviation). Both eyes look together, as people's do.
-The drawn face is one face, plain-skinned; people differ from it, and from one another.
+Every channel moves up and down separately, with the head straight ahead and turned aside, on pictures with the noise of
+a camera. The bench reports, relative to rest: how well the channel follows (correlation), how far (slope), which other
+channel moves with it, and the tremble at rest (standard deviation). Both eyes look together, as people's do. The drawn
+face is one plain-skinned face; people differ from it, and from one another.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.stats import linregress
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.drawing import PLACE_M, SIZE_PX, VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
-from sfms_robot.lab.bench.measure import Told, times
+from sfms_robot.lab.bench.measure import BenchResult, Row, percentiles, times
 from sfms_robot.sources.webcam import Landmarker, Picture, SeenFace, open_webcam
 
-SEEN_CORRELATION: Final = 0.8  # a channel that follows this well, and this far, counts as seen
+SEEN_CORRELATION: Final = 0.8  # a channel counts as seen if it follows this well, and this far
 SEEN_SLOPE: Final = 0.1
-PICTURE_HZ: Final = 30
-_SHAPE_LEVELS: Final = (1 / 3, 2 / 3, 1.0)
+_PICTURE_HZ: Final = 30
+_SHAPE_LEVELS: Final = (0.0, 1 / 3, 2 / 3, 1.0)
 _TURN_LEVELS_RAD: Final = (-0.35, -0.2, -0.1, 0.1, 0.2, 0.35)
 _MOVE_LEVELS_M: Final = (-0.1, -0.05, 0.05, 0.1)
+_MOVES: Final = {"x": (-1, 0, 0), "y": (0, -1, 0), "z": (0, 0, 1)}  # x towards the camera, y to their own left, z up
 _YAWS_RAD: Final = (0.0, 0.15)
 _TREMBLE_PICTURES: Final = 20
 _NOISE: Final = 4.0  # of 255, 1 sigma
 _NOISES: Final = 8  # different ones
-_SETTLE: Final = 2  # pictures of one face: MediaPipe follows its landmarks from picture to picture
+_SETTLE: Final = 2  # pictures of one face: MediaPipe tracks its landmarks from picture to picture
 _TIMED: Final = 100
 _VIDEO_S: Final = 4.0
 _EYES: Final = {
@@ -43,11 +45,9 @@ _EYES: Final = {
     "eyeLookDownLeft": "eyeLookDownRight", "eyeLookDownRight": "eyeLookDownLeft",
 }  # fmt: skip
 
-Row = dict[str, Any]
 
-
-class _Trial:
-    """Shows faces and tells what is seen of them: (58,) motion, then place (3,)."""
+class _Sight:
+    """Draws faces and returns what MediaPipe sees of them: motion (58,), then place (3,)."""
 
     def __init__(self) -> None:
         self._camera, self._landmarker = VirtualWebcam(), Landmarker()
@@ -59,12 +59,12 @@ class _Trial:
         return self._camera.picture(motion, place_m)
 
     def seen(self, drawn: Picture) -> Doubles:
-        """Raises ConfigError where MediaPipe finds no face, since then nothing can be measured."""
+        """Return (61,). Raises ConfigError if MediaPipe finds no face: the bench can then measure nothing."""
         faces: list[SeenFace] = []
         for _ in range(_SETTLE):
             self._looked += 1
             noisy = np.clip(drawn + self._noises[self._looked % _NOISES], 0, 255).astype(np.uint8)
-            faces = self._landmarker.faces(noisy, self._looked / PICTURE_HZ)
+            faces = self._landmarker.faces(noisy, self._looked / _PICTURE_HZ)
         if not faces:
             raise ConfigError("bench webcam: MediaPipe sees no face in a picture of the virtual human")
         return np.concatenate([faces[0].motion, faces[0].place_m]).astype(np.float64)
@@ -73,78 +73,71 @@ class _Trial:
         self._landmarker.close()
 
 
+def measure() -> BenchResult:
+    """Measure every channel; takes about two minutes of an idle core."""
+    result = webcam()
+    table = []
+    for name, found in result["channels"].items():
+        beside = f"{found['with']} {found['with_change']:+.2f}" if abs(found["with_change"]) >= SEEN_SLOPE else "-"
+        figures = {key: round(found[key], 3) for key in ("correlation", "slope", "tremble")}
+        table.append({"channel": name, **figures, "moves also": beside, "seen": "yes" if found["seen"] else "no"})
+    lines = [f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})" for name, ms in result["timings_ms"].items()]
+    return BenchResult(result, table, lines)
+
+
+def webcam(names: Sequence[str] = CHANNELS) -> dict[str, Any]:
+    """Return `channels`, `place` and `timings_ms`.
+
+    A channel has correlation, slope, tremble, whether it counts as seen, and the other blendshape that moves most with
+    it, with its change at the largest level; an axis of `place` has correlation and slope. Raises MissingExtra without
+    the extras `pictures` and `webcam`.
+    """
+    with closing(_Sight()) as sight:
+        channels, place = _followed(sight, names)
+    return {"channels": channels, "place": place, "timings_ms": _timings()}
+
+
 def face_of(**channels: float) -> Floats:
-    """Motion (58,) with these channels; all others are 0."""
+    """Return motion (58,) with these channels; all others are 0."""
     motion = np.zeros(MOTION_DIM, dtype=np.float32)
     for name, value in channels.items():
         motion[CHANNEL_INDEX[name]] = value
     return motion
 
 
-def webcam(names: Sequence[str] = CHANNELS) -> dict[str, Any]:
-    """`channels`, `place` and `timings_ms`. Takes about two minutes of an idle core.
-
-    A channel has correlation, slope, tremble, whether it is seen, and with which other blendshape it moves most and how
-    far at its largest; an axis of `place` correlation and slope. Raises MissingExtra without the extras `pictures` and
-    `webcam`.
-    """
-    with closing(_Trial()) as trial:
-        channels, place = _followed(trial, names)
-    return {"channels": channels, "place": place, "timings_ms": _timings()}
-
-
-def _followed(trial: _Trial, names: Sequence[str]) -> tuple[dict[str, Row], dict[str, Row]]:
-    ahead = trial.draw(face_of())
-    still = np.array([trial.seen(ahead) for _ in range(_TREMBLE_PICTURES)])
+def _followed(sight: _Sight, names: Sequence[str]) -> tuple[dict[str, Row], dict[str, Row]]:
+    ahead = sight.draw(face_of())
+    still = np.array([sight.seen(ahead) for _ in range(_TREMBLE_PICTURES)])
     rest, tremble = still.mean(axis=0), still.std(axis=0)
-    moves = _moves(trial, rest) if set(names) & {"x", "y", "z"} else {}
-    rests = {yaw: trial.draw(face_of(yaw=yaw)) for yaw in _YAWS_RAD}
+    rests = {yaw: sight.draw(face_of(yaw=yaw)) for yaw in _YAWS_RAD}
     channels: dict[str, Row] = {}
+    place: dict[str, Row] = {}
     for name in names:
         if name in BLENDSHAPES:
-            asked, came = _shape(trial, name, rests)
-        elif name in moves:
-            asked, came = moves[name]
+            asked, came = _shape(sight, name, rests)
+        elif name in _MOVES:
+            asked = np.array(_MOVE_LEVELS_M)
+            spots = np.array(PLACE_M) + np.multiply.outer(asked, _MOVES[name])
+            came = np.array([sight.seen(sight.draw(face_of(), (spot[0], spot[1], spot[2]))) - rest for spot in spots])
+            axis = "xyz".index(name)  # x and y of `place_m` run against the person's
+            place[name] = _fit(asked if name == "z" else -asked, came[:, MOTION_DIM + axis])
         else:
-            asked, came = _turn(trial, name, rest)
+            asked = np.array(_TURN_LEVELS_RAD)
+            came = np.array([sight.seen(sight.draw(face_of(**{name: level}))) - rest for level in _TURN_LEVELS_RAD])
         channels[name] = _row(name, asked, came, tremble)
-    place = {axis: _fit(*_placed(moves[axis], index)) for index, axis in enumerate("xyz") if axis in moves}
     return channels, place
 
 
-def _shape(trial: _Trial, name: str, rests: Mapping[float, Picture]) -> tuple[Doubles, Doubles]:
-    """A blendshape at several levels and yaws: what was asked (N,), what came beyond rest (N, 61)."""
-    asked, came = [], []
+def _shape(sight: _Sight, name: str, rests: Mapping[float, Picture]) -> tuple[Doubles, Doubles]:
+    """Return the levels (N,) of a blendshape, at several yaws, and what was seen beyond rest (N, 61)."""
     together = [name, _EYES[name]] if name in _EYES else [name]
+    came = []
     for yaw, drawn in rests.items():
-        rest = trial.seen(drawn)
-        asked.append(0.0)
-        came.append(trial.seen(drawn) - rest)
-        for level in _SHAPE_LEVELS:
-            asked.append(level)
-            came.append(trial.seen(trial.draw(face_of(yaw=yaw, **dict.fromkeys(together, level)))) - rest)
-    return np.array(asked), np.array(came)
-
-
-def _turn(trial: _Trial, name: str, rest: Doubles) -> tuple[Doubles, Doubles]:
-    came = [trial.seen(trial.draw(face_of(**{name: level}))) - rest for level in _TURN_LEVELS_RAD]
-    return np.array(_TURN_LEVELS_RAD), np.array(came)
-
-
-def _moves(trial: _Trial, rest: Doubles) -> dict[str, tuple[Doubles, Doubles]]:
-    """The person moves along an axis of theirs: x towards the camera, y to their own left, z up."""
-    out = {}
-    for axis, step in (("x", (-1, 0, 0)), ("y", (0, -1, 0)), ("z", (0, 0, 1))):
-        places = [tuple(at + level * by for at, by in zip(PLACE_M, step, strict=True)) for level in _MOVE_LEVELS_M]
-        came = [trial.seen(trial.draw(face_of(), (place[0], place[1], place[2]))) - rest for place in places]
-        out[axis] = np.array(_MOVE_LEVELS_M), np.array(came)
-    return out
-
-
-def _placed(move: tuple[Doubles, Doubles], index: int) -> tuple[Doubles, Doubles]:
-    """Asked and come of one axis of `place_m`, whose x and y run against the person's."""
-    asked, came = move
-    return asked * (-1 if index < 2 else 1), came[:, MOTION_DIM + index]
+        rest = sight.seen(drawn)
+        came.append(sight.seen(drawn) - rest)
+        for level in _SHAPE_LEVELS[1:]:
+            came.append(sight.seen(sight.draw(face_of(yaw=yaw, **dict.fromkeys(together, level)))) - rest)
+    return np.tile(_SHAPE_LEVELS, len(rests)), np.array(came)
 
 
 def _row(name: str, asked: Doubles, came: Doubles, tremble: Doubles) -> Row:
@@ -160,48 +153,36 @@ def _row(name: str, asked: Doubles, came: Doubles, tremble: Doubles) -> Row:
 
 
 def _fit(asked: Doubles, came: Doubles) -> Row:
-    """Correlation, 0 where nothing came at all, and slope of the line through both means."""
-    centred, follows = asked - asked.mean(), came - came.mean()
-    spread = float(np.sqrt((centred @ centred) * (follows @ follows)))
-    along = float(centred @ follows)
-    return {"correlation": along / spread if spread else 0.0, "slope": along / float(centred @ centred)}
+    """Return correlation and slope; 0 for both if nothing came at all."""
+    if not np.ptp(came):
+        return {"correlation": 0.0, "slope": 0.0}
+    line = linregress(asked, came)
+    return {"correlation": float(line.rvalue), "slope": float(line.slope)}
 
 
-# --- time ---------------------------------------------------------------------------------------------------------
+# --- time -----------------------------------------------------------------------------------------------------------
 
 
 def _timings() -> dict[str, Any]:
-    """Per picture with one and with three faces looked for; and picture -> sighting of a video in its own process."""
-    pictures = list(_nodding())
-    stream = iter(range(1_000_000))
+    """Measure a picture with one and with three faces looked for, and from picture to sighting in a child process."""
+    camera = VirtualWebcam()  # a person who nods once a second
+    once = [camera.picture(face_of(pitch=0.1 * float(np.sin(2 * np.pi * k / _PICTURE_HZ)))) for k in range(_PICTURE_HZ)]
+    pictures = [once[k % _PICTURE_HZ] for k in range(round(_VIDEO_S * _PICTURE_HZ))]
+    numbers = iter(range(1_000_000))
     out: dict[str, Any] = {}
     for most_faces in (1, 3):
-        landmarker = Landmarker(most_faces)
-        ms = times(_look(landmarker, pictures, stream), _TIMED)
-        out[f"landmarks_of_{most_faces}"] = {"p50": float(np.median(ms)), "p99": float(np.percentile(ms, 99))}
-        landmarker.close()
-    out["picture_to_sighting"] = _latency(pictures)
-    return out
+        with closing(Landmarker(most_faces)) as landmarker:
+
+            def look(landmarker: Landmarker = landmarker) -> object:
+                number = next(numbers)
+                return landmarker.faces(pictures[number % len(pictures)], number / _PICTURE_HZ)
+
+            out[f"landmarks_of_{most_faces}"] = percentiles(times(look, _TIMED))
+    return out | {"picture_to_sighting": _latency(pictures)}
 
 
-def _nodding(hz: int = PICTURE_HZ, seconds: float = _VIDEO_S) -> Iterator[Picture]:
-    """A person who nods once a second."""
-    camera = VirtualWebcam()
-    once = [camera.picture(face_of(pitch=0.1 * float(np.sin(2 * np.pi * k / hz)))) for k in range(hz)]
-    for k in range(round(seconds * hz)):
-        yield once[k % hz]
-
-
-def _look(landmarker: Landmarker, pictures: Sequence[Picture], stream: Iterator[int]) -> Callable[[], object]:
-    def look() -> object:
-        number = next(stream)
-        return landmarker.faces(pictures[number % len(pictures)], number / PICTURE_HZ)
-
-    return look
-
-
-def write_video(file: Path, pictures: Sequence[Picture], hz: int = PICTURE_HZ) -> None:
-    """Motion JPEG of pictures (H, W, 3), red, green, blue."""
+def write_video(file: Path, pictures: Sequence[Picture], hz: int = _PICTURE_HZ) -> None:
+    """Write Motion JPEG of pictures (H, W, 3), red, green, blue."""
     import cv2
 
     high, wide = pictures[0].shape[:2]
@@ -215,31 +196,11 @@ def _latency(pictures: Sequence[Picture]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "nods.avi"
         write_video(file, pictures)
-        webcam = open_webcam(str(file))
-        try:
+        with closing(open_webcam(str(file))) as webcam:
             origin_s = time.monotonic()
             webcam.start(origin_s)
             while webcam.statistics()["state"] != "finished":
                 webcam.at(time.monotonic() - origin_s)
                 time.sleep(0.01)
-            out: dict[str, Any] = webcam.statistics()["latency_ms"]
-            return out
-        finally:
-            webcam.close()
-
-
-def measure() -> Told:
-    """`webcam`, as `bench` tells it."""
-    result = webcam()
-    times = [f"{name}: {ms['p50']:.1f} ms (p99 {ms['p99']:.1f})" for name, ms in result["timings_ms"].items()]
-    return Told(result, table(result), times)
-
-
-def table(result: Mapping[str, Any]) -> list[Row]:
-    """A row per channel, for people."""
-    rows = []
-    for name, row in result["channels"].items():
-        beside = f"{row['with']} {row['with_change']:+.2f}" if abs(row["with_change"]) >= SEEN_SLOPE else "-"
-        figures = {key: round(row[key], 3) for key in ("correlation", "slope", "tremble")}
-        rows.append({"channel": name, **figures, "moves also": beside, "seen": "yes" if row["seen"] else "no"})
-    return rows
+            found: dict[str, Any] = webcam.statistics()["latency_ms"]
+            return found

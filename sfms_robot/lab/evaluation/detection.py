@@ -1,7 +1,7 @@
-"""How well events are seen in motion: what a detector makes of events that are known to be there.
+"""Quality of the detectors of events in motion, measured on known events.
 
-People's nods are annotated, a listener's are found in its motion: before the two are laid side by side the finder is
-tried on motion composed from known nods. The same count tells whether a listener does what it has decided to do.
+People's nods are annotated, a listener's are found in its motion: before the two are compared the finder is tried on
+motion composed from known nods. The same count shows whether a listener performs what it has decided.
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions, head_part
 from sfms_robot.signals.motion_primitives import Motions
 
-IN_TIME_S: Final = 0.12
-LOOSE_S: Final = 0.5  # further apart is no pair at all
-SHOWS_AS: Final[Mapping[str, tuple[str, ...]]] = {"smile": ("laugh",)}  # what else is seen so, and is not counted
-EDGE_S: Final = 1.0  # what begins this close to the end of a motion may not be over
-SIZES: Final[Mapping[str, tuple[float, ...]]] = {
+_IN_TIME_S: Final = 0.12
+_LOOSE_S: Final = 0.5  # further apart is not a pair
+_SHOWS_AS: Final[Mapping[str, tuple[str, ...]]] = {"smile": ("laugh",)}  # what else looks like one, and is not counted
+_EDGE_S: Final = 1.0  # an event that begins this close to the end of a motion may not be over
+_SIZES: Final[Mapping[str, tuple[float, ...]]] = {  # edges of the ranges of sizes
     "nod": tuple(np.deg2rad([0, 2, 3, 4, 6, 9, 180])),
     "blink": (0.0, 0.5, 0.75, 1.01),
     "smile": (0.0, 0.2, 0.3, 0.45, 0.6, 1.01),
 }
-EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])  # an eye's yaw and pitch for a channel of 1
+_EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])  # an eye's yaw and pitch for a channel of 1
 _EYES: Final = list(EYE_CHANNELS)
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Events of one kind that were asked for, beside what a detector saw; those of several motions may be added.
+    """Requested events of one kind, beside the events that a detector saw; those of several motions can be added.
 
     Attributes:
-        sizes: (K,) of those asked for; in_time: (K,) seen within 0.12 s of when they should be.
-        seen: how many the detector saw; late_s: of those within 0.5 s of one asked for, by how much.
+        sizes: (K,) of the requested events; in_time: (K,) 1 if seen within 0.12 s of the due time.
+        seen: How many the detector saw.
+        late_s: Lateness of those within 0.5 s of a requested one.
     """
 
     sizes: Doubles = field(default_factory=lambda: np.zeros(0))
@@ -56,32 +57,52 @@ class Sightings:
 
     @property
     def recall(self) -> float:
-        """Share of those asked for that is seen in time; NaN of none."""
+        """Return the share of requested events seen in time; NaN of none."""
         return float(self.in_time.mean()) if len(self.in_time) else float("nan")
 
     @property
     def precision(self) -> float:
-        """Share of those seen that was asked for, in time; NaN of none."""
+        """Return the share of seen events that were requested, in time; NaN of none."""
         return float(self.in_time.sum() / self.seen) if self.seen else float("nan")
 
     @property
     def offset_s(self) -> float:
-        """How late they are seen, median; NaN of none."""
+        """Return the median lateness; NaN of none."""
         return float(np.median(self.late_s)) if len(self.late_s) else float("nan")
 
     def recall_at(self, sizes: Doubles, edges: Sequence[float]) -> float:
-        """Recall that events of these sizes would have, by the recall of each range of sizes between `edges`."""
+        """Return the recall that events of these sizes would have, by the recall of each range between `edges`."""
         here, there = np.digitize(self.sizes, edges), np.digitize(sizes, edges)
         known = {place: self.in_time[here == place].mean() for place in np.unique(here)}
         found = [known[place] for place in there if place in known]
         return float(np.mean(found)) if found else float("nan")
 
+    def report(self, kind: str) -> dict[str, Any]:
+        """Return counts, recall, precision and lateness, and the recall by size; None where undefined."""
+        edges = _SIZES[kind]
+        place = np.digitize(self.sizes, edges)
+        by_size = [
+            {
+                "size": [round(float(edges[at - 1]), 4), round(float(edges[at]), 4)],
+                "asked": int((place == at).sum()),
+                "recall": round(float(self.in_time[place == at].mean()), 4),
+            }
+            for at in range(1, len(edges))
+            if (place == at).any()
+        ]
+        values = {"recall": self.recall, "precision": self.precision, "offset_s": self.offset_s}
+        return {"asked": len(self.sizes), "seen": self.seen, **rounded(values), "by_size": by_size}
+
+
+def rounded(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: round(value, 4) if np.isfinite(value) else None for name, value in values.items()}
+
 
 def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
-    """(start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58).
+    """Return (start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58).
 
-    The head goes along with a look aside and comes back: that is no nod, and what looking makes it do is left out
-    (where eyes move at all; of those that were not tracked nobody knows).
+    The head goes along with a look aside and comes back, which is not a nod: the head's part of looking is removed, if
+    the eyes move at all (untracked eyes do not).
     """
     how = MOTION_EVENTS[kind]
     if kind != "nod" or not motion[:, _EYES].any():
@@ -92,100 +113,127 @@ def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
 
 
 def gaze_rad(motion: Floats) -> Doubles:
-    """Motion (N, 58) -> where head and eyes together look (N, 2), yaw and pitch."""
-    return np.asarray(motion[:, YAW_PITCH] + directions(motion, EYES_RAD).mean(axis=1), np.float64)
+    """Return the direction (N, 2), yaw and pitch, in which head and eyes of motion (N, 58) look together."""
+    return np.asarray(motion[:, YAW_PITCH] + directions(motion, _EYES_RAD).mean(axis=1), np.float64)
 
 
 def gaze_shifts(motion: Floats) -> list[float]:
-    """Seconds at which head and eyes together, of motion (N, 58), go elsewhere."""
+    """Return the seconds at which the gaze of motion (N, 58) moves elsewhere."""
     gaze = gaze_rad(motion)
     return find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ)
 
 
-def asked_and_seen(
-    asked: Sequence[ListenerEvent], motion: Floats, lag_s: Mapping[str, float] | None = None
-) -> dict[str, Sightings]:
-    """By kind of `MOTION_EVENTS`: which of the events asked for are to be seen in motion (N, 58), and when.
+@dataclass(frozen=True)
+class Detected:
+    """Events detected in motion of some frames, by kind of `MOTION_EVENTS`: (start_s, end_s, size)."""
 
-    Times count from the first frame's beginning. `lag_s`: how late each kind is seen by its nature (a smile has to have
-    risen); what is in time is in time apart from that. Of several candidates the nearest pairs go together.
+    frames: int
+    events: Mapping[str, Sequence[tuple[float, float, float]]]
+
+    @classmethod
+    def of(cls, motion: Floats) -> Detected:
+        return cls(len(motion), {kind: seen(motion, kind) for kind in MOTION_EVENTS})
+
+
+def asked_and_seen(
+    asked: Sequence[ListenerEvent], detected: Detected, lag_s: Mapping[str, float] | None = None
+) -> dict[str, Sightings]:
+    """Return by kind which requested events were detected, and when.
+
+    Times count from the beginning of the first frame. `lag_s`: the lateness by nature of each kind (a smile has to
+    rise), which does not count. Of several candidates the nearest pairs go together.
     """
-    last_s = len(motion) * FRAME_S - EDGE_S
+    last_s = detected.frames * FRAME_S - _EDGE_S
     found = {}
-    for kind in MOTION_EVENTS:
+    for kind, events in detected.events.items():
         wanted = [event for event in asked if event.kind == kind and 0 <= event.start_s < last_s]
-        others = [event for event in asked if event.kind in SHOWS_AS.get(kind, ())]
+        others = [event for event in asked if event.kind in _SHOWS_AS.get(kind, ())]
         starts_s = np.array([
-            start for start, _, _ in seen(motion, kind)
-            if start < last_s + LOOSE_S and not any(_within(start, event) for event in others)
+            start for start, _, _ in events
+            if start < last_s + _LOOSE_S
+            and not any(event.start_s - _LOOSE_S <= start <= event.end_s + _LOOSE_S for event in others)
         ])  # fmt: skip
         lag = (lag_s or {}).get(kind, 0.0)
-        pairs = paired(np.array([event.start_s for event in wanted]) + lag, starts_s, LOOSE_S)
-        late_s = np.array([late for _, late in pairs]) + lag
+        pairs = paired(np.array([event.start_s for event in wanted]) + lag, starts_s, _LOOSE_S)
         in_time = np.zeros(len(wanted))
-        in_time[[place for place, late in pairs if abs(late) <= IN_TIME_S + 1e-9]] = 1.0
+        in_time[[place for place, late in pairs if abs(late) <= _IN_TIME_S + 1e-9]] = 1.0
         sizes = np.array([abs(event.size) for event in wanted], np.float64)
+        late_s = np.array([late for _, late in pairs]) + lag
         found[kind] = Sightings(sizes, in_time, int((starts_s < last_s).sum()), late_s)
     return found
 
 
-def _within(time_s: float, event: ListenerEvent) -> bool:
-    return event.start_s - LOOSE_S <= time_s <= event.end_s + LOOSE_S
-
-
 def paired(asked_s: Doubles, seen_s: Doubles, within_s: float) -> list[tuple[int, float]]:
-    """(index in `asked_s`, seconds late) of pairs no further apart than `within_s`, each in one pair, nearest first."""
+    """Return (index in `asked_s`, lateness) of pairs at most `within_s` apart, each time in one pair, nearest first."""
     late = seen_s[None, :] - asked_s[:, None]
     rows, columns = np.nonzero(np.abs(late) <= within_s)
-    pairs: list[tuple[int, float]] = []
-    rows_left, columns_left = set(rows.tolist()), set(columns.tolist())
+    pairs: dict[int, float] = {}
+    taken: set[int] = set()
     for place in np.argsort(np.abs(late[rows, columns]), kind="stable"):
         row, column = int(rows[place]), int(columns[place])
-        if row in rows_left and column in columns_left:
-            rows_left.remove(row)
-            columns_left.remove(column)
-            pairs.append((row, float(late[row, column])))
-    return sorted(pairs)
+        if row not in pairs and column not in taken:
+            pairs[row] = float(late[row, column])
+            taken.add(column)
+    return sorted(pairs.items())
+
+
+def added_up(parts: Iterable[Mapping[str, Sightings]]) -> dict[str, Sightings]:
+    """Return the sum of each kind."""
+    total: dict[str, Sightings] = {kind: Sightings() for kind in MOTION_EVENTS}
+    for part in parts:
+        for kind, one in part.items():
+            total[kind] = total[kind] + one
+    return total
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the detectors make of known events, by kind."""
+    """Sightings of known events by the detectors, by kind."""
 
     known: Mapping[str, Sightings]
 
     @classmethod
     def of(cls, motions: Motions, listeners: int = 60, seed: int = 1) -> Calibration:
-        """On a minute of each of so many composed listeners, whose nods are of many sizes. Some seconds."""
+        """Measure on a minute of each of `listeners` composed listeners, with nods of many sizes. Takes seconds."""
         drawn = [np.random.default_rng([seed, number]) for number in range(listeners)]
         acted = [act(busy_minute(rng), motions, rng) for rng in drawn]
         return cls.on([(one.events, one.motion) for one in acted])
 
     @classmethod
     def on(cls, listeners: Sequence[tuple[Sequence[ListenerEvent], Floats]]) -> Calibration:
-        """On listeners (events, motion) whose events are known; each kind is in time apart from its median lateness."""
-        loose = added_up(asked_and_seen(asked, motion) for asked, motion in listeners)
-        lag_s = {kind: one.offset_s for kind, one in loose.items() if len(one.late_s)}
-        return cls(added_up(asked_and_seen(asked, motion, lag_s) for asked, motion in listeners))
+        """Measure on listeners (events, motion); "in time" is relative to the median lateness of each kind."""
+        known = [(asked, Detected.of(motion)) for asked, motion in listeners]
+        lag_s = cls(added_up(asked_and_seen(asked, detected) for asked, detected in known)).lag_s
+        return cls(added_up(asked_and_seen(asked, detected, lag_s) for asked, detected in known))
 
     @property
     def lag_s(self) -> dict[str, float]:
-        """How late each kind is seen, median."""
+        """Return the median lateness of each kind."""
         return {kind: one.offset_s for kind, one in self.known.items() if len(one.late_s)}
 
     @property
     def nods_per_seen_nod(self) -> float:
-        """Nods there are for every one that is seen; 1 where nothing is known."""
+        """Return how many nods there are for each one seen; 1 without data."""
         nods = self.known.get("nod", Sightings())
         return nods.precision / nods.recall if nods.in_time.any() else 1.0
 
     def report(self) -> dict[str, Any]:
-        """Recall, precision and lateness by kind, and recall by size."""
-        return {kind: figures(one, SIZES[kind]) for kind, one in self.known.items() if len(one.sizes)}
+        return {kind: one.report(kind) for kind, one in self.known.items() if len(one.sizes)}
+
+    def report_of(self, sightings: Mapping[str, Sightings]) -> dict[str, Any]:
+        """Return reports of sightings, with the recall of known events of the same sizes as "recorded"."""
+        found = {}
+        for kind, one in sightings.items():
+            if len(one.sizes):
+                known = self.known[kind]
+                recall = known.recall_at(one.sizes, _SIZES[kind])
+                recorded = {"recall": recall, "precision": known.precision, "offset_s": known.offset_s}
+                found[kind] = {**one.report(kind), "recorded": rounded(recorded)}
+        return found
 
 
 def busy_minute(rng: np.random.Generator) -> Score:
-    """A minute in which a listener does a little of everything: what a detector may miss, or take for another."""
+    """Draw a minute in which a listener does everything that a detector may miss or confuse."""
 
     def spans(every_s: float, shortest_s: float, longest_s: float) -> Doubles:
         starts = np.cumsum(rng.exponential(every_s, round(120 / every_s)) + longest_s)
@@ -202,29 +250,3 @@ def busy_minute(rng: np.random.Generator) -> Score:
         shared_laughs=spans(15, 0.5, 2),
         gaze=tuple(looks),
     )
-
-
-def added_up(parts: Iterable[Mapping[str, Sightings]]) -> dict[str, Sightings]:
-    """The sum of each kind."""
-    total: dict[str, Sightings] = {kind: Sightings() for kind in MOTION_EVENTS}
-    for part in parts:
-        for kind, one in part.items():
-            total[kind] = total[kind] + one
-    return total
-
-
-def figures(one: Sightings, edges: Sequence[float]) -> dict[str, Any]:
-    """As a report has them; None for what cannot be told."""
-    place = np.digitize(one.sizes, edges)
-    by_size = [
-        {
-            "size": [round(float(edges[at - 1]), 4), round(float(edges[at]), 4)],
-            "asked": int((place == at).sum()),
-            "recall": round(float(one.in_time[place == at].mean()), 4),
-        }
-        for at in range(1, len(edges))
-        if (place == at).any()
-    ]
-    values = {"recall": one.recall, "precision": one.precision, "offset_s": one.offset_s}
-    told = {name: round(value, 4) if np.isfinite(value) else None for name, value in values.items()}
-    return {"asked": len(one.sizes), "seen": one.seen, **told, "by_size": by_size}

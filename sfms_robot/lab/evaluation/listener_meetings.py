@@ -1,8 +1,8 @@
-"""A meeting around one of its people: what reaches him from the others, and what he did.
+"""A meeting around one of its people: what reaches the listener from the others, and what the listener did.
 
-Everything but himself is kept: when the others spoke becomes a voice and a face, as in composed dyads; the face laughs
-and nods when they did, and whether the one who speaks looks at him is what the annotation says. `shifted` puts another
-minute of the others in the place of each.
+Everything but the listener's own behaviour is kept: the speech of the others becomes a voice and a face, as in composed
+dyads; the face laughs and nods when they did, and the annotation says whether the person who speaks looks at the
+listener. `shifted` puts another minute of the others in the place of each.
 """
 
 from __future__ import annotations
@@ -27,28 +27,27 @@ from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions
 
 SHIFT_S: Final = 60.0
-SILENT_S: Final = 1.0  # whoever spoke this recently is not just listening to somebody
-FLOOR_S: Final = 1.0  # a phrase this long takes the floor
-SIZES: Final[Mapping[str, float]] = {"nod": np.deg2rad(5.0), "gaze_shift": 0.4}  # which nobody measured; else 0.5
+_SILENT_S: Final = 1.0  # a listener who spoke this recently does more than listen
+_FLOOR_S: Final = 1.0  # a phrase this long takes the floor
+_SIZES: Final[Mapping[str, float]] = {"nod": np.deg2rad(5.0), "gaze_shift": 0.4}  # assumed; others 0.5
 
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ListenerMeeting:
     """N frames of 40 ms around one listener.
 
     Attributes:
-        name: meeting and listener; participant: who he is in all his meetings.
-        speaker: what he hears and sees; `agent_audio` is his own voice.
-        spans_s: what he did by kind, (K, 2) start, end; a kind that nobody annotated of him is not there.
-        aside: (K,) which of his gaze shifts go away from whoever speaks or has the floor.
-        others, own, unseen: (N,) others speak, he speaks, his head is off camera.
+        participant: The listener, the same name in all meetings.
+        speaker: What the listener hears and sees; `agent_audio` is the listener's own voice.
+        spans_s: What the listener did by kind, (K, 2) start, end; kinds without annotation are missing.
+        aside: (K,) the gaze shifts that go away from the person who speaks or has the floor.
+        others, own, unseen: (N,) others speak, the listener speaks, the listener's head is off camera.
         alone: (N,) exactly one other speaks.
-        attention: (N,) 1 or 0: the other who speaks, or had the floor last, looks at him or not; NaN: nobody annotated.
+        attention: (N,) 1 or 0: the other who speaks, or had the floor last, looks at the listener; NaN: not annotated.
     """
 
-    name: str
     participant: str
     speaker: tuple[SpeakerFrame, ...]
     spans_s: Mapping[str, Doubles]
@@ -65,14 +64,14 @@ class ListenerMeeting:
 
     @property
     def listening(self) -> Bools:
-        """(N,) others spoke in the last 2 s, he is silent and in view."""
+        """Return (N,): others spoke in the last 2 s, the listener is silent and in view."""
         return phrase_timing.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
 
     @property
     def spoken_to(self) -> Bools:
-        """(N,) exactly one other speaks, he has been silent for a second, and it is known where the other looks."""
+        """Return (N,): exactly one other speaks, with known attention, and the listener was silent for a second."""
         ends_s = [end / FRAME_HZ for _, end in events.runs(self.own)]
-        spoke = phrase_timing.window_after(ends_s, (0.0, SILENT_S), self.frames, FRAME_HZ)
+        spoke = phrase_timing.window_after(ends_s, (0.0, _SILENT_S), self.frames, FRAME_HZ)
         return self.listening & self.alone & ~spoke & ~np.isnan(self.attention)
 
     @property
@@ -85,28 +84,21 @@ class ListenerMeeting:
 
     @property
     def history(self) -> tuple[ListenerEvent, ...]:
-        """What he did that a listener might have, as events in their order: nods, while he listened."""
-        heard = self.listening[self.instants("nod")]
-        spans_s = {**self.spans_s, "nod": self.spans_s["nod"][heard]}
-        found = [
-            ListenerEvent(
-                kind, float(start), float(end - start), SIZES.get(kind, 0.5), target_rad=self._target(kind, at)
-            )
-            for kind, spans in spans_s.items()
-            for at, (start, end) in enumerate(spans)
-        ]
+        """Return the annotated events that a listener model has, in their order; nods only while listening."""
+        nods = self.spans_s["nod"][self.listening[self.instants("nod")]]
+        found = []
+        for kind, spans in {**self.spans_s, "nod": nods}.items():
+            size = _SIZES.get(kind, 0.5)
+            for at, (start, end) in enumerate(spans):
+                target = None if kind != "gaze_shift" else (size, 0.0) if self.aside[at] else (0.0, 0.0)
+                found.append(ListenerEvent(kind, float(start), float(end - start), size, target_rad=target))
         return tuple(sorted(found, key=lambda event: event.start_s))
 
-    def _target(self, kind: str, at: int) -> tuple[float, float] | None:
-        if kind != "gaze_shift":
-            return None
-        return (SIZES[kind], 0.0) if self.aside[at] else (0.0, 0.0)
-
     def begins(self, kind: str) -> tuple[Ints, Bools]:
-        """(K,) last frames before his events of a kind, of those that begin where they might; and where (N,) that is.
+        """Return (K,) last frames before the events of a kind that begin where they may, and (N,) where they may.
 
-        They might where he listens and is not in the middle of one; a look aside might where he looks at whoever
-        speaks or has the floor, and other shifts of gaze are left out.
+        Events may begin while the listener listens and is not inside one; a look aside may begin while the listener
+        looks at the person who speaks or has the floor, and other gaze shifts do not count.
         """
         instants = self.instants(kind)
         if kind == "gaze_shift":
@@ -118,17 +110,17 @@ class ListenerMeeting:
 
     @property
     def looks_at_speaker(self) -> Bools:
-        """(N,) the newest of his looks did not go aside."""
+        """Return (N,): the newest look did not go aside."""
         shifts = self.instants("gaze_shift") + 1
         newest = np.searchsorted(shifts, np.arange(self.frames), side="right") - 1
         return np.asarray((newest >= 0) & ~np.r_[self.aside, False][newest])
 
     def instants(self, kind: str) -> Ints:
-        """(K,) the last frame that is over when each event of the kind begins."""
+        """Return (K,) the last frame that is over when each event of the kind begins."""
         return frames_before(self.spans_s[kind][:, 0], self.frames)
 
     def inside(self, kind: str) -> Bools:
-        """(N,) an event of the kind is under way when the frame is over."""
+        """Return (N,): an event of the kind is under way when the frame is over."""
         mask = np.zeros(self.frames, bool)
         for start, end in self.spans_s[kind] * FRAME_HZ:
             mask[int(np.floor(start + 1e-6)) : max(0, int(np.ceil(end - 1e-6)) - 1)] = True
@@ -136,7 +128,7 @@ class ListenerMeeting:
 
 
 def frames_before(starts_s: Doubles, frames: int) -> Ints:
-    """(K,) the last frame, of so many, that is over at each instant (K,)."""
+    """Return the last frame (K,), of `frames`, that is over at each instant (K,)."""
     before = np.floor(starts_s * FRAME_HZ + 1e-6).astype(np.int64) - 1
     return np.asarray(before.clip(0, frames - 1))
 
@@ -144,126 +136,91 @@ def frames_before(starts_s: Doubles, frames: int) -> Ints:
 def listener_meeting(
     person: Person, voices: Sequence[Voice], laughter: Sequence[Floats], motions: Motions, rng: np.random.Generator
 ) -> ListenerMeeting:
-    """The time in which his head was annotated: one voice and face for all the others, and a voice for himself."""
+    """Compose the annotated time: one voice and face for all others, one voice for the listener."""
     whole = Stretch(person, 0.0, FRAME_S * int(person.until_s * FRAME_HZ))
     voice = cast(voices, rng)
-    said = _own_words(whole, own_voice(voices, voice, rng), rng)
-    floor = _floor(person, whole)
-    attention = _looks(person, whole, floor)
-    audio, face = _others(whole, voice, laughter, motions, attention, rng)
+    own, said = own_voice(voices, voice, rng), None
+    if own is not None:
+        said = sent(lay(_spoken(person.talk, whole), whole.frames, own, rng)[0], rng)
+    alone = _speakers(person, whole) == 1
+    floor = _floor(person, whole, alone)
+    attention = np.full(whole.frames, np.nan)
+    for agent in person.gaze_known:
+        theirs = floor == agent
+        attention[theirs] = active(_spans(person.looked_at, agent), whole)[theirs]
+    speech, mouth = lay(_spoken(person.others, whole), whole.frames, voice, rng)
+    moving = mouth_over(speech, motions.talk, whole.frames, rng) if mouth is None else mouth
+    look, nods = attention.astype(np.float32), _spans(person.others_nods)
+    face = speaker_motion(moving, motions, rng, look, person.others_laughs, nods)
+    audio = heard(laugh(speech, person.others_laughs, laughter, rng), voice, rng)
+    spans = {"nod": person.nods, "mm_hm": person.mm_hms, "laugh": person.laughs}
+    looks = [each for each in person.gaze or () if each[0] < whole.frames * FRAME_S]
+    if person.gaze is not None:
+        spans["gaze_shift"] = np.array([each[:2] for each in person.gaze], np.float64).reshape(-1, 2)
+    at = frames_before(np.array([start for start, _, _ in looks], np.float64), whole.frames)
     return ListenerMeeting(
-        f"{person.meeting}_{person.agent}",
-        person.participant,
-        tuple(speaker_frames(audio, face, said, attention.astype(np.float32))),
-        _annotated(person, whole),
-        _aside(person, floor),
-        active(person.others, whole),
-        active(person.talk, whole),
-        active(person.unseen, whole),
-        _speakers(person, whole) == 1,
-        attention,
+        participant=person.participant,
+        speaker=tuple(speaker_frames(audio, face, said, look)),
+        spans_s={kind: found[found[:, 0] < whole.end_s] for kind, found in spans.items()},
+        aside=np.array([target != floor[frame] for (_, _, target), frame in zip(looks, at, strict=True)], bool),
+        others=active(person.others, whole),
+        own=active(person.talk, whole),
+        unseen=active(person.unseen, whole),
+        alone=alone,
+        attention=attention,
     )
 
 
-def _others(
-    stretch: Stretch,
-    voice: Voice,
-    laughter: Sequence[Floats],
-    motions: Motions,
-    attention: Doubles,
-    rng: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Their voice (N * 640,) and their face (N, 58)."""
-    person, frames = stretch.person, stretch.frames
-    spoken = np.clip(person.others, 0, stretch.end_s)
-    speech, mouth = lay(spoken[spoken[:, 1] > spoken[:, 0]], frames, voice, rng)
-    nods = _spans(person.others_nods)
-    moving = mouth_over(speech, motions.talk, frames, rng) if mouth is None else mouth
-    face = speaker_motion(moving, motions, rng, attention.astype(np.float32), person.others_laughs, nods)
-    return heard(laugh(speech, person.others_laughs, laughter, rng), voice, rng), face
-
-
-def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) -> Floats | None:
-    if voice is None:
-        return None
-    said = np.clip(stretch.person.talk, 0, stretch.end_s)
-    speech, _ = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
-    return sent(speech, rng)
-
-
-def _annotated(person: Person, stretch: Stretch) -> dict[str, Doubles]:
-    spans = {"nod": person.nods, "mm_hm": person.mm_hms, "laugh": person.laughs}
-    if person.gaze is not None:
-        spans["gaze_shift"] = np.array([look[:2] for look in person.gaze], np.float64).reshape(-1, 2)
-    return {kind: found[found[:, 0] < stretch.end_s] for kind, found in spans.items()}
-
-
-# --- who speaks, and who looks ----------------------------------------------------------------------------------
+def _spoken(spans: Doubles, stretch: Stretch) -> Doubles:
+    spoken = np.clip(spans, 0, stretch.end_s)
+    return np.asarray(spoken[spoken[:, 1] > spoken[:, 0]])
 
 
 def _speakers(person: Person, stretch: Stretch) -> Ints:
-    """(N,) how many of the others speak."""
+    """Return (N,) how many of the others speak."""
     agents = sorted({agent for _, _, agent in person.floor})
     masks = [active(_spans(person.floor, agent), stretch) for agent in agents]
     return np.asarray(np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0), np.int64)
 
 
-def _floor(person: Person, stretch: Stretch) -> NDArray[np.str_]:
-    """(N,) the only other who speaks; else who of them spoke for a second last; "" before the first."""
+def _floor(person: Person, stretch: Stretch, alone: Bools) -> NDArray[np.str_]:
+    """Return (N,) the only other who speaks, else the last of them who spoke for a second; "" before the first."""
     floor = np.full(stretch.frames, "", dtype="<U1")
-    for taken_s, agent in sorted(
-        (start + FLOOR_S, agent) for start, end, agent in person.floor if end - start >= FLOOR_S
-    ):
+    taken = sorted((start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S)
+    for taken_s, agent in taken:
         floor[int(np.ceil(taken_s * FRAME_HZ)) :] = agent
-    alone = _speakers(person, stretch) == 1
     for agent in {agent for _, _, agent in person.floor}:
         floor[alone & active(_spans(person.floor, agent), stretch)] = agent
     return floor
 
 
-def _looks(person: Person, stretch: Stretch, floor: NDArray[np.str_]) -> Doubles:
-    """(N,) `ListenerMeeting.attention`."""
-    out = np.full(stretch.frames, np.nan)
-    for agent in person.gaze_known:
-        his = floor == agent
-        out[his] = active(_spans(person.looked_at, agent), stretch)[his]
-    return out
+def _spans(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """Return (K, 2) of one agent, or of all."""
+    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
-def _aside(person: Person, floor: NDArray[np.str_]) -> Bools:
-    """(K,) his looks that go elsewhere than to whoever speaks or has the floor."""
-    looks = [look for look in person.gaze or () if look[0] < len(floor) * FRAME_S]
-    at = frames_before(np.array([start for start, _, _ in looks], np.float64), len(floor))
-    return np.array([target != floor[frame] for (_, _, target), frame in zip(looks, at, strict=True)], bool)
-
-
-def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
-    """(K, 2) of what one agent did, or all."""
-    return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
-
-
-# --- the same, otherwise ----------------------------------------------------------------------------------------
+# --- parts and variants ---------------------------------------------------------------------------------------------
 
 
 def part(speaker: Sequence[SpeakerFrame], first: int, frames: int) -> list[SpeakerFrame]:
-    """So many frames from `first` on, timed from their own beginning."""
-    return [_at((index + 1) * FRAME_S, frame) for index, frame in enumerate(speaker[first : first + frames])]
+    """Return `frames` frames from `first` on, timed from the beginning of the part."""
+    return [at_time((index + 1) * FRAME_S, frame) for index, frame in enumerate(speaker[first : first + frames])]
 
 
 def without_own_voice(speaker: Sequence[SpeakerFrame]) -> list[SpeakerFrame]:
-    """As a head hears it that never speaks."""
+    """Return the frames for a head that never speaks."""
     return [changed(frame, agent_audio=None) for frame in speaker]
 
 
 def shifted(speaker: Sequence[SpeakerFrame], by_s: float = SHIFT_S) -> list[SpeakerFrame]:
-    """What comes from the others, `by_s` late; the end comes at the beginning. His own voice stays where it is."""
+    """Return the input from the others `by_s` late, its end moved to the beginning; the own voice stays in place."""
     by = round(by_s * FRAME_HZ) % len(speaker)
     before = [*speaker[len(speaker) - by :], *speaker[: len(speaker) - by]]
     return [
-        changed(_at(frame.time_s, other), agent_audio=frame.agent_audio)
+        changed(at_time(frame.time_s, other), agent_audio=frame.agent_audio)
         for frame, other in zip(speaker, before, strict=True)
     ]
 
 
-def _at(time_s: float, frame: SpeakerFrame) -> SpeakerFrame:
+def at_time(time_s: float, frame: SpeakerFrame) -> SpeakerFrame:
     return changed(frame, time_s=time_s, face=frame.face and changed(frame.face, time_s=time_s))

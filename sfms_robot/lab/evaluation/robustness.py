@@ -1,15 +1,19 @@
-"""Whom a listener has never met, heard and seen badly: its events have to stay as many as people's.
+"""`evaluate robustness`: events of a listener with unknown speakers, heard and seen well and badly.
 
-A speaker looks at the head all the time. Each is played as a voice, as a face, and as both, as recorded and spoilt in
-one way at a time; every stream of a listener differs by its seed alone. What is counted is what is seen in its motion,
-and what it has decided; of what comes only to somebody who speaks, a minute is one in which he does, or did two
-seconds ago. Where nothing tells that he speaks (no microphone, a mouth that hangs) nothing has to answer him.
+A speaker looks at the head all the time. Each is played as a voice, as a face, and as both, as recorded and degraded in
+one way at a time; the streams of a listener differ by their seeds alone. Counted are the events visible in its motion,
+and its decisions, which have to stay as frequent as people's. For events that only answer a speaker, a minute is one in
+which the speaker talks or stopped less than two seconds ago. Without evidence of speech (no microphone, a mouth that
+does not move) no answer is expected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from statistics import median
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -17,6 +21,9 @@ import soxr
 from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
+from sfms_robot.config import find
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
     AUDIO_HZ,
     CHANNEL_INDEX,
@@ -28,94 +35,225 @@ from sfms_robot.frames import (
     Floats,
     SpeakerFrame,
 )
+from sfms_robot.lab.corpora.compose.render_events import speaker_motion
+from sfms_robot.lab.corpora.compose.voices import find_voices, mouth_over
+from sfms_robot.lab.corpora.splits import Split, split_of_voice
 from sfms_robot.lab.evaluation.detection import seen
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
-from sfms_robot.lab.evaluation.rollout import Rollout, speaker_frames
+from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames
 from sfms_robot.listeners.events.model import ALWAYS
+from sfms_robot.listeners.registry import load_listener
 from sfms_robot.signals.events import MOTION_EVENTS
+from sfms_robot.signals.motion_primitives import read_motions
 
 Inputs = Literal["voice", "face", "both"]
-Spoil = Callable[[Floats, np.random.Generator], Floats]
+Degrade = Callable[[Floats, np.random.Generator], Floats]
 
-# Events a minute of people who are spoken to: nods of AMI's listeners, median person and speaker-rich meetings; blinks
-# and smiles of people in conversation.
+# Events per minute of people in conversation: nods of AMI's listeners, median person and speaker-rich meetings.
 RANGES: Final[Mapping[str, tuple[float, float]]] = {"nod": (3.0, 7.0), "blink": (10.0, 25.0), "smile": (0.5, 1.5)}
-DISPERSION: Final = (0.7, 2.0)  # variance over mean of counts: 1 is Poisson's
-NOISE_DB: Final = -10.0  # below speech
-RT60_S: Final = 0.6
+_DISPERSION: Final = (0.7, 2.0)  # variance over mean of counts: 1 is Poisson's
+_NOISE_DB: Final = -10.0  # below speech
+_RT60_S: Final = 0.6
+_VOICE_FOLDERS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
+
+
+def evaluate_robustness(
+    name: str,
+    data: Path | None,
+    *,
+    split: Split,
+    speakers: int | None,
+    minutes: float,
+    seeds: int,
+    seed: int,
+    jobs: int | None,
+) -> dict[str, Any]:
+    """Return events per minute for every speaker in every condition, and their scatter over seeds, beside people's.
+
+    Raises ConfigError, also for voices that listeners were trained on, or ModelError.
+    """
+    if split == "train":
+        raise ConfigError("--split train: listeners were trained on these voices; validation and test are others")
+    folder = find("listeners", name, "config.yaml")
+    load_listener(folder)  # report its errors here, not from a process
+    voices = voice_folders(data)
+    everybody = unseen(voices, split)[:speakers]
+    tasks = [
+        _RobustnessTask(
+            folder=folder,
+            voices=voices,
+            split=split,
+            speaker=place,
+            inputs=inputs,
+            condition=CONDITIONS.index(condition),
+            minutes=minutes,
+            seeds=range(seed, seed + seeds),
+        )
+        for place, speaker in enumerate(everybody)
+        for inputs, condition in cases(speaker)
+    ]
+    rows = run_in_processes(_play, tasks, jobs, "speakers heard")
+    found: dict[str, Any] = {}
+    for kind in RANGES:
+        rate_key, scatter_key = f"{kind}s_per_minute", f"{kind}s_variance_over_mean"
+        values = [row[rate_key] for row in rows]
+        known = [row[scatter_key] for row in rows if row[scatter_key] is not None]
+        found |= {rate_key: [min(values), max(values)], scatter_key: round(median(known), 3) if known else None}
+    return {
+        "listener": name,
+        "split": split,
+        "speakers": [speaker.name for speaker in everybody],
+        "minutes": minutes,
+        "seeds": seeds,
+        "people": {f"{kind}s_per_minute": list(least_most) for kind, least_most in RANGES.items()},
+        "people_variance_over_mean": list(_DISPERSION),
+        **found,
+        "outside": [
+            {**{key: row[key] for key in ("speaker", "inputs", "condition")}, "figures": wrong}
+            for row in rows
+            if (wrong := outside(row, row["tells_speech"]))
+        ],
+        "rows": rows,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RobustnessTask:
+    """One speaker in one condition: places of `speaker` among the voices of `split`, and in `CONDITIONS`."""
+
+    folder: Path
+    voices: tuple[Path, ...]
+    split: Split
+    speaker: int
+    inputs: Inputs
+    condition: int
+    minutes: float
+    seeds: range
+
+
+def _play(task: _RobustnessTask) -> dict[str, Any]:
+    speaker, condition = unseen(task.voices, task.split)[task.speaker], CONDITIONS[task.condition]
+    rng = np.random.default_rng([task.seeds.start, task.speaker, task.condition])
+    frames = heard_and_seen(speaker, task.inputs, condition, task.minutes, rng)
+    played = rollout(_listener(task.folder), frames, task.seeds)
+    return {
+        "speaker": speaker.name,
+        "inputs": task.inputs,
+        "condition": condition.name,
+        "tells_speech": condition.tells_speech(task.inputs),
+        **rates(counted(played), len(frames) / FRAME_HZ / 60, listened_minutes(speaker, task.minutes)),
+    }
+
+
+_listener = cache(load_listener)
+
+
+# --- speakers -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Speaker:
-    """Somebody who talks: voice (n,) 16 kHz, and face (N, 58) at 25 frames a second, or None: never filmed."""
+class UnseenSpeaker:
+    """A person who talks: voice (n,) 16 kHz, and face (N, 58) at 25 frames a second, or None without a film."""
 
     name: str
     voice: Floats
     face: Floats | None
 
 
-@dataclass(frozen=True)
-class Condition:
+def voice_folders(data: Path | None) -> tuple[Path, ...]:
+    """Return the folders of the bundled speakers and of the voices in a data folder."""
+    if data is not None and not data.is_dir():
+        raise ConfigError(f"--data {data}: no such folder")
+    brought = [] if data is None else [data / name for name in _VOICE_FOLDERS if (data / name).is_dir()]
+    return (data_dir("sim") / "speakers", *brought)
+
+
+@cache
+def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[UnseenSpeaker, ...]:
+    """Return all speakers in the folders whose voice is of `split`, by name. Raises ConfigError without any.
+
+    The face has the speaker's own mouth if it was filmed, else another's that opens with the voice.
+    """
+    motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
+    kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
+    if not kept:
+        raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for {split}")
+    found = []
+    for number, (name, voice) in enumerate(sorted(kept.items())):
+        rng = np.random.default_rng(number)
+        frames = len(voice.recording) // FRAME_SAMPLES
+        mouth = voice.mouth if voice.mouth is not None else mouth_over(voice.recording, motions.talk, frames, rng)
+        frames = min(frames, len(mouth))
+        face = speaker_motion(mouth[:frames], motions, rng, attention=np.ones(frames, np.float32))
+        found.append(UnseenSpeaker(name, voice.recording[: frames * FRAME_SAMPLES], face))
+    return tuple(found)
+
+
+# --- conditions -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputCondition:
     """One way in which a microphone or a camera is not ideal.
 
     Attributes:
-        voice, face: what becomes of the samples and of the motion.
-        attention: number of frames -> (frames,) in place of looking at the head all the time.
-        mouth_moves: it is still to be seen that he speaks.
+        voice, face: Change the samples and the motion.
+        attention: Number of frames -> (frames,); without it the speaker looks at the head all the time.
+        mouth_moves: The face still shows speech.
     """
 
     name: str
-    voice: Spoil | None = None
-    face: Spoil | None = None
+    voice: Degrade | None = None
+    face: Degrade | None = None
     attention: Callable[[int], Floats] | None = None
     mouth_moves: bool = True
 
     def concerns(self, inputs: Inputs) -> bool:
-        """It changes something of what is heard and seen, or is what the others are compared with."""
+        """Return whether it changes these inputs, or is the condition that the others are compared with."""
         of_voice, of_face = self.voice is not None, self.face is not None or self.attention is not None
         nothing = not of_voice and not of_face
         return nothing or (of_voice and inputs != "face") or (of_face and inputs != "voice")
 
     def tells_speech(self, inputs: Inputs) -> bool:
-        """Whether a listener can know that somebody speaks."""
+        """Return whether a listener can know that the person speaks."""
         return inputs != "face" or self.mouth_moves
 
 
 def noise(voice: Floats, rng: np.random.Generator) -> Floats:
-    """Noise that falls by 3 dB an octave, 10 dB below the voice."""
+    """Add noise that falls by 3 dB an octave, 10 dB below the voice."""
     spectrum = np.fft.rfft(rng.standard_normal(len(voice)))
     spectrum /= np.sqrt(np.maximum(np.arange(len(spectrum)), 1))
     pink = np.fft.irfft(spectrum, len(voice))
-    level = _rms(voice) * 10 ** (NOISE_DB / 20) / _rms(pink)
+    level = _rms(voice) * 10 ** (_NOISE_DB / 20) / _rms(pink)
     return _clipped(voice + level * pink)
 
 
 def quiet(voice: Floats, rng: np.random.Generator) -> Floats:
-    """20 dB down, as from across a room."""
+    """Attenuate by 20 dB, as from across a room."""
     return _clipped(voice * 0.1)
 
 
 def loud(voice: Floats, rng: np.random.Generator) -> Floats:
-    """12 dB up, cut where the converter ends."""
+    """Amplify by 12 dB and clip."""
     return _clipped(voice * 4.0)
 
 
 def room(voice: Floats, rng: np.random.Generator) -> Floats:
-    """As much from the walls as from the mouth, dying away by 60 dB in 0.6 s."""
-    samples = round(RT60_S * AUDIO_HZ)
+    """Add as much sound from the walls as from the mouth, decaying by 60 dB in 0.6 s."""
+    samples = round(_RT60_S * AUDIO_HZ)
     tail = rng.standard_normal(samples) * 10 ** (-3 * np.arange(samples) / samples)
     walls = oaconvolve(voice, tail / np.sqrt(np.sum(tail**2)))[: len(voice)]
     return _clipped((voice + walls) / np.sqrt(2))
 
 
 def telephone(voice: Floats, rng: np.random.Generator) -> Floats:
-    """Through 8 kHz."""
+    """Resample through 8 kHz."""
     narrow = soxr.resample(soxr.resample(voice, AUDIO_HZ, AUDIO_HZ // 2), AUDIO_HZ // 2, AUDIO_HZ)
     return _clipped(np.pad(narrow, (0, max(0, len(voice) - len(narrow))))[: len(voice)])
 
 
 def jitter(face: Floats, rng: np.random.Generator) -> Floats:
-    """A tracker's scatter: 0.3 degrees, 2 mm, 0.03 of a blendshape."""
+    """Add the scatter of a tracker: 0.3 degrees, 2 mm, 0.03 of a blendshape."""
     sizes = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 2e-3), np.full(52, 0.03)]
     out = face + sizes * rng.standard_normal(face.shape)
     out[:, SHAPES] = out[:, SHAPES].clip(0, 1)
@@ -123,53 +261,59 @@ def jitter(face: Floats, rng: np.random.Generator) -> Floats:
 
 
 def lost(face: Floats, rng: np.random.Generator) -> Floats:
-    """Not found for every second second."""
+    """Lose the face for every second second."""
     out = face.copy()
     out[np.arange(len(face)) // FRAME_HZ % 2 == 1] = np.nan
     return out
 
 
 def constant(face: Floats, rng: np.random.Generator) -> Floats:
-    """A tracker that hangs."""
+    """Hold the first frame, like a tracker that hangs."""
     return np.repeat(face[:1], len(face), axis=0)
 
 
 def saturated(face: Floats, rng: np.random.Generator) -> Floats:
-    """Every blendshape at its end."""
+    """Set every blendshape to its maximum."""
     out = face.copy()
     out[:, SHAPES] = 1.0
     return out
 
 
 def upside_down(face: Floats, rng: np.random.Generator) -> Floats:
-    """A camera the wrong way up."""
+    """Turn the camera upside down."""
     out = face.copy()
     out[:, POSE] *= -1
     out[:, CHANNEL_INDEX["roll"]] += np.pi
     return out
 
 
-def _flickering(frames: int) -> Floats:
-    return (np.arange(frames) % 2).astype(np.float32)
+def _rms(values: NDArray[np.floating]) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values, np.float64) ** 2))) + 1e-12
 
 
-PLAIN: Final = Condition("as recorded")
-FLICKER: Final = Condition("attention flickers", attention=_flickering)
+def _clipped(values: NDArray[np.floating]) -> Floats:
+    return np.asarray(np.clip(values, -1, 1), np.float32)
+
+
+PLAIN: Final = InputCondition(name="as recorded")
+FLICKER: Final = InputCondition(
+    name="attention flickers", attention=lambda frames: (np.arange(frames) % 2).astype(np.float32)
+)
 CONDITIONS: Final = (
     PLAIN,
-    *(Condition(spoil.__name__.replace("_", " "), voice=spoil) for spoil in (noise, quiet, loud, room, telephone)),
+    *(InputCondition(name=each.__name__, voice=each) for each in (noise, quiet, loud, room, telephone)),
     *(
-        Condition(
-            f"face {spoil.__name__.replace('_', ' ')}", face=spoil, mouth_moves=spoil not in (constant, saturated)
+        InputCondition(
+            name=f"face {each.__name__.replace('_', ' ')}", face=each, mouth_moves=each not in (constant, saturated)
         )
-        for spoil in (jitter, lost, constant, saturated, upside_down)
+        for each in (jitter, lost, constant, saturated, upside_down)
     ),
     FLICKER,
 )
 
 
-def cases(speaker: Speaker) -> Iterator[tuple[Inputs, Condition]]:
-    """Everything that a speaker is played as."""
+def cases(speaker: UnseenSpeaker) -> Iterator[tuple[Inputs, InputCondition]]:
+    """Yield the inputs and conditions in which a speaker is played."""
     every: tuple[Inputs, ...] = ("voice",) if speaker.face is None else ("voice", "face", "both")
     for inputs in every:
         for condition in CONDITIONS:
@@ -178,9 +322,9 @@ def cases(speaker: Speaker) -> Iterator[tuple[Inputs, Condition]]:
 
 
 def heard_and_seen(
-    speaker: Speaker, inputs: Inputs, condition: Condition, minutes: float, rng: np.random.Generator
+    speaker: UnseenSpeaker, inputs: Inputs, condition: InputCondition, minutes: float, rng: np.random.Generator
 ) -> list[SpeakerFrame]:
-    """`minutes` of the speaker, again from the beginning where they are over sooner."""
+    """Return `minutes` of the speaker, repeated from the beginning if the recording is shorter."""
     frames = round(60 * minutes * FRAME_HZ)
     voice = np.resize(speaker.voice, frames * FRAME_SAMPLES).astype(np.float32)
     voice = condition.voice(voice, rng) if condition.voice else voice
@@ -192,8 +336,11 @@ def heard_and_seen(
     return speaker_frames(None if inputs == "face" else voice, face, attention=attention)
 
 
+# --- counts ---------------------------------------------------------------------------------------------------------
+
+
 def counted(played: Rollout) -> dict[str, list[int]]:
-    """How many of each kind every stream did: seen in its motion, and `decided_`."""
+    """Return the number of events of each kind per stream: visible in the motion, and `decided_`."""
     kinds = sorted({event.kind for events in played.events for event in events})
     decided = {
         f"decided_{kind}": [sum(event.kind == kind for event in events) for events in played.events] for kind in kinds
@@ -201,8 +348,8 @@ def counted(played: Rollout) -> dict[str, list[int]]:
     return {kind: [len(seen(motion, kind)) for motion in played.motion] for kind in MOTION_EVENTS} | decided
 
 
-def listened_minutes(speaker: Speaker, minutes: float) -> float:
-    """Of `minutes` of the speaker those in which he speaks, or did two seconds ago; by his voice as recorded."""
+def listened_minutes(speaker: UnseenSpeaker, minutes: float) -> float:
+    """Return the minutes in which the speaker talks, or stopped less than 2 s ago, by the voice as recorded."""
     voice = np.resize(speaker.voice, round(60 * minutes * FRAME_HZ) * FRAME_SAMPLES)
     return float(listening_mask(voice_activity(voice), FRAME_HZ).sum()) / FRAME_HZ / 60
 
@@ -210,9 +357,9 @@ def listened_minutes(speaker: Speaker, minutes: float) -> float:
 def rates(
     counts: Mapping[str, Sequence[int]], minutes: float, listened: float | None = None
 ) -> dict[str, float | None]:
-    """Of counts over streams: their mean a minute, and their variance over their mean (None of one, or of nothing).
+    """Return the mean per minute and the variance over the mean of counts over streams; None if undefined.
 
-    A minute of what comes only while listening is one of the `listened` (all, if not said).
+    Events that only answer a speaker are counted per minute of `listened` (default: of all).
     """
     figures: dict[str, float | None] = {}
     for kind, numbers in counts.items():
@@ -220,23 +367,15 @@ def rates(
         always = listened is None or kind.removeprefix("decided_") in ALWAYS
         time = minutes if always else max(listened or 0.0, FRAME_S / 60)
         figures[f"{kind}s_per_minute"] = round(mean / time, 3)
-        told = mean > 0 and len(numbers) > 1
-        figures[f"{kind}s_variance_over_mean"] = round(float(np.var(numbers, ddof=1)) / mean, 3) if told else None
+        several = mean > 0 and len(numbers) > 1
+        figures[f"{kind}s_variance_over_mean"] = round(float(np.var(numbers, ddof=1)) / mean, 3) if several else None
     return figures
 
 
 def outside(row: Mapping[str, Any], tells_speech: bool = True) -> list[str]:
-    """Which figures of a row are not people's; nobody answers whom nothing tells to speak."""
+    """Return the figures of a row outside people's ranges; without evidence of speech, 0 is inside."""
     return [
         f"{kind}s_per_minute"
         for kind, (least, most) in RANGES.items()
         if not (least if tells_speech or kind in ALWAYS else 0.0) <= row[f"{kind}s_per_minute"] <= most
     ]
-
-
-def _rms(values: NDArray[np.floating]) -> float:
-    return float(np.sqrt(np.mean(np.asarray(values, np.float64) ** 2))) + 1e-12
-
-
-def _clipped(values: NDArray[np.floating]) -> Floats:
-    return np.asarray(np.clip(values, -1, 1), np.float32)

@@ -1,68 +1,106 @@
-"""A listener left to itself: what it does while the speaker of a dyad is heard.
+"""The motion of a listener left to itself while it hears the speaker of a dyad.
 
-`rollout` goes frame by frame as `run` does, with any listener. `offline_rollout` is the same from arrays, for SFMS: the
-features of a dyad are worked out once and serve all streams, and speaker and plans stay in the model's motion space, so
-that data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in their own terms. That both
-give the same motion is a law of the tests.
+`rollout` goes frame by frame as `run` does, with any listener. `offline_rollout` does the same from arrays, for SFMS:
+the features of a dyad are computed once for all streams, and speaker and plans stay in the model's motion space, so
+that data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in the same space. A test
+checks that both give the same motion.
 
-A listener that is told of events is told those that are given, each `LEAD_FRAMES` before it begins, as when it runs.
+A listener that follows events receives the given ones, each `LEAD_FRAMES` before it begins, as in a run.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from torch import Tensor
 
+from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
+from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import ArigMemory
+from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
+from sfms_robot.listeners.registry import at_hop, hops_of, load_listener, one_thread
 from sfms_robot.listeners.sfms.draw import PlanInputs, later, passed, revoked
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
+from sfms_robot.processes import process_pool
 from sfms_robot.signals.control import control_track
 
+_Task = TypeVar("_Task")
+_Result = TypeVar("_Result")
 
-@dataclass(frozen=True)
-class Rollout:
-    """S streams that heard the same N frames; what a plan shows counts until the next one.
 
-    Attributes:
-        motion: (S, N, 58) faces.
-        states: (S, N) int8 of the paper's seven conversational states, -1 before the first and of listeners without.
-        events: of each stream, what it decided; nothing of listeners that decide none.
+def load_at_hop(name: str, hop: int | None = None, engine: EngineName = "torch") -> Listener:
+    """Load a listener by name or folder, planning every `hop` frames; None: as its config.yaml says.
+
+    Raises ConfigError for a hop that it does not support, ModelError.
     """
+    listener = load_listener(find("listeners", name, "config.yaml"), engine=engine)
+    if hop is None:
+        return listener
+    if hop not in (choices := hops_of(listener)):
+        raise ConfigError(f"--hop {hop}: not a hop of listener {name} (valid: {', '.join(map(str, choices))})")
+    return at_hop(listener, hop)
 
-    motion: Floats
-    states: NDArray[np.int8]
-    events: tuple[tuple[ListenerEvent, ...], ...]
+
+def run_in_processes(
+    work: Callable[[_Task], _Result], tasks: Sequence[_Task], jobs: int | None, title: str
+) -> list[_Result]:
+    """Return `work` of every task in their order, computed in at most `jobs` processes; None: as many as cores.
+
+    Shows a progress bar. An exception of a task is raised here and ends the others. `work` is a module's function.
+    """
+    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
+    workers = min(jobs or os.cpu_count() or 1, len(tasks))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task(title, total=len(tasks))
+        if workers <= 1:
+            one_thread()
+            results = []
+            for task in tasks:
+                results.append(work(task))
+                progress.advance(bar)
+            return results
+        with process_pool(workers) as pool:
+            waiting = [pool.submit(work, task) for task in tasks]
+            for done in as_completed(waiting):
+                done.result()
+                progress.advance(bar)
+            return [one.result() for one in waiting]
 
 
-@dataclass(frozen=True)
-class OfflineRollout:
-    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N, G) behind it."""
+def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
+    """Return at most `most` items, spread evenly from the first to the last."""
+    if most is None or most >= len(items):
+        return list(items)
+    return [items[int(index)] for index in np.linspace(0, len(items) - 1, most).round()]
 
-    motion: Tensor
-    tokens: Tensor
+
+# --- what a listener hears ------------------------------------------------------------------------------------------
 
 
 def speaker_frames(
     audio: Floats | None, face: Floats, agent_audio: Floats | None = None, attention: Floats | None = None
 ) -> list[SpeakerFrame]:
-    """Sound (N * 640,) and face (N, 58) as a source gives them, and the agent's own voice (N * 640,) one frame early.
+    """Return sound (N * 640,) and face (N, 58) as a source does, with the agent's voice (N * 640,) one frame early.
 
-    A face of NaN is None, and so is the attention (N,) of a face that is not seen; an attention of NaN stays: nobody
-    knows. No sound at all is no microphone.
+    A face of NaN becomes None, and so does the attention (N,) of a frame without a face; an attention of NaN (unknown)
+    stays. Without any sound there is no microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
     shown = np.asarray(np.isfinite(face).all(axis=1))
@@ -82,27 +120,35 @@ def speaker_frames(
 
 
 def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
-    """Both tracks of a dyad as a source gives them."""
+    """Return both tracks of a dyad as a source does."""
     return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
 
 
 def whole_clips(speaker: Sequence[SpeakerFrame], frames: int) -> Sequence[SpeakerFrame]:
-    """As much as is whole clips of so many frames."""
+    """Cut off the end that does not fill a clip of `frames` frames."""
     return speaker[: len(speaker) // frames * frames]
 
 
-@runtime_checkable
-class ManyStreams(Protocol):
-    """A listener that steps several streams of one speaker at once."""
+# --- frame by frame -------------------------------------------------------------------------------------------------
 
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats] | None = None
-    ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
-        """`Listener.step` of streams that have heard the same from the start; no plans between hops."""
+
+@dataclass(frozen=True)
+class Rollout:
+    """S streams that heard the same N frames; each plan counts until the next one.
+
+    Attributes:
+        motion: (S, N, 58) faces.
+        states: (S, N) int8 of the paper's seven conversational states, -1 before the first, and without states.
+        events: The decisions of each stream; empty for listeners that decide none.
+    """
+
+    motion: Floats
+    states: NDArray[np.int8]
+    events: tuple[tuple[ListenerEvent, ...], ...]
 
 
 def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) -> Floats | None:
-    """What `listener` is told with frame `index` of all the `events` of its life; None for one that is told nothing."""
+    """Return the control that `listener` receives with frame `index` of its life; None if it follows no events."""
     past, ahead = getattr(listener, "control_frames", (0, 0))
     if not past + ahead:
         return None
@@ -114,9 +160,9 @@ def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) 
 def rollout(
     listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int], events: Sequence[ListenerEvent] = ()
 ) -> Rollout:
-    """What the listener does while `speaker` is heard, once for every seed; side by side where the listener can.
+    """Play the listener to `speaker` once for every seed, all streams together if it can.
 
-    `events`: what a listener that is told of them shall do.
+    `events`: for a listener that follows events.
     """
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
@@ -138,10 +184,11 @@ def rollout(
 def _step(
     listener: Any, frame: SpeakerFrame, memories: Sequence[Any], control: Floats | None
 ) -> tuple[Sequence[Plan | None], Sequence[Any]]:
-    told = () if control is None else (control,)
-    if isinstance(listener, ManyStreams):
-        return listener.step_many(frame, memories, *([one] * len(memories) for one in told))
-    stepped = [listener.step(frame, memory, *told) for memory in memories]
+    given = () if control is None else (control,)
+    if hasattr(listener, "step_many"):
+        plans, after = listener.step_many(frame, memories, *([one] * len(memories) for one in given))
+        return plans, after
+    stepped = [listener.step(frame, memory, *given) for memory in memories]
     return [plan for plan, _ in stepped], [memory for _, memory in stepped]
 
 
@@ -152,9 +199,9 @@ def rollouts(
     each: Callable[[], object] = lambda: None,
     clip_frames: int = 1,
 ) -> list[Rollout]:
-    """One stream through every dyad from its beginning, each with a seed of its own; `each()` after every one.
+    """Play one stream through every dyad from its beginning, with seeds from `seed` on; call `each()` after every one.
 
-    A listener that is told of events is told those of the dyad's own listener. `clip_frames`: see `whole_clips`.
+    A listener that follows events receives those of the dyad's listener. `clip_frames`: see `whole_clips`.
     """
     found = []
     for number, dyad in enumerate(dyads):
@@ -164,10 +211,21 @@ def rollouts(
     return found
 
 
-def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
-    """`rollout` from arrays, told of the dyad's own events where the listener is told of any.
+# --- from arrays ----------------------------------------------------------------------------------------------------
 
-    Raises ConfigError when the dyad is in a space that cannot become the listener's, or has no events.
+
+@dataclass(frozen=True)
+class OfflineRollout:
+    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N, G) behind it."""
+
+    motion: Tensor
+    tokens: Tensor
+
+
+def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
+    """Compute `rollout` from arrays, with the dyad's events for a listener that follows events.
+
+    Raises ConfigError when the dyad's space cannot become the listener's, or the dyad has no events.
     """
     past, ahead, streams = listener.settings.past_frames, listener.horizon, len(seeds)
     heard = frames_of(dyad, listener.space, listener.frontend, listener.settings)
@@ -212,5 +270,5 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
 
 
 def _led(rows: NDArray[Any], frames: int) -> NDArray[Any]:
-    """(N, ...) behind so many rows of nothing."""
+    """Return rows (N, ...) after `frames` rows of zeros."""
     return np.concatenate([np.zeros((frames, *rows.shape[1:]), rows.dtype), rows])

@@ -1,9 +1,8 @@
-"""The roll-out, brought to the data by what both can be counted on: keyframes, and how nods and smiles go.
+"""Calibration of sampling on training data: the rate of keyframes, and the course of nods and smiles.
 
-Teacher forcing never shows the model its own mistakes, so left to itself it places keyframes somewhat too often or
-too rarely, and looks restless or frozen. A bias on class 0 per group moves that rate.
-
-How the nods and smiles of the data go, for a listener that keeps to their course, is taken from them as it is.
+Teacher forcing never shows the model its own mistakes, so in a roll-out it places keyframes somewhat too often or too
+rarely, and looks restless or frozen. A bias on class 0 per group corrects that rate. For a listener with a fixed course
+of nods and smiles, the course is the median of the data's.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import OfflineRollout, offline_rollout
+from sfms_robot.lab.evaluation.rollout import offline_rollout
 from sfms_robot.lab.learning.corpus import without_gaze
 from sfms_robot.lab.learning.sfms.features import gather, tokenise
 from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
@@ -32,9 +31,9 @@ from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 
-DYADS = 8  # that are listened to
-COURSE_DYADS = 128  # likewise, for their nods and smiles: nothing is rolled out
-LEAST = 10  # of a kind, to tell its course
+DYADS = 8  # that are rolled out
+COURSE_DYADS = 128  # for their nods and smiles, without roll-outs
+LEAST = 10  # of a kind, to know its course
 LARGEST_STEP = 1.0  # of a bias, per round
 STREAMS = 4  # of every dyad, side by side
 
@@ -44,16 +43,19 @@ Progress = Callable[[], object]
 def calibrate(
     training: config.Training, data: Path, out: Path, order: Order | None = None, each: Progress = lambda: None
 ) -> None:
-    """Fit how the listener trained in `out` is sampled, on some training dyads, and write `out`/config.yaml anew.
+    """Calibrate the listener trained in `out` on some training dyads, and rewrite `out`/config.yaml.
 
-    Blocks for minutes; `each()` is called after every round of roll-outs, `rounds(training)` times.
+    Blocks for minutes; calls `each()` after every round of roll-outs, `rounds(training)` times.
     """
     settings, space = training.listener, MotionSpace.of(training.listener)
     model = SfmsModel(settings)
     checkpoint.load_weights(out / checkpoint.WEIGHTS, model)
     every = open_for(space.name, data, "train", order, [settings.audio])
     some = _some(every, settings.window_frames)
-    found = calibrated(corrected(training), model, some, training.predictor, each=each)
+    found = corrected(training)
+    for _ in range(training.predictor.calibration_rounds):
+        found = placing(found, model, some)
+        each()
     if found.events and training.predictor.calibration_rounds:
         found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
         each()
@@ -61,38 +63,30 @@ def calibrate(
 
 
 def rounds(training: config.Training) -> int:
-    """Rounds of roll-outs that `calibrate` takes."""
+    """Return the rounds of `calibrate`."""
     placings = training.predictor.calibration_rounds
     return placings + bool(placings and training.listener.events)
 
 
 def _some(dyads: Dataset, window: int, count: int = DYADS) -> list[Dyad]:
-    """A few dyads of a set, spread over it, that are as long as a window; if none of those is, the first that is."""
+    """Return a few dyads, spread over a set, that are as long as a window; or else the first one that is."""
     chosen = [*usable(dyads[:: max(1, len(dyads) // count)])][:count]
     long = [dyad for dyad in chosen if len(dyad.listener) >= window]
     return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
 
 
-def calibrated(
-    settings: config.Sfms,
-    model: SfmsModel,
-    dyads: Sequence[Dyad],
-    training: config.PredictorTraining,
-    seed: int = 1,
-    each: Progress = lambda: None,
-) -> config.Sfms:
-    """`settings` with biases fitted on `dyads`. The model is left in evaluation mode."""
-    for _ in range(training.calibration_rounds):
-        settings = placing(settings, model, dyads, seed)
-        each()
-    return settings
+def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int = 1) -> config.Sfms:
+    """Return `settings` with biases that would have given a roll-out the keyframe rates of the data.
 
-
-def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int) -> config.Sfms:
-    """One round: biases that would have brought the keyframe rates of a roll-out to those of the data."""
+    The model is left in evaluation mode.
+    """
     listener = SfmsListener(settings, torch_engine(settings, model.eval()))
     wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
-    rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in _rolled_out(listener, dyads, seed)]))
+    rolled = [
+        offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
+        for index, dyad in enumerate(dyads)
+    ]
+    rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in rolled]))
     groups = {}
     for (name, group), has, wants in zip(settings.groups.items(), rates, wanted, strict=True):
         step = math.log(max(has, 1e-4) / (1 - has) * (1 - wants) / wants)
@@ -102,9 +96,7 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
 
 
 def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
-    """`settings` with the median course of nods and smiles of `dyads`, where they keep to one; as they are, if too few
-    of the kind do.
-    """
+    """Return `settings` with the median course of nods and smiles of `dyads`, for kinds that have enough of them."""
     nod, smile = settings.sampling.nod, settings.sampling.smile
     if nod is not None:
         falls = [fall for dyad in dyads for fall in _falls(dyad)]
@@ -120,7 +112,7 @@ def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
 
 
 def _falls(dyad: Dyad) -> Iterator[float]:
-    """How large the second swing is beside the first, of each nod that has one."""
+    """Yield the size of the second swing over that of the first, of each nod that has one."""
     pitch = without_gaze(dyad).listener[:, CHANNEL_INDEX["pitch"]]
     for event in dyad.events or ():
         swing = event.duration_s / event.swings / FRAME_S
@@ -131,7 +123,7 @@ def _falls(dyad: Dyad) -> Iterator[float]:
 
 
 def _smiles(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
-    """Shares of its size at `RISE_S` and `FALL_S` of each smile that is long enough for both, and of no laugh."""
+    """Yield the shares of its size at `RISE_S` and `FALL_S` of each smile long enough for both, without a laugh."""
     corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in SMILE_CORNERS]].mean(axis=1)
     times_s = (1 + np.arange(len(corners))) * FRAME_S
     rise_s, fall_s = np.array(config.SmileCourse.RISE_S), np.array(config.SmileCourse.FALL_S)
@@ -145,13 +137,6 @@ def _smiles(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
             yield first, last
 
 
-def _rolled_out(listener: SfmsListener, dyads: Sequence[Dyad], seed: int) -> list[OfflineRollout]:
-    return [
-        offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
-        for index, dyad in enumerate(dyads)
-    ]
-
-
 def _rates(tokens: Tensor) -> list[float]:
-    """Keyframes per frame of each group, in tokens (N, G)."""
+    """Return keyframes per frame of each group, in tokens (N, G)."""
     return [float(rate) for rate in (tokens > 0).float().mean(0)]

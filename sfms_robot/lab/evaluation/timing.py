@@ -1,9 +1,14 @@
-"""When a listener nods, against when people did: meetings are heard by it, its nods laid beside the annotated ones.
+"""Figures of when a listener nods in meetings, beside the annotated nods of the people.
 
-Three things are told apart: what people did (`people_`), what a listener decides (`decided_`), and what is to be seen
-in its motion (no prefix). All are counted alike: onsets a minute of time of a kind (`times_of`), intervals in listening
-time, and how well a score ranks the instants at which he began above the other instants at which he might have
-(`ranked`). Every count is a sum over one meeting, to be added up to people (`per_person`) and made into figures.
+Three sources are distinguished: what people did (`people_`), what a listener decides (`decided_`), and what is visible
+in its motion (no prefix). All are counted alike: onsets per minute of a kind of time (`times_of`), intervals in
+listening time, and how well a score ranks the instants at which the person's events began above the other instants at
+which they might have (`ranked`). Every count is a sum over one meeting; sums are added per person (`per_person`) and
+made into figures.
+
+The nod table is the simplest baseline of timing: a rate of nods by speech phase. A cell is the place in the talk of the
+others: in a phrase, by how long it has lasted, or in a silence, by how long; both by the length of the phrase before.
+Its rate is nods over minutes, drawn toward the mean where minutes are few.
 """
 
 from __future__ import annotations
@@ -17,77 +22,87 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import Person
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
-from sfms_robot.lab.evaluation.bootstrap import Figure, Sums, added, distance, median, quotient, ratio
-from sfms_robot.lab.evaluation.deciding import spans_of
-from sfms_robot.lab.evaluation.detection import Calibration, gaze_shifts, seen
+from sfms_robot.lab.evaluation.detection import Calibration, Detected, gaze_shifts
+from sfms_robot.lab.evaluation.hazard_scores import spans_of
+from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
-from sfms_robot.lab.evaluation.nod_table import Counts, cells
 from sfms_robot.signals import phase
 from sfms_robot.signals.events import MOTION_EVENTS, Bools
 
-WITHIN_S: Final = 0.5  # a nod this close counts for an instant
-LEAST: Final = 3  # events of a person in a meeting, to be ranked
-INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of intervals
-SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
-LONG_SILENCE_S: Final = 2.0
-STRETCH_S: Final = 48.0  # of listening, whose nods are counted for their variance over mean
-WHO: Final = ("", "decided_", "people_")
-ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # beside nods
-AUC: Final = "_auc"  # in the names of figures that are means over people
+ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # besides nods
+_WITHIN_S: Final = 0.5  # a nod this close counts for an instant
+_LEAST: Final = 3  # events of a person in a meeting, to be ranked
+_INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of intervals
+_SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
+_LONG_SILENCE_S: Final = 2.0
+_STRETCH_S: Final = 48.0  # of listening, whose nods are counted for their variance over mean
+_AUC: Final = "_auc"  # in the names of figures that are means over people
+_SPEECH_S: Final = (1.0, 2.0, 4.0, 8.0)  # edges of the cells of the nod table
+_SILENCE_S: Final = (0.4, 0.8, 1.2)
+_LAST_S: Final = (1.0, 3.0)
+_PRIOR_NODS: Final = 5.0  # at the mean rate, in every cell
+CELLS: Final = (len(_SILENCE_S) + 1 + len(_SPEECH_S) + 1) * (len(_LAST_S) + 1)
 
-Runs = Sequence[Doubles]  # spans (K, 2) [s] of what was done, once for each seed
+Runs = Sequence[Doubles]  # spans (K, 2) [s] of events, once for each seed
 
 
-# --- how often --------------------------------------------------------------------------------------------------
+def _minutes(mask: Bools) -> float:
+    return float(mask.sum()) / FRAME_HZ / 60
+
+
+def _pooled(onsets: Sequence[Ints]) -> Ints:
+    return np.concatenate([np.zeros(0, np.int64), *onsets])
+
+
+# --- counts ---------------------------------------------------------------------------------------------------------
 
 
 def times_of(one: ListenerMeeting) -> dict[str, Bools]:
-    """Masks (N,) of the times that nods are counted in; `after_phrase` and `later` make the phrase-end ratio."""
+    """Return masks (N,) of the times in which nods are counted; `after_phrase` over `later` is the phrase-end ratio."""
     frames, listening = one.frames, one.listening
     ends = phrase_timing.phrase_ends(one.others, FRAME_HZ)
-    silence_s = phase.times(one.others.tolist())[:, 1]
+    silence_s = phase.times(one.others)[:, 1]
     return {
         "nods_per_minute": listening,
         "addressed_nods_per_minute": one.addressed,
         "bystander_nods_per_minute": one.bystander,
         "nods_after_phrase": phrase_timing.window_after(ends, phrase_timing.AFTER_S, frames, FRAME_HZ) & listening,
         "nods_later": phrase_timing.window_after(ends, phrase_timing.LATER_S, frames, FRAME_HZ) & listening,
-        "nods_long_silence": (silence_s > LONG_SILENCE_S) & ~one.own & ~one.unseen,
+        "nods_long_silence": (silence_s > _LONG_SILENCE_S) & ~one.own & ~one.unseen,
     }
 
 
 def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = None, per_seen: float = 1.0) -> Sums:
-    """Nods and minutes of every kind of time, and the histogram of intervals, in the part of it that is played.
+    """Return nods and minutes of every kind of time, and the histogram of intervals, in the played part.
 
-    `per_seen`: how many nods there are for each that is told (`detection.Calibration`).
+    `per_seen`: nods there are for each one counted (`detection.Calibration`).
     """
     played = np.ones(one.frames, bool) if within is None else within
     onsets = [np.round(nods[:, 0] * FRAME_HZ).astype(np.int64).clip(0, one.frames - 1) for nods in runs]
-    every = np.concatenate([np.zeros(0, np.int64), *onsets])
-    sums = {}
-    for name, mask in times_of(one).items():
-        counted = mask & played
-        sums[who + name] = np.array([per_seen * counted[every].sum(), len(runs) * _minutes(counted)])
-    sums[who + "nods_variance_over_mean"] = np.sum(
-        [np.zeros(2), *(scatter(begun, one.listening & played) for begun in onsets)], axis=0
-    )
-    found = [intervals_s(begun, one.listening & played) for begun in onsets]
-    sums[who + "intervals"] = histogram(np.concatenate([np.zeros(0), *found]))
+    every, heard = _pooled(onsets), one.listening & played
+    sums = {
+        who + name: np.array([per_seen * (mask & played)[every].sum(), len(runs) * _minutes(mask & played)])
+        for name, mask in times_of(one).items()
+    }
+    sums[who + "nods_variance_over_mean"] = np.sum([np.zeros(2), *(scatter(begun, heard) for begun in onsets)], axis=0)
+    lengths_s = np.concatenate([np.zeros(0), *(intervals_s(begun, heard) for begun in onsets)])
+    bins = np.digitize(lengths_s, _INTERVALS_S)  # also beyond both ends
+    sums[who + "intervals"] = np.bincount(bins, minlength=len(_INTERVALS_S) + 1).astype(np.float64)
     return sums
 
 
 def intervals_s(onsets: Ints, listening: Bools) -> Doubles:
-    """From onset to onset (frames), as much of it as was listened in; onsets outside of it do not count."""
+    """Return the listening time from onset to onset (frames); onsets outside of it do not count."""
     clock_s = np.cumsum(listening) / FRAME_HZ
     return np.diff(clock_s[np.sort(onsets[listening[onsets]])])
 
 
 def scatter(onsets: Ints, listening: Bools) -> Doubles:
-    """[stretches times variance, sum] of the counts in stretches of 48 s of listening; nothing of fewer than two.
+    """Return [stretches times variance, sum] of the counts in stretches of 48 s of listening; zeros for one or none.
 
-    Nods that call forth nods come in bouts, and leave whole stretches without: more than 1, which is Poisson's.
+    Nods that trigger nods come in bouts and leave whole stretches empty: their ratio exceeds 1, which is Poisson's.
     """
-    frames = round(STRETCH_S * FRAME_HZ)
+    frames = round(_STRETCH_S * FRAME_HZ)
     stretch = (np.cumsum(listening) - 1) // frames
     whole = int(listening.sum()) // frames
     if whole < 2:
@@ -96,54 +111,54 @@ def scatter(onsets: Ints, listening: Bools) -> Doubles:
     return np.array([whole * counts.var(ddof=1), counts.sum()], np.float64)
 
 
-def histogram(values: Doubles) -> Doubles:
-    """Counts between the edges `INTERVALS_S`, and beyond both ends."""
-    return np.bincount(np.digitize(values, INTERVALS_S), minlength=len(INTERVALS_S) + 1).astype(np.float64)
-
-
-def other_sums(who: str, one: ListenerMeeting, kind: str, runs: Runs) -> Sums:
-    """Events of another kind than nods, a minute of listening; an own voice begins where listening ends."""
-    begun = np.concatenate([np.zeros(0, np.int64), *(frames_before(spans[:, 0], one.frames) for spans in runs)])
-    listening = one.listening
-    return {f"{who}{kind}s_per_minute": np.array([listening[begun].sum(), len(runs) * _minutes(listening)], np.float64)}
+def _other_sums(who: str, one: ListenerMeeting, kind: str, runs: Runs) -> Sums:
+    """Return events of another kind than nods and minutes of listening; "mm-hm" begins where listening ends."""
+    begun = _pooled([frames_before(spans[:, 0], one.frames) for spans in runs])
+    counts = [one.listening[begun].sum(), len(runs) * _minutes(one.listening)]
+    return {f"{who}{kind}s_per_minute": np.array(counts, np.float64)}
 
 
 def people_sums(one: ListenerMeeting, within: Bools) -> Sums:
-    """What he did himself; his intervals also of the part that is played alone."""
+    """Return the sums of the person; the intervals also of the played part alone."""
     sums = nod_sums("people_", one, [one.spans_s["nod"]])
     sums["played_intervals"] = nod_sums("", one, [one.spans_s["nod"]], within)["intervals"]
     for kind in ANNOTATED:
-        known = [one.spans_s[kind]] if kind in one.spans_s else []
-        sums |= other_sums("people_", one, kind, known)
+        sums |= _other_sums("people_", one, kind, [one.spans_s[kind]] if kind in one.spans_s else [])
     return sums
 
 
 def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]], own_voice: bool = False) -> Sums:
-    """What a listener decided, left to itself, once for each seed. `own_voice`: it spoke when he did, and a minute of
-    its nods moved would be moved against that too, so how they hang on the others is not told.
+    """Return the sums of a listener's decisions, one stream per seed.
+
+    `own_voice`: it spoke when the person did. Shifting its nods by a minute would shift them against that voice too, so
+    their contingency on the others is left out.
     """
     nods = [spans_of(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
     if not own_voice:
         sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
     for kind in (*ANNOTATED, "smile", "blink"):
-        sums |= other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
+        sums |= _other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
     return sums
 
 
 def motion_sums(
-    one: ListenerMeeting, motions: Floats, first: int, calibration: Calibration, own_voice: bool = False
+    one: ListenerMeeting,
+    motions: Floats,
+    detected: Sequence[Detected],
+    first: int,
+    calibration: Calibration,
+    own_voice: bool = False,
 ) -> Sums:
-    """What is to be seen in motion (S, N', 58) that was made of the meeting's frames from `first` on.
+    """Return the sums of events detected in motion (S, N', 58), made of the meeting's frames from `first` on.
 
-    `own_voice`: see `decided_sums`.
-
-    Nods are set right by what their finder makes of known ones: it is late or early by so much, and misses so many.
+    Nods are corrected by the finder's calibration: its lateness, and the share that it misses. `own_voice`: see
+    `decided_sums`.
     """
     runs, frames = motions.shape[:2]
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
-    found = {kind: [seen(motion, kind) for motion in motions] for kind in MOTION_EVENTS}
+    found = {kind: [each.events[kind] for each in detected] for kind in MOTION_EVENTS}
     begin_s = first * FRAME_S - calibration.lag_s.get("nod", 0.0)
     nods = [begin_s + np.array([nod[:2] for nod in each], np.float64).reshape(-1, 2) for each in found["nod"]]
     sizes = [np.degrees(size) for each in found["nod"] for _, _, size in each]
@@ -151,24 +166,20 @@ def motion_sums(
     return {
         **nod_sums("", one, nods, played, calibration.nods_per_seen_nod),
         **({} if own_voice else nod_contingency("", nods, one, played)),
-        "nod_deg_sizes": np.histogram(sizes, SIZES_DEG)[0].astype(np.float64),
+        "nod_deg_sizes": np.histogram(sizes, _SIZES_DEG)[0].astype(np.float64),
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
         "gaze_shifts_per_minute": np.array([sum(len(gaze_shifts(motion)) for motion in motions), minutes]),
     }
 
 
-def _minutes(mask: Bools) -> float:
-    return float(mask.sum()) / FRAME_HZ / 60
-
-
-# --- ranking ----------------------------------------------------------------------------------------------------
+# --- ranking --------------------------------------------------------------------------------------------------------
 
 
 def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Bools | None = None) -> Doubles:
-    """[AUC * K, K]: how scores (N,) rank the instants before his K events above the others at which he might begin.
+    """Return [AUC * K, K]: how scores (N,) rank the instants before K events above the others of `begins`.
 
-    See `ListenerMeeting.begins`. Nothing of fewer than three events, or of a kind that was not annotated.
+    Zeros for fewer than three events, or a kind without annotation.
     """
     if kind not in one.spans_s:
         return np.zeros(2)
@@ -176,7 +187,7 @@ def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Boo
     if within is not None:
         onsets, others = onsets[within[onsets]], others & within
     others[onsets] = False
-    if len(onsets) < LEAST or not others.any():
+    if len(onsets) < _LEAST or not others.any():
         return np.zeros(2)
     return np.array([phrase_timing.rank_auc(scores, onsets, others) * len(onsets), len(onsets)], np.float64)
 
@@ -184,7 +195,7 @@ def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Boo
 def contingent(
     who: str, name: str, matched: Doubles, shifted: Sequence[Doubles], one: ListenerMeeting, within: Bools | None = None
 ) -> Sums:
-    """How scores (N,) rank his nods; likewise those that belong to other minutes, in the mean; and by how much less."""
+    """Return how scores (N,) rank the nods, the mean for scores that belong to other minutes, and the difference."""
     own = ranked(matched, one, "nod", within)
     other = np.zeros(2)
     if shifted:
@@ -194,7 +205,7 @@ def contingent(
 
 
 def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubles, other: Doubles) -> Sums:
-    """How hazards (N,) rank his nods: given his own speech, without it, and without it while the others are shifted."""
+    """Return how hazards (N,) rank the nods: with the own speech, without it, and without it and the others shifted."""
     ranks = contingent(who, "nod_hazard_auc", silent, [other], one)
     return {
         f"{who}nod_hazard_auc_without_own_speech": ranks[f"{who}nod_hazard_auc"],
@@ -203,21 +214,14 @@ def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubl
     }
 
 
-def nod_share(runs: Runs, frames: int) -> Doubles:
-    """(frames,) share of the runs with a nod within 0.5 s: the nod probability of every instant."""
-    return np.asarray(
-        np.mean([phrase_timing.near(nods, frames, FRAME_HZ, WITHIN_S) for nods in runs], axis=0), np.float64
-    )
-
-
 def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
-    """`contingent` of nods that a listener made itself.
+    """Return `contingent` for the nods of a listener with its own history.
 
-    Its history is its own, so what it did while it heard another minute is what it did then: its nods are moved, by
-    every whole minute that the part played allows.
+    The score is the share of runs with a nod within 0.5 s. The history of a run is its own, so its behaviour while it
+    heard another minute is its behaviour at that time: its nods are shifted, by every whole minute of the played part.
     """
     played = np.flatnonzero(within)
-    share = nod_share(runs, one.frames)
+    share = np.mean([phrase_timing.near(nods, one.frames, FRAME_HZ, _WITHIN_S) for nods in runs], axis=0)
     step = round(SHIFT_S * FRAME_HZ)
     moved = []
     for shift in range(step, len(played) - step + 1, step):
@@ -227,46 +231,73 @@ def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -
     return contingent(who, "nod_auc", share, moved, one, within)
 
 
+# --- the nod table --------------------------------------------------------------------------------------------------
+
+
+def cells(times_s: Doubles) -> Ints:
+    """Return the cell (N,), 0 to CELLS - 1, of speech phases (N, 3) (`signals.phase.times`): silence first."""
+    speech, silence, last = times_s.T
+    row = np.where(speech > 0, len(_SILENCE_S) + 1 + np.digitize(speech, _SPEECH_S), np.digitize(silence, _SILENCE_S))
+    return np.asarray(row * (len(_LAST_S) + 1) + np.digitize(last, _LAST_S), np.int64)
+
+
 def table_rates(people: Sequence[Person]) -> Doubles:
-    """Nods a minute by cell of the nod table, over everybody's whole annotated time."""
+    """Return nods per minute (CELLS,) over the whole annotated time of all people."""
     parts = []
     for person in people:
         whole = Stretch(person, 0.0, person.until_s)
         others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
         listening = phrase_timing.listening_mask(others, FRAME_HZ, own) & ~unseen
-        onsets = frames_before(person.nods[:, 0], len(others))
-        parts.append(Counts.of(cells(phase.times(others.tolist())), onsets, listening))
-    return Counts.total(parts).rates()
+        parts.append(cell_counts(cells(phase.times(others)), frames_before(person.nods[:, 0], len(others)), listening))
+    return smoothed_rates(np.sum([np.zeros((2, CELLS)), *parts], axis=0))
+
+
+def cell_counts(cell: Ints, onsets: Ints, listening: Bools) -> Doubles:
+    """Return nods and minutes of listening (2, CELLS) from cells (N,), onsets (frames), and listening time (N,)."""
+    inside = onsets[(onsets >= 0) & (onsets < len(cell))]
+    nods, frames = (np.bincount(cell[at], minlength=CELLS) for at in (inside[listening[inside]], listening))
+    return np.stack([nods, frames / FRAME_HZ / 60])
+
+
+def smoothed_rates(counts: Doubles) -> Doubles:
+    """Return nods per minute (CELLS,) of counts (2, CELLS), each cell with five more nods at the mean rate."""
+    nods, minutes = counts.sum(axis=1)
+    if not nods or not minutes:
+        return np.zeros(CELLS)
+    return np.asarray((counts[0] + _PRIOR_NODS) / (counts[1] + _PRIOR_NODS * minutes / nods))
 
 
 def table_sums(one: ListenerMeeting, rates: Doubles) -> Sums:
-    """How the nod table with these rates (`table_rates`) ranks his nods."""
-    return {"table_nod_auc": ranked(rates[cells(phase.times(one.others.tolist()))], one)}
+    """Return how the nod table with these rates ranks the nods."""
+    return {"table_nod_auc": ranked(rates[cells(phase.times(one.others))], one)}
 
 
-# --- people and figures -----------------------------------------------------------------------------------------
+# --- people and figures ---------------------------------------------------------------------------------------------
 
 
 def per_person(meetings: Iterable[tuple[str, Sums]]) -> list[Sums]:
-    """Sums of (participant, sums of a meeting) -> one of each participant; of an AUC the mean over his events, once."""
+    """Return the sums of each participant from (participant, sums of a meeting).
+
+    An AUC becomes the mean over the person's events and counts once.
+    """
     by_name: dict[str, list[Sums]] = {}
     for participant, sums in meetings:
         by_name.setdefault(participant, []).append(sums)
+
+    def once(numbers: Doubles) -> Doubles:
+        return np.array([numbers[0] / numbers[1], 1.0]) if numbers[1] else np.zeros(2)
+
     return [
-        {name: _once(numbers) if AUC in name else numbers for name, numbers in added(parts).items()}
+        {name: once(numbers) if _AUC in name else numbers for name, numbers in added(parts).items()}
         for _, parts in sorted(by_name.items())
     ]
 
 
-def _once(numbers: Doubles) -> Doubles:
-    return np.array([numbers[0] / numbers[1], 1.0]) if numbers[1] else np.zeros(2)
-
-
 def figures_of(sums: Sums) -> dict[str, Figure]:
-    """Every figure that these sums can be made into."""
+    """Return every figure that these sums define."""
     pairs = [name for name in sums if not name.endswith(("intervals", "sizes"))]
     figures: dict[str, Figure] = {name: quotient(name) for name in pairs}
-    for who in WHO:
+    for who in ("", "decided_", "people_"):
         if f"{who}nods_later" in sums:
             figures[f"{who}phrase_end_ratio"] = ratio(f"{who}nods_after_phrase", f"{who}nods_later")
             figures[f"{who}addressed_over_bystander"] = ratio(
@@ -274,7 +305,7 @@ def figures_of(sums: Sums) -> dict[str, Figure]:
             )
     if "intervals" in sums:
         figures["interval_ks"] = distance("intervals", "played_intervals")
-        figures["nod_deg"] = median("nod_deg_sizes", (SIZES_DEG[1:] + SIZES_DEG[:-1]) / 2)
+        figures["nod_deg"] = median("nod_deg_sizes", (_SIZES_DEG[1:] + _SIZES_DEG[:-1]) / 2)
     if "decided_intervals" in sums:
         figures["decided_interval_ks"] = distance("decided_intervals", "people_intervals")
     gained = "nod_hazard_auc_matched_minus_shifted"

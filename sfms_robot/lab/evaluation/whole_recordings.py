@@ -14,24 +14,39 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, MOTION_DIM, Doubles, FaceFrame, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.events.evidence import (
     AT,
+    BACK,
+    BEAM,
+    CORNERS,
     COUNTED_S,
     DONE,
     EPS_S,
     EVIDENCE,
     FLOOR_FRAMES,
     HEARD,
+    HELD_FRAMES,
+    JAW,
     MINE,
     NOBODY,
+    NOD_RAD,
+    NODS_APART,
+    OPENING,
+    PITCH,
+    STANDS_OUT,
+    SWAY,
+    WINDOW,
     Addressed,
     SenseMemory,
+    jaw_opening,
     looks_at_head,
-    read_signs,
+    smile_over,
+    smoothed_pitch,
     sounds,
 )
 from sfms_robot.listeners.events.model import (
@@ -43,7 +58,7 @@ from sfms_robot.listeners.events.model import (
     STEP_S,
     EventModel,
 )
-from sfms_robot.signals import phase, voice_activity
+from sfms_robot.signals import phase
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.event_sizes import SWING_S
 
@@ -141,20 +156,56 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
     return holder, np.maximum.accumulate(np.where(changed, index, 0))
 
 
+def signs_in(faces: Sequence[FaceFrame | None]) -> Bools:
+    """Return nods, smiles, laughs and moving mouth (N, 4) of a recording: `read_signs` of all frames at once."""
+    channels = np.full((len(faces), 4), np.nan)
+    known = [index for index, face in enumerate(faces) if face is not None]
+    motion = np.array([face.motion for face in faces if face is not None], np.float64).reshape(-1, MOTION_DIM)
+    finite = np.isfinite(motion).all(axis=1)
+    if len(known):
+        channels[np.array(known)[finite]] = motion[finite][:, [PITCH, *CORNERS, JAW]]
+    pitch_rad, found = np.full(len(faces), np.nan), np.zeros((len(faces), 4), bool)
+    smoothed, neutral, held, jaw, opening = None, None, 0, 0.0, 0.0
+    for index, (pitch, left, right, open_) in enumerate(channels.tolist()):
+        if pitch != pitch:  # NaN: no face
+            smoothed, held, opening = None, 0, 0.0
+            continue
+        pitch_rad[index] = smoothed = smoothed_pitch(pitch, smoothed)
+        over, neutral, held = smile_over((left + right) / 2, neutral, held)
+        jaw, opening = jaw_opening(open_, jaw, opening)
+        smiles, moves = held >= HELD_FRAMES, opening > OPENING
+        found[index, 1:] = smiles, smiles and over > BEAM and moves, moves
+    nodded, sway = -NODS_APART, 0.0
+    swings = np.maximum(_swings_in(pitch_rad), _swings_in(-pitch_rad)).tolist()
+    for index in np.flatnonzero(~np.isnan(pitch_rad)).tolist():
+        stands_out = swings[index] >= max(NOD_RAD, STANDS_OUT * sway)
+        if stands_out and index - nodded >= NODS_APART:
+            found[index, 0], nodded = True, index
+        sway += SWAY * (swings[index] - sway)
+    return found
+
+
+def _swings_in(values: Doubles) -> Doubles:
+    """Return `_swing` of the second before each frame (N,), as far as it has no NaN."""
+    windows = sliding_window_view(np.r_[np.full(WINDOW - 1, np.nan), values], WINDOW)
+    whole = np.logical_and.accumulate(~np.isnan(windows[:, ::-1]), axis=1)[:, ::-1]  # since the last NaN
+    high = np.where(whole, windows, -np.inf)
+    lowest = np.minimum.accumulate(np.where(whole, windows, np.inf), axis=1)
+    top, rows = high.argmax(axis=1), np.arange(len(values))
+    risen = high[rows, top] - lowest[rows, top]
+    return np.where(high[rows, top] - values >= BACK * risen, risen, 0.0)
+
+
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
     """Return the scene that `sense` sees in a recording; `heard_in` makes its rows of that."""
     memory = SenseMemory(addressed)
-    deaf, ear, face = True, memory.ear, memory.face
-    speaks, looks, signs = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan), []
-    speaks[:, 0] = [sounds(frame.agent_audio) for frame in speaker]
+    speaks, looks = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan)
+    nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
+    first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then
+    speaks[first:, 1] = phase.hear(np.array([energy_db(frame.audio) for frame in speaker[first:]]))
     for index, frame in enumerate(speaker):
-        deaf = deaf and not len(frame.audio)
-        ear = ear if deaf else voice_activity.step(energy_db(frame.audio), ear)
-        sign, face = read_signs(frame.face, face)
+        speaks[index, 0] = sounds(frame.agent_audio)
         looks[index, 1], memory = looks_at_head(frame, memory)
-        speaks[index, 1] = sign.mouth_moves if deaf else ear.active
-        signs.append((sign.laughs, sign.nods, sign.smiles))
-    laughs, nods, smiles = np.array(signs, bool).reshape(-1, 3).T
     silent = phase.times(speaks[:, 1])[:, 0] == 0
     return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
 

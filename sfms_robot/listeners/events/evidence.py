@@ -235,10 +235,10 @@ _SMOOTH: Final = 0.5  # share of a new value
 _NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: a person who always beams is neutral within a minute
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
-_SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
-_CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
-_JAW: Final = CHANNEL_INDEX["jawOpen"]
-_PITCH: Final = CHANNEL_INDEX["pitch"]
+SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
+CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
+JAW: Final = CHANNEL_INDEX["jawOpen"]
+PITCH: Final = CHANNEL_INDEX["pitch"]
 
 
 @dataclass(frozen=True)
@@ -278,13 +278,13 @@ def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceSta
     motion = None if face is None else face.motion
     if motion is None or not np.isfinite(motion).all():
         return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
-    pitch, left, right, jaw = (motion.item(channel) for channel in (_PITCH, *_CORNERS, _JAW))
+    pitch, left, right, jaw = (motion.item(channel) for channel in (PITCH, *CORNERS, JAW))
     nods, state = _nod(pitch, state)
-    smiles, beams, state = _smile(_within((left + right) / 2), state)
-    jaw = _within(jaw)
-    opening = state.opening + _MOTION * (abs(jaw - state.jaw) - state.opening)
-    moves = opening > OPENING
-    return Signs(nods, smiles, beams and moves, moves), changed(state, frame=state.frame + 1, jaw=jaw, opening=opening)
+    over, neutral, held = smile_over((left + right) / 2, state.neutral, state.held)
+    jaw, opening = jaw_opening(jaw, state.jaw, state.opening)
+    smiles, moves = held >= HELD_FRAMES, opening > OPENING
+    after = changed(state, frame=state.frame + 1, neutral=neutral, held=held, jaw=jaw, opening=opening)
+    return Signs(nods, smiles, smiles and over > BEAM and moves, moves), after
 
 
 def _within(value: float) -> float:
@@ -293,12 +293,11 @@ def _within(value: float) -> float:
 
 def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
     before = state.pitch_rad
-    smoothed = before[-1] + _SMOOTH * math.remainder(pitch_rad - before[-1], 2 * math.pi) if before else pitch_rad
-    pitch = (*before, smoothed)[-WINDOW:]
+    pitch = (*before, smoothed_pitch(pitch_rad, before[-1] if before else None))[-WINDOW:]
     swing = max(_swing(pitch), _swing([-p for p in pitch]))
     stands_out = swing >= max(NOD_RAD, STANDS_OUT * state.sway_rad)
     new = stands_out and state.frame - state.nodded >= NODS_APART
-    sway = state.sway_rad + _SWAY * (swing - state.sway_rad)
+    sway = state.sway_rad + SWAY * (swing - state.sway_rad)
     return new, changed(state, pitch_rad=pitch, nodded=state.frame if new else state.nodded, sway_rad=sway)
 
 
@@ -309,14 +308,26 @@ def _swing(values: tuple[float, ...] | list[float]) -> float:
     return risen if top - values[-1] >= BACK * risen else 0.0
 
 
-def _smile(level: float, state: FaceState) -> tuple[bool, bool, FaceState]:
-    """Return (smiles, beams, state); a smile counts after it has been up for a quarter of a second."""
-    neutral = level if state.neutral is None else state.neutral
+def smoothed_pitch(pitch_rad: float, before_rad: float | None) -> float:
+    """Return the smoothed, unwrapped pitch; `before_rad`: that of the frame before, None without one."""
+    if before_rad is None:
+        return pitch_rad
+    return before_rad + _SMOOTH * math.remainder(pitch_rad - before_rad, 2 * math.pi)
+
+
+def smile_over(level: float, neutral: float | None, held: int) -> tuple[float, float, int]:
+    """Return how far the smile is over its neutral, the neutral, and for how many frames it has been up."""
+    level = _within(level)
+    neutral = level if neutral is None else neutral
     neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
     over = level - neutral
-    held = state.held + 1 if over > SMILE * (0.6 if state.held >= HELD_FRAMES else 1.0) else 0
-    smiles = held >= HELD_FRAMES
-    return smiles, smiles and over > BEAM, changed(state, neutral=neutral, held=held)
+    return over, neutral, held + 1 if over > SMILE * (0.6 if held >= HELD_FRAMES else 1.0) else 0
+
+
+def jaw_opening(jaw: float, before: float, opening: float) -> tuple[float, float]:
+    """Return jawOpen within 0..1, and its smoothed change per frame."""
+    jaw = _within(jaw)
+    return jaw, opening + _MOTION * (abs(jaw - before) - opening)
 
 
 # --- The person -------------------------------------------------------------------------------------------------------

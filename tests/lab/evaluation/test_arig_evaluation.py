@@ -11,7 +11,7 @@ from tiny_arig_training import dyad, settings, write
 
 from sfms_robot.cli.main import main
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.evaluation.paper.arig_tables import PAPER_1, PAPER_2, PAPER_4
+from sfms_robot.lab.evaluation.arig_tables import _PAPER, _PAPER_2
 from sfms_robot.lab.learning.arig.trainer import train_arig
 
 
@@ -82,11 +82,11 @@ def test_table_2_has_a_row_for_every_listener_given_and_the_papers(evaluate, lis
     )
     rows = json.loads(out)["rows"]
     assert code == 0
-    assert [row["name"] for row in rows] == ["Ground truth", str(listener), "sfms-small", *PAPER_2]
+    assert [row["name"] for row in rows] == ["Ground truth", str(listener), "sfms-small", *_PAPER_2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("table", "paper"), [("arig-1", PAPER_1), ("arig-4", PAPER_4)])
+@pytest.mark.parametrize(("table", "paper"), [("arig-1", _PAPER[1]), ("arig-4", _PAPER[4])])
 def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, lively, tmp_path, table, paper):
     file = tmp_path / "arig.yaml"
     file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))

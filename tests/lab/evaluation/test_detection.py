@@ -5,7 +5,7 @@ import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, ListenerEvent
-from sfms_robot.lab.evaluation.detection import Calibration, Sightings, added_up, asked_and_seen, paired, seen
+from sfms_robot.lab.evaluation.detection import Calibration, Detected, Sightings, added_up, asked_and_seen, paired, seen
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import find_nods
 from sfms_robot.signals.motion_primitives import read_motions
@@ -28,10 +28,14 @@ def nodding(starts_s, late_s=0.0):
 STARTS = np.arange(3.0, 55.0, 4.0)
 
 
+def sightings(asked, motion, lag_s=None):
+    return asked_and_seen(asked, Detected.of(motion), lag_s)
+
+
 def test_what_was_asked_for_is_seen():
     asked, motion = nodding(STARTS)
-    lag = asked_and_seen(asked, motion)["nod"].offset_s
-    found = asked_and_seen(asked, motion, {"nod": lag})["nod"]
+    lag = asked_and_seen(asked, Detected.of(motion))["nod"].offset_s
+    found = asked_and_seen(asked, Detected.of(motion), {"nod": lag})["nod"]
     assert (found.recall, found.precision) == (1.0, 1.0)
     assert abs(lag) <= 0.12
 
@@ -63,18 +67,20 @@ def test_a_nod_of_eyes_that_nobody_tracked_keeps_its_size():
 
 
 def test_lateness_is_told_and_what_is_late_is_not_in_time():
-    on_time = asked_and_seen(*nodding(STARTS))["nod"].offset_s
-    late = asked_and_seen(*nodding(STARTS, late_s=0.24), {"nod": on_time})["nod"]
+    on_time = sightings(*nodding(STARTS))["nod"].offset_s
+    late = sightings(*nodding(STARTS, late_s=0.24), {"nod": on_time})["nod"]
     assert late.offset_s - on_time == pytest.approx(0.24, abs=0.045)
     assert late.recall == late.precision == 0
 
 
 def test_what_nobody_asked_for_costs_precision_and_what_is_not_there_recall():
     asked, motion = nodding(STARTS)
-    lag = {"nod": asked_and_seen(asked, motion)["nod"].offset_s}
-    assert asked_and_seen(asked[::2], motion, lag)["nod"].precision == pytest.approx(len(asked[::2]) / len(asked))
-    assert asked_and_seen(asked[::2], motion, lag)["nod"].recall == 1
-    still = asked_and_seen(asked, np.zeros_like(motion))["nod"]
+    lag = {"nod": asked_and_seen(asked, Detected.of(motion))["nod"].offset_s}
+    assert asked_and_seen(asked[::2], Detected.of(motion), lag)["nod"].precision == pytest.approx(
+        len(asked[::2]) / len(asked)
+    )
+    assert asked_and_seen(asked[::2], Detected.of(motion), lag)["nod"].recall == 1
+    still = asked_and_seen(asked, Detected.of(np.zeros_like(motion)))["nod"]
     assert still.recall == 0 and np.isnan(still.precision) and np.isnan(still.offset_s)
 
 
@@ -100,7 +106,7 @@ def test_each_is_in_one_pair_and_the_nearest_go_together():
 
 def test_motions_add_up():
     asked, motion = nodding(STARTS)
-    once, twice = (added_up([asked_and_seen(asked, motion)] * count)["nod"] for count in (1, 2))
+    once, twice = (added_up([asked_and_seen(asked, Detected.of(motion))] * count)["nod"] for count in (1, 2))
     assert len(twice.sizes) == 2 * len(once.sizes) and twice.seen == 2 * once.seen and twice.recall == once.recall
 
 

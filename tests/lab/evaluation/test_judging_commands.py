@@ -10,11 +10,10 @@ from tiny_arig_training import dyad
 
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.evaluate.naturalness import asked_for, figures, listening, notes, of_training
-from sfms_robot.lab.evaluation import two_sample
-from sfms_robot.lab.evaluation.manners import manners
-from sfms_robot.lab.evaluation.robustness import RANGES, Speaker, cases
-from sfms_robot.lab.evaluation.two_sample import FOLDS, REGIONS
+from sfms_robot.lab.evaluation import naturalness
+from sfms_robot.lab.evaluation.behaviour_stats import movement
+from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, notes
+from sfms_robot.lab.evaluation.robustness import RANGES, UnseenSpeaker, cases
 
 LEAST = 2 * FOLDS
 SERIES = {"train": "ES2008a", "validation": "IS1000a", "test": "ES2003a"}
@@ -49,7 +48,7 @@ def one_line(ended, *said: str) -> None:
 
 @pytest.mark.slow
 def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tmp_path, monkeypatch):
-    monkeypatch.setattr(two_sample, "STEPS", 6)  # the document is looked at here, not how well the nets tell apart
+    monkeypatch.setattr(naturalness, "_STEPS", 6)  # the document is looked at here, not how well the nets tell apart
     data = people(tmp_path / "dyads", ("train", "test"))
     found = command_line("evaluate", "naturalness", "--data", data, "--drift", 30, "--json").told
     assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
@@ -79,11 +78,11 @@ def test_people_who_do_nothing_and_whose_gaze_nobody_knows_leave_figures_out(tmp
     still = np.zeros((12 * FRAME_HZ, 58), np.float32)
     data = people(tmp_path, ("validation",), count=3, listener=still, attention=None, events=())
     dyads = clips.load(data / "validation")
-    nothing = manners([dyad.listener for dyad in dyads], [asked_for(dyad) for dyad in dyads])
-    found = figures(nothing, nothing)
+    nothing = movement([dyad.listener for dyad in dyads], [np.ones(len(still), bool)] * len(dyads))
+    found = compared(nothing, nothing)
     assert [found[who + name] for who in ("", "people_") for name in NOBODY_KNOWS] == [None] * 2 * len(NOBODY_KNOWS)
     assert found["nod_amplitude_ratio"] is None and found["gaze_on_person"] == 1.0
-    gaze, training = notes(dyads, of_training(data, 3))
+    gaze, training = notes(dyads, [])
     assert "in 3 dyads: gaze" in gaze and "training" in training
 
 
@@ -169,7 +168,7 @@ def test_timing_names_what_it_cannot_play(command_line, tables, words, said):
 def test_tables_without_people_of_validation_say_who_is_there(command_line, tmp_path):
     data = write_tables(tmp_path, meetings=(SERIES["train"], SERIES["test"]), until_s=120.0)
     ended = command_line("evaluate", "timing", "--data", data, "--split", "validation")
-    one_line(ended, "--split validation: the tables hold nobody of it (train 2, test 2)")
+    one_line(ended, "--split validation: the tables have no people of this split (train 2, test 2)")
 
 
 def test_tables_of_which_one_is_missing_name_it(command_line, tmp_path):
@@ -184,7 +183,7 @@ def test_tables_of_which_one_is_missing_name_it(command_line, tmp_path):
 def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line):
     words = ("evaluate", "robustness", "--speakers", 1, "--minutes", 0.1, "--seeds", 2, "--jobs", 1, "--json")
     found = command_line(*words).told
-    ways = list(cases(Speaker("any", np.zeros(1, np.float32), np.zeros((1, 58), np.float32))))
+    ways = list(cases(UnseenSpeaker("any", np.zeros(1, np.float32), np.zeros((1, 58), np.float32))))
     assert [(row["inputs"], row["condition"]) for row in found["rows"]] == [(one, how.name) for one, how in ways]
     for kind in RANGES:
         rates = [row[f"{kind}s_per_minute"] for row in found["rows"]]

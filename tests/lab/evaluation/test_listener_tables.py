@@ -11,12 +11,22 @@ from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, Dataset
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.paper.listener_clips import collect, shared_space, spread
-from sfms_robot.lab.evaluation.paper.listener_tables import TABLE_1, TABLE_2, Clips, cut, table
+from sfms_robot.lab.evaluation.listener_evaluation import collect, shared_space, spread_clips
+from sfms_robot.lab.evaluation.listener_tables import Clips, heuristics, table
+from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
 from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+
+COLUMNS = {
+    1: ("L2", "FD", "Var", "SI", "P-FD", "RPCC"),
+    2: ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn"),
+}
+
+
+def clips_of(truth, speaker, train, people=(), space="arkit58") -> Clips:
+    return Clips(space=space, truth=truth, speaker=speaker, train=train, people=people)
 
 
 def listener(space: str = "arkit58", **changes) -> SfmsListener:
@@ -60,7 +70,7 @@ def test_a_rollout_from_arrays_is_that_of_a_stream(changes):
 
 
 @pytest.mark.parametrize("space", ["arkit58", "faceverse58", "deca56"])
-@pytest.mark.parametrize("number, columns", [(1, TABLE_1), (2, TABLE_2)])
+@pytest.mark.parametrize("number, columns", COLUMNS.items())
 def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, number, columns):
     one = listener(space)
     data = [dyad("a", 130, 1, space), dyad("b", 130, 2, space)]
@@ -78,7 +88,7 @@ def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, 
 def test_the_truth_has_no_error_and_random_the_most():
     rng = np.random.default_rng(0)
     truth, speaker, train = (rng.uniform(0.4, 0.6, (6, 64, 58)) for _ in range(3))
-    rows = {row["name"]: row for row in table(1, Clips("arkit58", truth, speaker, train), {}, 2)["rows"][:5]}
+    rows = {row["name"]: row for row in table(1, clips_of(truth, speaker, train), {}, 2)["rows"][:5]}
     assert rows["Ground truth"]["expression L2"] == 0
     assert rows["Ground truth"]["expression FD"] == pytest.approx(0, abs=1e-9)
     assert rows["Random"]["expression L2"] == max(row["expression L2"] for row in rows.values())
@@ -88,7 +98,7 @@ def test_the_truth_has_no_error_and_random_the_most():
 def test_mime_of_a_speaker_who_copies_the_listener_is_the_truth():
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 1, (3, 60, 58))
-    rows = {row["name"]: row for row in table(2, Clips("arkit58", truth, truth, truth), {}, 2)["rows"][:5]}
+    rows = {row["name"]: row for row in table(2, clips_of(truth, truth, truth), {}, 2)["rows"][:5]}
     assert rows["Mime"]["FRDist"] == pytest.approx(0, abs=1e-4) and rows["Mime"]["FRSyn"] == 0
     assert rows["Mime"]["FRCorr per sample"] == pytest.approx(1, abs=1e-6)
     assert rows["Mime"]["FRCorr"] == pytest.approx(2, abs=1e-6)  # the challenge's sum over the samples
@@ -99,12 +109,12 @@ def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
     truth, speaker, train = rng.normal(0, 1, (3, 4, 60, 58))
     made = rng.normal(0, 1, (4, 2, 60, 58)).cumsum(axis=2)
     made[1, 0] = 0.5  # no lag can be told of what never moves
-    found = table(2, Clips("arkit58", truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][5]
-    assert found["FRCorr"] == pytest.approx(metrics.frc(made, truth, np.eye(4)))
-    assert found["FRDist"] == pytest.approx(metrics.reactface_frd(made, truth, np.eye(4)))
+    found = table(2, clips_of(truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][5]
+    assert found["FRCorr"] == pytest.approx(2 * metrics.frc(made, truth))
+    assert found["FRDist"] == pytest.approx(metrics.reactface_frd(made, truth))
     assert found["FRDiv"] == pytest.approx(metrics.frdiv(made)) and found["FRVar"] == pytest.approx(metrics.frvar(made))
-    assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, "skip", "all"))
-    assert set(found["interval"]) == {*TABLE_2, "FRCorr per sample"}
+    assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, as_challenge=False))
+    assert set(found["interval"]) == {*COLUMNS[2], "FRCorr per sample"}
 
 
 def test_what_is_no_whole_clip_is_not_played():
@@ -127,10 +137,10 @@ def test_some_dyads_are_spread_over_all():
     clips = tuple(Clip(str(row), 60, row, lambda row=row: replace(one, name=str(row))) for row in range(10))
     clips = (*clips[:3], Clip("broken", 60, 3, lambda: open("gone")), *clips[4:])
     whole = Dataset("composed", "train", "arkit58", 25.0, clips)
-    assert [each.name for each in spread(whole, 4)] == ["0", "2", "5", "7"]
-    assert [each.name for each in spread(whole, None)] == [*"012456789"], "what cannot be read is left out"
+    assert [each.name for each in spread_clips(whole, 4)] == ["0", "2", "5", "7"]
+    assert [each.name for each in spread_clips(whole, None)] == [*"012456789"], "what cannot be read is left out"
     with pytest.raises(ConfigError, match="none of 1 clips can be read"):
-        spread(whole[3:4], None)
+        spread_clips(whole[3:4], None)
 
 
 def test_listeners_of_several_spaces_have_no_common_table():
@@ -147,4 +157,33 @@ def test_too_short_dyads_are_refused_by_the_table_that_needs_longer_ones():
 def test_one_training_clip_does_not_say_how_clips_differ():
     clip = np.random.default_rng(0).uniform(0, 1, (1, 64, 56))
     with pytest.raises(ConfigError, match="L2L's units need training clips that differ, there is 1"):
-        table(1, Clips("deca56", clip, clip, clip), {}, 1)
+        table(1, clips_of(clip, clip, clip, space="deca56"), {}, 1)
+
+
+def answers(samples: int = 3, clips: int = 4, frames: int = 60, pose: float = 1.0) -> tuple[dict, Clips]:
+    rng = np.random.default_rng(1)
+    train, speaker = rng.uniform(0, 1, (5, frames, 58)), rng.uniform(0, 1, (clips, frames, 58))
+    train[..., :6] *= pose
+    given = clips_of(speaker, speaker, train)
+    return heuristics(given, samples, seed=0), given
+
+
+def test_all_heuristics_but_random_repeat_one_answer():
+    found, given = answers()
+    assert {name: answer.shape for name, answer in found.items()} == dict.fromkeys(found, (4, 3, 60, 58))
+    for name in ("Median", "MeanFr"):
+        scores = [metrics.frvar(found[name]), metrics.frdiv(found[name]), metrics.frdvs(found[name])]
+        assert scores == pytest.approx([0, 0, 0], abs=1e-20)
+    assert metrics.frdiv(found["Mime"]) == pytest.approx(0, abs=1e-12) and metrics.frvar(found["Mime"]) > 0
+    assert np.array_equal(found["Mime"][:, 1], given.speaker)
+    assert np.allclose(found["Median"][0, 0, 7], np.median(given.train.reshape(-1, 58), axis=0))
+
+
+def test_random_has_the_moments_of_even_numbers_in_the_range_of_training():
+    """FRVar 1/12, FRDiv and FRDvs 1/6: the paper's row."""
+    random = answers(samples=6, clips=6, frames=200, pose=0.1)[0]["Random"]
+    shapes, pose = random[..., 6:], random[..., :6]
+    assert metrics.frvar(shapes) == pytest.approx(1 / 12, rel=0.02)
+    assert metrics.frdiv(shapes) == pytest.approx(1 / 6, rel=0.02)
+    assert metrics.frdvs(shapes) == pytest.approx(1 / 6, rel=0.02)
+    assert 0 <= pose.min() and pose.max() <= 0.1

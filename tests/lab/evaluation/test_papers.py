@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import t as student_t
 from tiny_arig_training import dyad, write
 
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.evaluate.as_written import LABELS, training_file
-from sfms_robot.lab.evaluation.paper.over_people import intervals, people_of
+from sfms_robot.lab.evaluation.arig_tables import LABELS, training_file
 from sfms_robot.listeners import checkpoint
 
 
@@ -61,28 +59,3 @@ def test_without_a_folder_for_models_a_table_says_what_is_not_trained_and_how_it
         assert label not in {row["name"] for row in tables[name]["rows"] if row.get("source") == "here"}
         assert tables[name]["not_trained"][label]
     assert "configs/training/arig-as-written.yaml" in tables["arig-1"]["not_trained"]["w/o long-range context"]
-
-
-def _mean_of(values):
-    return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
-
-
-def test_intervals_over_people_are_those_of_their_means() -> None:
-    """One clip each: the jackknife of a mean is Student's interval."""
-    values = np.random.default_rng(0).normal(3.0, 2.0, 20)
-    found = intervals(_mean_of(values), [str(number) for number in range(20)])
-    low, high = student_t.interval(0.95, 19, values.mean(), values.std(ddof=1) / np.sqrt(20))
-    assert found == {"mean": (pytest.approx(low), pytest.approx(high))}
-
-
-def test_clips_of_one_person_hang_together() -> None:
-    values = np.repeat(np.random.default_rng(1).normal(0, 1, 6), 50)
-    (low, high) = intervals(_mean_of(values), [str(number) for number in np.repeat(range(6), 50)])["mean"]
-    (near, far) = intervals(_mean_of(values), [str(number) for number in range(300)])["mean"]
-    assert high - low > 3 * (far - near)
-    assert intervals(_mean_of(values), ["a", "b"] * 150) == {}
-
-
-def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:
-    dyads = [dyad(name, "listening", 0) for name in ("IS1000a_B_0120", "IS1000d_B_0007", "IS1000a_C_0120", "clip_7")]
-    assert people_of(dyads, [250, 600, 249, 300], 250) == ["IS1000 B"] * 3 + ["clip_7"]

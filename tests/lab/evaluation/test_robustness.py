@@ -1,14 +1,19 @@
 """What spoils a voice or a face keeps its length and bounds; counts become rates and scatter."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, ListenerEvent
+from sfms_robot.config import find
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES, ListenerEvent
+from sfms_robot.lab.corpora.splits import split_of_voice
 from sfms_robot.lab.evaluation.robustness import (
     CONDITIONS,
     FLICKER,
     PLAIN,
-    Speaker,
+    UnseenSpeaker,
     cases,
     counted,
     heard_and_seen,
@@ -17,13 +22,16 @@ from sfms_robot.lab.evaluation.robustness import (
     rates,
     room,
     telephone,
+    unseen,
     upside_down,
+    voice_folders,
 )
-from sfms_robot.lab.evaluation.rollout import Rollout
+from sfms_robot.lab.evaluation.rollout import Rollout, rollout
+from sfms_robot.listeners.registry import load_listener
 
 VOICE = (0.1 * np.sin(np.arange(3 * AUDIO_HZ) * 0.3)).astype(np.float32)
 FACE = np.full((3 * FRAME_HZ, 58), 0.2, np.float32)
-SPEAKER = Speaker("someone", VOICE, FACE)
+SPEAKER = UnseenSpeaker("someone", VOICE, FACE)
 
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
@@ -67,7 +75,7 @@ def test_each_way_is_played_where_it_changes_something():
     for inputs, condition in every:
         assert inputs != "voice" or (condition.face is None and condition is not FLICKER)
         assert inputs != "face" or condition.voice is None
-    assert {inputs for inputs, _ in cases(Speaker("unfilmed", VOICE, None))} == {"voice"}
+    assert {inputs for inputs, _ in cases(UnseenSpeaker("unfilmed", VOICE, None))} == {"voice"}
 
 
 def test_a_short_recording_begins_again():
@@ -109,7 +117,7 @@ def test_a_minute_of_nods_is_one_of_listening():
 def test_who_is_silent_is_listened_to_for_two_seconds_more():
     talk = np.random.default_rng(0).normal(0, 0.1, 10 * AUDIO_HZ).astype(np.float32)
     hiss = np.random.default_rng(1).normal(0, 1e-5, 20 * AUDIO_HZ).astype(np.float32)
-    listened = listened_minutes(Speaker("someone", np.r_[talk, hiss], None), 0.5)
+    listened = listened_minutes(UnseenSpeaker("someone", np.r_[talk, hiss], None), 0.5)
     assert listened == pytest.approx(12 / 60, abs=0.5 / 60)
 
 
@@ -132,3 +140,39 @@ def test_nobody_has_to_answer_whom_nothing_tells_to_speak():
     ]
     mute = {(inputs, how.name) for inputs, how in cases(SPEAKER) if not how.tells_speech(inputs)}
     assert mute == {("face", "face constant"), ("face", "face saturated")}
+
+
+LIES = ("face constant", "face saturated", "face upside down", "face lost", "attention flickers")
+MINUTES = 0.4
+MOST = {"nod": 15.0, "blink": 30.0, "smile": 4.0}  # a minute, of people who are talked to and looked at, twice as many
+
+
+def test_bundled_speakers_that_are_kept_for_test_have_a_face_as_long_as_their_voice():
+    speakers = unseen(voice_folders(None))
+    assert speakers and all(split_of_voice(speaker.name) == "test" for speaker in speakers)
+    for speaker in speakers:
+        assert speaker.face is not None and np.isfinite(speaker.face).all()
+        assert len(speaker.face) == len(speaker.voice) // FRAME_SAMPLES > 250
+
+
+def test_folders_without_such_a_voice_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="no such folder"):
+        voice_folders(Path(tmp_path / "gone"))
+    with pytest.raises(ConfigError, match=f"{tmp_path.name}: no WAV or FLAC file to take voices from"):
+        unseen((tmp_path,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sfms-small", "arig-small"])
+@pytest.mark.parametrize("lie", [one for one in CONDITIONS if one.name in LIES], ids=lambda one: one.name)
+def test_a_face_that_lies_and_attention_that_flickers_bring_no_storm(name, lie):
+    """In the motion itself, beside a voice that is as it was."""
+    (speaker, *_), rng = unseen(voice_folders(None)), np.random.default_rng(1)
+    played = rollout(
+        load_listener(find("listeners", name, "config.yaml")),
+        heard_and_seen(speaker, "both", lie, MINUTES, rng),
+        range(2),
+    )
+    for kind, numbers in counted(played).items():
+        assert np.mean(numbers) / MINUTES <= MOST.get(kind.removeprefix("decided_"), 60.0), kind
+    assert np.isfinite(played.motion).all()

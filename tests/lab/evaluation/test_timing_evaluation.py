@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
 from sfms_robot.lab.corpora.compose.ami import Person
-from sfms_robot.lab.evaluate.meetings import middle, people_of, spread
 from sfms_robot.lab.evaluation import timing
-from sfms_robot.lab.evaluation.bootstrap import estimates
-from sfms_robot.lab.evaluation.detection import Calibration, Sightings
+from sfms_robot.lab.evaluation.detection import Calibration, Detected, Sightings
+from sfms_robot.lab.evaluation.intervals import estimates
 from sfms_robot.lab.evaluation.listener_meetings import ListenerMeeting
-from sfms_robot.lab.evaluation.rollout import rollout, speaker_frames
+from sfms_robot.lab.evaluation.meetings import middle, people_of
+from sfms_robot.lab.evaluation.rollout import rollout, speaker_frames, spread
+from sfms_robot.lab.evaluation.timing import CELLS, cell_counts, cells, smoothed_rates
 from sfms_robot.signals.phase import times
 
 NONE = np.zeros((0, 2))
@@ -39,7 +42,7 @@ def meeting(nods_s, others=None, participant="A", **changed):
     others = talk() if others is None else others
     silent = np.zeros(len(others), bool)
     whole = {
-        "name": f"M1a_{participant}", "participant": participant, "speaker": (), "spans_s": {"nod": spans(nods_s)},
+        "participant": participant, "speaker": (), "spans_s": {"nod": spans(nods_s)},
         "aside": np.zeros(0, bool), "others": others, "own": silent, "unseen": silent, "alone": others,
         "attention": np.full(len(others), np.nan),
     }  # fmt: skip
@@ -151,7 +154,8 @@ def test_what_a_finder_misses_is_made_up_for():
         inside = (when_s >= start) & (when_s < start + 0.5)
         motion[0, inside, 1] = np.radians(5) * np.sin(np.pi * (when_s[inside] - start) / 0.5) ** 2
     half = Calibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
-    plain, made_up = (timing.motion_sums(one, motion, 0, known) for known in (Calibration({}), half))
+    detected = [Detected.of(each) for each in motion]
+    plain, made_up = (timing.motion_sums(one, motion, detected, 0, known) for known in (Calibration({}), half))
     assert plain["nods_per_minute"][0] > 0
     assert made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
     assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
@@ -279,7 +283,7 @@ def test_people_who_were_trained_on_are_refused_unless_asked_for():
 
 
 def test_a_part_without_people_says_who_is_there():
-    with pytest.raises(ConfigError, match=r"--split validation: the tables hold nobody of it \(train 1\)"):
+    with pytest.raises(ConfigError, match=r"--split validation: the tables have no people of this split \(train 1\)"):
         people_of([someone()], "validation", False)
 
 
@@ -329,3 +333,46 @@ def test_streams_one_by_one_and_side_by_side_are_rolled_out_alike():
     np.testing.assert_array_equal(alone, rollout(Choir(), speaker, [3, 5]).motion)
     np.testing.assert_allclose(alone[:, [1, 4, 5, 29], 1], [[3, 3, 3.04, 3.28], [5, 5, 5.04, 5.28]], rtol=1e-6)
     assert not alone[:, 0].any()  # nothing is planned yet while the first frame is heard
+
+
+MINUTE = 60 * 25
+
+
+def counts(nods, minutes):
+    """The given numbers in the first cells, nothing in the others."""
+    return np.stack([np.pad(np.array(v, float), (0, CELLS - len(v))) for v in (nods, minutes)])
+
+
+@given(st.floats(0, 100), st.floats(0, 100), st.floats(0, 100))
+def test_every_phase_has_one_cell(speech_s, silence_s, last_s):
+    cell = cells(np.array([[speech_s, silence_s, last_s]]))
+    assert cell.shape == (1,) and 0 <= cell[0] < CELLS
+
+
+def test_every_cell_has_a_phase():
+    speech = [(s, 0.0) for s in (0.5, 1.5, 3, 6, 20)]
+    silence = [(0.0, s) for s in (0.3, 0.6, 1.0, 5.0)]
+    phases = np.array([(*now, last) for now in speech + silence for last in (0.0, 2.0, 9.0)])
+    assert sorted(cells(phases)) == list(range(CELLS))
+
+
+def test_counts_are_onsets_and_minutes_within_listening():
+    cell = np.r_[np.zeros(MINUTE, int), np.ones(2 * MINUTE, int)]
+    listening = np.r_[np.ones(2 * MINUTE, bool), np.zeros(MINUTE, bool)]
+    nods, minutes = cell_counts(cell, np.array([5, 10, MINUTE, 3 * MINUTE - 1, 10 * MINUTE]), listening)
+    assert nods[:3].tolist() == [2, 1, 0]
+    assert minutes[:3].tolist() == [1, 1, 0]
+
+
+def test_a_busy_cell_has_the_higher_rate_and_an_unknown_one_the_mean():
+    rates = smoothed_rates(counts([40, 10], [10, 10]))
+    assert rates[0] > rates[2] > rates[1]
+    assert rates[2] == pytest.approx(2.5)
+
+
+def test_rates_with_much_data_are_the_plain_ones():
+    assert smoothed_rates(counts([4000, 1000], [1000, 1000]))[:2] == pytest.approx([4, 1], rel=0.02)
+
+
+def test_without_nods_all_rates_are_nought():
+    assert not smoothed_rates(counts([0], [10])).any()

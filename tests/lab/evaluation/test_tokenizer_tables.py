@@ -14,14 +14,15 @@ from sfms_robot.config import parse
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora import takes
-from sfms_robot.lab.evaluation.paper import compared_tokenizer, score_history, tokenizer_tables
-from sfms_robot.lab.evaluation.paper.compared_tokenizer import TableModel
-from sfms_robot.lab.evaluation.paper.recipes import recipes
-from sfms_robot.lab.evaluation.paper.restoration import Score, Windows, score
-from sfms_robot.lab.evaluation.paper.table_trainer import train
+from sfms_robot.lab.evaluation import table_tokenizers, tokenizer_tables
+from sfms_robot.lab.evaluation.metrics import dtw
+from sfms_robot.lab.evaluation.table_tokenizers import TableModel, recipes
+from sfms_robot.lab.evaluation.table_training import load_history, train
+from sfms_robot.lab.evaluation.tokenizer_tables import Clusters, Windows, integrity, restoration_errors, warped
 from sfms_robot.lab.learning.corpus import first_frames
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import place_exact
 from sfms_robot.signals.tracks import Take
 
@@ -49,6 +50,11 @@ def faces(frames: int = 200, seed: int = 1) -> list[Take]:
     drawn = np.random.default_rng(seed)
     steps = drawn.normal(0, 0.02, (frames, 58)).cumsum(axis=0)
     return [Take("walk", np.clip(0.3 + steps, 0, 1).astype(np.float32))]
+
+
+def mse_of(model: TableModel, seen: Windows) -> float:
+    motion = model.standardise(seen.motion)
+    return float(restoration_errors(model, motion, model.restore(motion))[0].mean())
 
 
 def test_takes_come_back_within_their_resolution(tmp_path: Path) -> None:
@@ -98,19 +104,18 @@ def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Reci
     seen = Windows.of(faces(seed=2), 48)
     trained = train("one", recipe, faces(), tmp_path, Run(), seen.motion[:1])
     assert not list((tmp_path / "one").glob("checkpoint-*")), "a finished tokenizer needs no checkpoint"
-    read = compared_tokenizer.read(tmp_path / "one")
+    read = table_tokenizers.read(tmp_path / "one")
     assert read.recipe == recipe
-    ours, again = score(trained, seen), score(read, seen)
-    assert again.mse == pytest.approx(ours.mse, rel=0.05)  # half precision on disk may move a code
-    assert again.per_take == {"walk": pytest.approx(again.mse)}
+    ours, again = (mse_of(model, seen) for model in (trained, read))
+    assert again == pytest.approx(ours, rel=0.05)  # half precision on disk may move a code
 
 
 def test_weights_of_another_recipe_are_refused(tmp_path: Path) -> None:
-    compared_tokenizer.save(tmp_path / "a", TableModel(sparse()))
-    compared_tokenizer.save(tmp_path / "b", TableModel(dense()))
-    (tmp_path / "a" / compared_tokenizer.WEIGHTS).replace(tmp_path / "b" / compared_tokenizer.WEIGHTS)
+    table_tokenizers.save(tmp_path / "a", TableModel(sparse()))
+    table_tokenizers.save(tmp_path / "b", TableModel(dense()))
+    (tmp_path / "a" / checkpoint.WEIGHTS).replace(tmp_path / "b" / checkpoint.WEIGHTS)
     with pytest.raises(ModelError, match="the weights belong to another configuration"):
-        compared_tokenizer.read(tmp_path / "b")
+        table_tokenizers.read(tmp_path / "b")
 
 
 def test_places_cost_bits_only_where_nobody_expects_them() -> None:
@@ -133,10 +138,11 @@ def test_a_score_is_in_deviations_of_the_training_motion() -> None:
 
 
 def test_a_window_error_counts_every_channel_the_same() -> None:
-    found = Score(("a", "a", "b"), np.array([[1.0, 3.0], [0.0, 0.0], [4.0, 6.0]]), 0.0, 0.0)
-    assert found.of_windows.tolist() == [2.0, 0.0, 5.0]
-    assert found.median == 2.0 and found.mse == pytest.approx(7 / 3)
-    assert found.per_take == {"a": 1.0, "b": 5.0}
+    wrong = torch.zeros(2, 48, 58)
+    wrong[0, :, 0], wrong[1, :, 57] = 1.0, 2.0
+    errors, angle_rmse_rad, shape_rmse = restoration_errors(TableModel(dense()), torch.zeros_like(wrong), wrong)
+    assert errors == pytest.approx([1 / 58, 4 / 58])
+    assert angle_rmse_rad == pytest.approx(np.sqrt(0.5 / 3)) and shape_rmse == pytest.approx(np.sqrt(2 / 52))
 
 
 def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
@@ -147,26 +153,26 @@ def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
 
 
 def test_the_paper_rows_of_the_tables_are_those_of_the_paper() -> None:
-    three = {(spec.name, spec.k): spec.paper_e2 for spec in tokenizer_tables.TABLE_3 if spec.paper_e2 is not None}
+    three = {(spec.name, spec.k): spec.paper_e2 for spec in tokenizer_tables.TABLES["3"] if spec.paper_e2 is not None}
     assert three["Dynamic (Algorithm 1, as written)", 3] / three["Static (every N/k-th)", 3] == pytest.approx(
         0.17, abs=0.005
     )
-    four = {spec.name: spec.paper_e2 for spec in tokenizer_tables.TABLE_4}
+    four = {spec.name: spec.paper_e2 for spec in tokenizer_tables.TABLES["4"]}
     assert four["Dense-FSQ-1024"] / four["Sparse-FSQ-256"] == pytest.approx(24, abs=0.5)
     assert four["L2L (VQ-256)"] / four["Sparse-FSQ-256"] == 48
 
 
 def test_a_broken_history_is_named(tmp_path: Path) -> None:
-    assert score_history.load(tmp_path) == []
-    (tmp_path / score_history.FILE).write_text('[{"stride": 1}]')
+    assert load_history(tmp_path) == []
+    (tmp_path / "history.json").write_text('[{"stride": 1}]')
     with pytest.raises(ModelError, match=r"history\.json: not the history of a tokenizer"):
-        score_history.load(tmp_path)
+        load_history(tmp_path)
 
 
 def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> None:
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
-    snapshots = score_history.load(tmp_path / "one")
+    snapshots = load_history(tmp_path / "one")
     assert {snapshot.window for snapshot in snapshots} == {0, 1}
     assert snapshots[0].step == 0 and snapshots[-1].step == 2
     for snapshot in snapshots:
@@ -188,7 +194,51 @@ def test_amplified_windows_keep_their_shape_and_their_best_masks() -> None:
 def test_bits_are_the_logarithm_of_how_many_codes_there_are(frames, data):
     k = data.draw(st.integers(0, frames))
     codes = data.draw(st.integers(1, 1024))
-    bits = compared_tokenizer.keyframe_bits(frames, k, codes)
+    bits = table_tokenizers.keyframe_bits(frames, k, codes)
     assert 2**bits == pytest.approx(math.comb(frames, k) * codes**k, rel=1e-6)
-    with pytest.raises(ValueError, match="9 keyframes in 8"):
-        compared_tokenizer.keyframe_bits(8, 9, 2)
+    with pytest.raises(ValueError, match="keyframes: expected 0 to 8, got 9"):
+        table_tokenizers.keyframe_bits(8, 9, 2)
+
+
+def kinds(each: int = 5, seed: int = 0) -> np.ndarray:
+    """(3 * each, 30, 4): three kinds of motion, each time at another pace and a little different."""
+    rng, out = np.random.default_rng(seed), []
+    for kind in range(3):
+        for _ in range(each):
+            phase = np.linspace(0, 2 * np.pi * rng.uniform(0.9, 1.1), 30)[:, None]
+            shape = np.sin((kind + 1) * phase + np.arange(4)) * (kind + 1)
+            out.append(shape + rng.normal(0, 0.05, (30, 4)))
+    return np.stack(out)
+
+
+def test_distances_are_those_of_the_metric():
+    motion = kinds(2)
+    found = warped(motion[:2], motion[2:5])
+    assert found == pytest.approx(np.array([dtw(a, motion[2:5]) for a in motion[:2]]))
+
+
+def test_kinds_are_found():
+    labels = Clusters.of(kinds(), 3).labels
+    assert [len(set(labels[rows])) for rows in np.split(np.arange(15), 3)] == [1, 1, 1] and len(set(labels)) == 3
+
+
+def test_what_is_restored_as_it_was_keeps_all_of_it():
+    motion = kinds()
+    clusters = Clusters.of(motion, 3)
+    silhouette, separation = integrity(motion, motion, clusters)
+    assert separation == pytest.approx(1) and silhouette > 0.5
+
+
+def test_codes_that_pull_kinds_together_are_seen():
+    motion = kinds()
+    clusters, mean = Clusters.of(motion, 3), motion.mean(0)
+    kept, _ = integrity(motion, motion, clusters)
+    rng = np.random.default_rng(1)
+    silhouette, separation = integrity(
+        mean + 0.3 * (motion - mean) + rng.normal(0, 0.3, motion.shape), motion, clusters
+    )
+    assert separation < 0.7 and silhouette < kept - 0.2
+
+
+def test_few_windows_make_few_clusters():
+    assert len(Clusters.of(kinds(2)).medoids) == 3

@@ -13,7 +13,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.evaluation.behaviour import behaviour
+from sfms_robot.lab.evaluation.behaviour_stats import behaviour
 from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.lab.evaluation.sampling_calibration import calibrate
 from sfms_robot.lab.learning.corpus import windows
@@ -82,7 +82,7 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     (one,) = rollouts(sfms.load(tmp_path), [unseen], seed=1)
     assert one.motion.shape == (1, 160, 58) and np.isfinite(one.motion).all()
     own, people = behaviour([one.motion[0]], [unseen]), behaviour([unseen.listener], [unseen])
-    assert people.blinks >= 0 and own.jerk_deg_s3 > 0
+    assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0
 
 
 def test_training_repeats_bit_for_bit(data, tmp_path):

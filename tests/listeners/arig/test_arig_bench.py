@@ -4,9 +4,7 @@ import pytest
 from tiny_arig import arig_listener, talk
 
 from sfms_robot.lab.bench import listener_bench as bench
-from sfms_robot.lab.bench.engine_bench import TURN_HOPS, Stream, take_turns
-from sfms_robot.lab.bench.in_run import in_run
-from sfms_robot.lab.bench.samplers import WAYS, samplers
+from sfms_robot.lab.bench.listener_bench import TURN_HOPS, WAYS, Stream, in_run, samplers, take_turns
 from sfms_robot.listeners import checkpoint
 
 MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}
@@ -25,14 +23,14 @@ def test_the_fast_path_is_compared_frame_by_frame():
     for listener in (one, other):
         listener.model.motion_mean.fill_(0.5)
         listener.model.motion_std.fill_(0.02)
-    assert bench._distance(one, one, talk(10)) == 0
-    assert 0 < bench._distance(other, one, talk(10)) < 0.05
+    assert bench.distance(one, one, talk(10)) == 0
+    assert 0 < bench.distance(other, one, talk(10)) < 0.05
 
 
 @pytest.mark.parametrize("minutes", [1, 60])
 def test_a_memory_minutes_old_goes_on(minutes: int):
     listener = arig_listener()
-    memory = bench._later(listener, listener.start(0), talk(5), minutes)
+    memory = bench.aged(listener, listener.start(0), talk(5), minutes)
     assert memory.frames == minutes * 1500 and memory.context.any()
     stream = Stream(listener, memory)
     take_turns({"one": stream}, talk(5), turns=3)

@@ -6,7 +6,7 @@ from tiny_sfms import speech
 
 from sfms_robot.config import find
 from sfms_robot.frames import CHANNEL_INDEX, ListenerEvent
-from sfms_robot.lab.evaluation.detection import added_up, asked_and_seen
+from sfms_robot.lab.evaluation.detection import Detected, added_up, asked_and_seen
 from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import at_hop, load_listener
 from sfms_robot.listeners.sfms.draw import UNDECIDED, anchored, revoked
@@ -81,7 +81,7 @@ def test_nods_come_out_as_told_and_when(hop: int):
     ]
     silence = speech(round(25 * (nods[-1].end_s + 2)))
     motions = rollout(listener, silence, [1, 2, 3], nods).motion
-    seen = added_up(asked_and_seen(nods, motion, {"nod": -0.06}) for motion in motions)["nod"]
+    seen = added_up(asked_and_seen(nods, Detected.of(motion), {"nod": -0.06}) for motion in motions)["nod"]
     assert seen.recall >= 26 / 27 and seen.precision >= 26 / 27
     pitch = np.degrees(motions[..., CHANNEL_INDEX["pitch"]])
     made = [np.ptp(pitch[:, round(25 * nod.start_s) - 2 : round(25 * nod.end_s) + 2], axis=1) for nod in nods]

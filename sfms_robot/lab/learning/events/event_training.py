@@ -21,7 +21,7 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
-from sfms_robot.lab.evaluate.meetings import tables
+from sfms_robot.lab.evaluation.meetings import tables
 from sfms_robot.lab.learning.events import event_rollout, event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,

@@ -1,0 +1,148 @@
+"""Confidence intervals of figures over people: 95 %, for other people of the same kind.
+
+Whole people are drawn with replacement, not their minutes or their nods, which depend on one another. For the bootstrap
+(`estimates`) a figure is a function of sums over people, so a person is one row of sums, computed once for all draws.
+Most sums are pairs: a count and its base. Metrics of the papers that pool all clips are not such functions; for these
+`jackknife` leaves out one person at a time, which takes as many evaluations as there are people instead of thousands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student_t
+
+from sfms_robot.frames import Doubles
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.splits import series
+
+LEVEL: Final = 0.95
+DRAWS: Final = 2000
+_DEFINED: Final = 0.9  # share of the draws in which a figure has to be defined to have an interval
+_LEAST_PEOPLE: Final = 3  # for a jackknife
+
+Sums = dict[str, Doubles]  # of one person: name -> numbers (K,)
+Totals = Mapping[str, Doubles]  # of R sets of people: name -> (R, K)
+Figure = Callable[[Totals], Doubles]  # -> (R,), NaN where it is not defined
+Chosen = NDArray[np.intp]  # places of clips
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and its interval; None where it is not defined, or there are too few people."""
+
+    value: float | None
+    interval: tuple[float, float] | None
+
+
+def ends(values: Doubles) -> Doubles:
+    """Return the ends (2, ...) of the interval of `LEVEL` of draws (R, ...)."""
+    return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
+
+
+def draw_people(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
+    """Draw sets of `count` people with replacement; return how often each is in each set (draws, count)."""
+    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), draws)
+
+
+def added(parts: Iterable[Sums]) -> Sums:
+    """Return the sum of each name over all parts."""
+    total: Sums = {}
+    for part in parts:
+        for name, numbers in part.items():
+            total[name] = total[name] + numbers if name in total else np.asarray(numbers, np.float64)
+    return total
+
+
+def estimates(
+    figures: Mapping[str, Figure], people: Sequence[Sums], seed: int, draws: int = DRAWS
+) -> dict[str, Estimate]:
+    """Return every figure of all people with its interval (percentiles over `draws` sets of as many people).
+
+    All people have the same names. One seed gives the same sets for any figures.
+    """
+    count = len(people)
+    weights = np.concatenate([np.ones((1, count)), draw_people(count, seed, draws)])  # all people once, then the draws
+    totals = {name: weights @ np.stack([person[name] for person in people]) for name in people[0]}
+
+    def estimate(values: Doubles) -> Estimate:
+        value = float(values[0]) if np.isfinite(values[0]) else None
+        defined = values[1:][np.isfinite(values[1:])]
+        if value is None or count < 2 or len(defined) < _DEFINED * draws:
+            return Estimate(value, None)
+        low, high = ends(defined).tolist()
+        return Estimate(value, (low, high))
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {name: estimate(figure(totals)) for name, figure in figures.items()}
+
+
+def quotient(name: str) -> Figure:
+    """Return the figure of a pair: the count over its base."""
+    return lambda totals: totals[name][:, 0] / totals[name][:, 1]
+
+
+def ratio(above: str, below: str) -> Figure:
+    """Return the figure of two pairs: one quotient over the other."""
+    return lambda totals: quotient(above)(totals) / quotient(below)(totals)
+
+
+def _shares(histograms: Doubles) -> Doubles:
+    return np.asarray(np.cumsum(histograms, axis=1) / histograms.sum(axis=1, keepdims=True))
+
+
+def distance(one: str, other: str) -> Figure:
+    """Return Kolmogorov and Smirnov's figure of two histograms: the largest difference of their cumulative shares."""
+    return lambda totals: np.asarray(np.abs(_shares(totals[one]) - _shares(totals[other])).max(axis=1))
+
+
+def median(name: str, middles: Doubles) -> Figure:
+    """Return the median of a histogram whose bins have these middles (K,)."""
+
+    def figure(totals: Totals) -> Doubles:
+        shares = _shares(totals[name])
+        return np.where(np.isnan(shares[:, -1]), np.nan, middles[np.argmax(shares >= 0.5, axis=1)])
+
+    return figure
+
+
+# --- leaving out one person at a time -------------------------------------------------------------------------------
+
+
+def people_of(dyads: Sequence[Dyad], lengths: Sequence[int], frames: int) -> list[str]:
+    """Return the listener of each clip of `frames` frames, cut out of motions of these lengths.
+
+    In composed dyads this is the seat in a series of meetings, in others the dyad itself.
+    """
+
+    def person(dyad: Dyad) -> str:
+        meeting, _, rest = dyad.name.partition("_")
+        seat, _, start = rest.partition("_")
+        return f"{series(meeting)} {seat}" if start.isdigit() else dyad.name
+
+    return [person(dyad) for dyad, length in zip(dyads, lengths, strict=True) for _ in range(length // frames)]
+
+
+def jackknife(score: Callable[[Chosen], Mapping[str, Any]], people: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the interval of every finite figure of `score(clips)`; none for fewer than three people.
+
+    `people` names the listener of each clip. With n people and s the standard deviation of the n figures without one of
+    them, the interval is the figure of all +- t(n - 1) sqrt(n - 1) s.
+    """
+    who = np.asarray(people)
+    names = np.unique(who)
+    if len(names) < _LEAST_PEOPLE:
+        return {}
+    parts = [score(np.flatnonzero(who != name)) for name in names]
+    wide = float(student_t.ppf((1 + LEVEL) / 2, len(parts) - 1))
+    found = {}
+    for name, value in score(np.arange(len(who))).items():
+        without = np.array([part[name] for part in parts], np.float64)
+        if value is not None and np.isfinite(without).all() and np.isfinite(value):
+            reach = wide * float(np.sqrt((len(parts) - 1) * np.var(without)))
+            found[name] = (float(value) - reach, float(value) + reach)
+    return found

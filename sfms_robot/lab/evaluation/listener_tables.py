@@ -1,0 +1,204 @@
+"""Tables I and II of the SFMS paper, on any data: listeners and heuristics beside the paper's rows.
+
+The paper does not say how its numbers were computed; each choice is stated where it is made. Table 1 is that of the
+Learning2Listen line, expression and rotation apart; table 2 that of the REACT challenge, which scores 25 attributes
+that no public code derives from coefficients: here it is computed on the coefficients, with ReactFace's FRDist. FRRea
+needs rendered pictures and is out of scope. The paper's rows come from other data and spaces: compare their shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS, Doubles
+from sfms_robot.lab.corpora.learning2listen import l2l_mean_std
+from sfms_robot.lab.evaluation import metrics
+from sfms_robot.lab.evaluation.intervals import Chosen, jackknife
+
+PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
+    "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
+    "faceverse58": {"expression": slice(0, 52), "rotation": slice(52, 55)},
+    "deca56": {"expression": slice(0, 50), "rotation": slice(50, 53)},
+}
+CLUSTERS: Final = {"expression": 15, "rotation": 9}  # of the Shannon index (V-D1)
+FRAMES: Final = {1: 64, 2: 750}  # of a clip: Learning2Listen's and REACT's
+NEEDED_FRAMES: Final = {1: 2, 2: 51}  # FRSyn looks 49 frames either way
+_LEAST_SPREAD: Final = 1e-6  # smaller spreads would divide by nearly nothing
+_COLUMNS_1: Final = ("L2", "FD", "Var", "SI", "P-FD", "RPCC")
+_COLUMNS_2: Final = ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn")
+
+# Tables I and II of the paper, in its units; None where it leaves a cell out.
+_NONE: Final = (None,) * 6
+_PAPER_1: Final = {  # per part: L2, FD, Var, SI, P-FD, RPCC
+    "Ground truth": ((None, 0.0, 2.90, 2.61, None, None), (None, None, 0.81, 1.96, None, None)),
+    "Random": ((129.34, 524.69e3, 62.23, 1.17, 526.46e3, 0.08), (27.67, 257.06e2, 62.39, 1.06, 257.16e2, 0.002)),
+    "Median": ((43.18, 97.86e3, 0.0, 0.0, None, None), _NONE),
+    "LFI": ((50.07, 43.63e3, 1.15, 1.33, 54.34e3, 0.8), (9.00, 9.80e2, 0.17, 1.07, 12.36e2, 0.034)),
+    "Learning2Listen": ((33.16, 3.55e3, 2.01, 2.48, 5.15e3, 0.02), (4.75, 0.81e2, 0.62, 1.82, 0.87e2, 0.0)),
+    "ELP": ((None, 1.37e3, 2.70, 2.15, None, 0.014), (None, 0.36e2, 0.59, 1.60, None, 0.077)),
+    "SFMS": ((26.65, 1.13e3, 2.17, 2.63, 1.35e3, 0.0023), (4.02, 0.68e2, 0.83, 2.03, 0.73e2, 0.006)),
+}
+_PAPER_2: Final = {  # FRCorr, FRDist, FRDiv, FRVar, FRDvs, FRSyn
+    "Ground truth": (0.85, 0.0, 0.0, 0.0724, 0.2483, 47.69),
+    "Random": (0.05, 237.23, 0.1667, 0.0833, 0.1667, 44.10),
+    "Mime": (0.38, 92.94, 0.0, 0.0724, 0.2483, 38.54),
+    "MeanFr": (0.0, 97.86, 0.0, 0.0, 0.0, 49.0),
+    "Trans-VAE": (0.07, 90.31, 0.0064, 0.0012, 0.0009, 44.65),
+    "BeLFusion": (0.12, 94.09, 0.0379, 0.0248, 0.0397, 49.0),
+    "Dense-FSQ": (0.31, 84.93, 0.1164, 0.0348, 0.1166, 47.42),
+    "SFMS": (0.84, 66.89, 0.1207, 0.0871, 0.1212, 45.66),
+}
+
+Score = Callable[[Chosen], dict[str, Any]]  # figures of some of the clips
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clips:
+    """Clips of one length in one motion space.
+
+    Attributes:
+        truth, speaker: (N, T, D); train: (M, T, D) listeners of the training set.
+        people: (N,) the listener of each clip; empty if no intervals are wanted.
+    """
+
+    space: str
+    truth: Doubles
+    speaker: Doubles
+    train: Doubles
+    people: Sequence[str] = ()
+
+
+def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: int, seed: int = 0) -> dict[str, Any]:
+    """Return table 1 or 2: rows of truth, heuristics, `answers` (N, K, T, D) by name, and the paper's.
+
+    A row has `source` "here" or "paper"; `features` names the feature space of the numbers from here.
+    """
+    score_of = _table_1(clips) if number == 1 else partial(_table_2, clips)
+    guesses = {"Ground truth": clips.truth[:, None], **heuristics(clips, samples, seed)}
+    rows = []
+    for name, motion in {**guesses, **answers}.items():
+        score = score_of(motion)
+        over = jackknife(score, clips.people) if name in answers else {}
+        rows.append({"name": name, "source": "here", **score(np.arange(len(clips.truth))), "interval": over})
+    if number == 1:
+        keys = [f"{part} {column}" for part in CLUSTERS for column in _COLUMNS_1]
+        paper = {name: dict(zip(keys, [*first, *second], strict=True)) for name, (first, second) in _PAPER_1.items()}
+    else:
+        paper = {name: dict(zip(_COLUMNS_2, row, strict=True)) for name, row in _PAPER_2.items()}
+    rows += [{"name": name, "source": "paper", **row} for name, row in paper.items()]
+    return {
+        "table": number,
+        "space": clips.space,
+        "features": _features(number, clips.space),
+        "clips": len(clips.truth),
+        "frames": clips.truth.shape[1],
+        "samples": samples,
+        "rows": [
+            {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()}
+            for row in rows
+        ],
+    }
+
+
+def _features(number: int, space: str) -> str:
+    if number == 1 and space == "deca56":
+        return "L2L-standardised: less the mean, over the deviation between clips of their deviations"
+    if number == 1:
+        return f"{space}, less the mean of training"
+    return f"{space}, raw coefficients; appropriate is the own listener alone"
+
+
+def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
+    """Return the answers (N, K, T, D) of listeners that learn nothing; all but Random give K equal answers.
+
+    Random, Mime and MeanFr as in `run_baselines` of the REACT challenge (baseline_react2023 @ c5a8ff85), Median as
+    Learning2Listen names it. Random draws every number uniformly from its channel's range (0..1 for blendshapes, else
+    that of training): FRVar is 1/12, FRDiv and FRDvs 1/6 in units of it.
+    """
+    shapes = np.array([channel in BLENDSHAPES for channel in SPACE_CHANNELS[clips.space]])
+    low = np.where(shapes, 0.0, clips.train.min(axis=(0, 1)))
+    high = np.where(shapes, 1.0, clips.train.max(axis=(0, 1)))
+    n, t, d = clips.speaker.shape
+    still = {"Median": np.median(clips.train, axis=(0, 1)), "MeanFr": clips.train.mean(axis=(0, 1))}
+    return {
+        "Random": np.random.default_rng(seed).uniform(low, high, (n, samples, t, d)),
+        **{
+            name: np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
+            for name, motion in (("Median", still["Median"]), ("Mime", clips.speaker), ("MeanFr", still["MeanFr"]))
+        },
+    }
+
+
+def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
+    """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
+    scaled = _scale(clips)
+    truth, speaker = scaled(clips.truth), scaled(clips.speaker)
+    most = max(CLUSTERS.values())
+    if (frames := truth.shape[0] * truth.shape[1]) < most:
+        raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
+    centres = metrics.centres_of(truth, PARTS[clips.space], CLUSTERS)
+
+    def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
+        row: dict[str, Any] = {}
+        for part, where in PARTS[clips.space].items():
+            own, person = truth[chosen][..., where], speaker[chosen][..., where]
+            values = [
+                (
+                    metrics.l2(own, guess),
+                    metrics.frechet_distance(own, guess),
+                    metrics.variance(guess),
+                    metrics.shannon_index(guess, centres[part]),
+                    metrics.paired_frechet_distance(own, guess, person),
+                    metrics.rpcc_flat(own, guess, person) if np.ptp(guess) else float("nan"),
+                )
+                for guess in (scaled(pred[chosen, k])[..., where] for k in range(pred.shape[1]))
+            ]
+            means = (float(np.mean(column)) for column in zip(*values, strict=True))
+            row |= {f"{part} {name}": value for name, value in zip(_COLUMNS_1, means, strict=True)}
+        return row
+
+    return lambda pred: partial(score, pred)
+
+
+def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
+    """Return the map to the units of L2L's numbers for its coefficients; other spaces less the mean of training.
+
+    Var and RPCC take all channels for one signal: of a head that rests at pi about x they would see nothing else.
+    """
+    if clips.space != "deca56":
+        rest = clips.train.mean(axis=(0, 1))
+        return lambda motion: motion - rest
+    mean, spread = l2l_mean_std(clips.train)
+    if (spread < _LEAST_SPREAD).all():
+        raise ConfigError(f"L2L's units need training clips that differ, there is {len(clips.train)}")
+    spread = np.where(spread < _LEAST_SPREAD, np.inf, spread)
+    return lambda motion: (motion - mean) / spread
+
+
+def _table_2(clips: Clips, pred: Doubles) -> Score:
+    """FRCorr is the challenge's sum over the samples, with a column for the mean; FRSyn skips constant channels.
+
+    All but FRDvs are means over the clips: the numbers of each clip are computed once for any choice of clips.
+    """
+    by_clip = np.array(
+        [
+            (metrics.frc(made, true), metrics.reactface_frd(made, true), metrics.frdiv(made), metrics.frvar(made))
+            for made, true in zip(pred[:, None], clips.truth[:, None], strict=True)
+        ]
+    )
+    lags = metrics.synchrony_lags(pred, clips.speaker, as_challenge=False)
+
+    def score(chosen: Chosen) -> dict[str, Any]:
+        correlation, distance, diverse, varied = by_clip[chosen].mean(axis=0).tolist()
+        known = lags[chosen][np.isfinite(lags[chosen])]
+        synchrony = float(known.mean()) if len(known) else float("nan")
+        values = (correlation * pred.shape[1], distance, diverse, varied, metrics.frdvs(pred[chosen]), synchrony)
+        return dict(zip(_COLUMNS_2, values, strict=True)) | {"FRCorr per sample": correlation}
+
+    return score

@@ -1,0 +1,302 @@
+"""`evaluate naturalness`: a listener's motion beside that of people whose motion it was never trained on.
+
+Besides statistics of movement and drift, a small network tries to distinguish the two: a classifier two-sample test
+(Lopez-Paz and Oquab 2017). Both motions are cut into windows of two seconds, by region of the face, after the same 6 Hz
+low-pass and with the noise of a face tracker, so that motion is judged, not rounding or a missing tremor. A network of
+three convolutions learns on the windows of most dyads and scores those of the others, in folds by dyad: no speaker and
+no stretch of a meeting is on both sides. The area under its ROC curve is 0.5 for indistinguishable motions, 1 for
+always distinguishable ones.
+
+Network, windows, noise and seeds are fixed: figures are comparable between versions, and nothing here may ever become a
+training loss.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+from torch import Tensor, nn
+
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame, changed
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.formats import detect, open_for, split_names
+from sfms_robot.lab.corpora.reading import speaks
+from sfms_robot.lab.evaluation.behaviour_stats import movement, slow_poses_deg
+from sfms_robot.lab.evaluation.intervals import ends
+from sfms_robot.lab.evaluation.listener_evaluation import bar
+from sfms_robot.lab.evaluation.phrase_timing import rank_auc
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
+from sfms_robot.listeners.engine import EngineName
+from sfms_robot.listeners.registry import engine_name, one_thread
+from sfms_robot.ports import Listener
+
+Bools = NDArray[np.bool_]
+REGIONS: Final[Mapping[str, tuple[int, ...]]] = {
+    "head": tuple(range(6)),
+    "eyes": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("eyeLook")),
+    "lids": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith(("eyeBlink", "eyeSquint", "eyeWide"))),
+    "mouth": tuple(CHANNEL_INDEX[n] for n in CHANNELS if n.startswith(("jaw", "mouth", "cheek", "nose", "tongue"))),
+    "brows": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("brow")),
+}
+FOLDS: Final = 5
+WINDOW: Final = 2 * FRAME_HZ
+_LOW_PASS_HZ: Final = 6.0
+_NOISE: Final = np.array([np.deg2rad(0.15)] * 3 + [0.0005] * 3 + [0.02] * 52)  # rad, m, of full closure
+_STEPS: Final = 240
+_BATCH: Final = 64
+_WIDTH: Final = 24
+_LEARNING_RATE: Final = 3e-3
+_WEIGHT_DECAY: Final = 0.02
+_RESAMPLED: Final = 400  # draws of dyads, for an interval
+_SEED: Final = 20
+_CHUNK: Final = 512
+
+
+def evaluate_naturalness(
+    name: str, data: Path, split: str, clips: int | None, drift_s: float, seed: int, engine: EngineName = "auto"
+) -> dict[str, Any]:
+    """Roll a listener out over the dyads of `split`, and compare its motion with that of their listeners.
+
+    Raises ConfigError for fewer than ten dyads, and for people of training. Blocks for minutes and
+    shows its progress.
+    """
+    one_thread()
+    if split == "train":
+        raise ConfigError("--split train: listeners were trained on these people; validation and test are others")
+    dyads = spread([at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split))], clips)
+    if len(dyads) < 2 * FOLDS:
+        raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; this comparison needs {2 * FOLDS} or more")
+    listener = load_at_hop(name, engine=engine)
+    heard = [frames_of_dyad(dyad) for dyad in dyads]
+    with bar(f"{name} listens", len(dyads) + 1) as advance:
+        ours = []
+        for number, speaker in enumerate(heard):
+            ours.append(rollout(listener, speaker, [seed + number]).motion[0])
+            advance()
+        long = long_run(listener, heard, drift_s, seed)
+        advance()
+    theirs, training = [dyad.listener for dyad in dyads], _training_windows(data, len(dyads))
+    with bar("two-sample tests", 2 * (4 if training else 2) * len(REGIONS) * FOLDS) as advance:
+        tests = two_samples(listening(dyads, ours), listening(dyads, theirs), training, advance)
+    addressed = [
+        np.ones(len(dyad.listener), bool) if dyad.attention is None else np.asarray(dyad.attention > 0.5)
+        for dyad in dyads
+    ]
+    return {
+        "listener": name,
+        "engine": engine_name(listener),
+        "split": split,
+        "dyads": len(dyads),
+        "minutes": round(sum(map(len, ours)) * FRAME_S / 60, 1),
+        **tests,
+        **compared(movement(ours, addressed), movement(theirs, addressed)),
+        **drifted(long, theirs),
+        "notes": list(notes(dyads, training)),
+    }
+
+
+def notes(dyads: Sequence[Dyad], training: Sequence[Floats]) -> Iterator[str]:
+    """Yield what a reader of the figures has to know."""
+    unknown = sum(dyad.attention is None for dyad in dyads)
+    if unknown:
+        yield f"the person's attention is unknown in {unknown} dyads: gaze counts all the time there"
+    if not training:
+        yield "too few dyads of training to compare its people with these"
+
+
+def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
+    """Return the windows (W, 50, 58) of each motion (N, 58) in which the dyad's listener is silent.
+
+    A mouth that talks is judged by its words (`evaluate interaction`).
+    """
+    rng = np.random.default_rng(0)
+    return [windows(motion, rng, silent(dyad)[: len(motion)]) for dyad, motion in zip(dyads, motions, strict=True)]
+
+
+def silent(dyad: Dyad) -> Bools:
+    """Return (N,) frames in which the dyad's listener is silent."""
+    frames = len(dyad.listener)
+    return np.ones(frames, bool) if dyad.agent_audio is None else ~speaks(dyad.agent_audio, frames, FRAME_HZ)
+
+
+def _training_windows(data: Path, count: int) -> list[Floats]:
+    """Return the windows of `count` listeners of the training split; empty if there are fewer."""
+    if "train" not in split_names(*detect(data, "auto")):
+        return []
+    every = open_for("arkit58", data, "train")
+    some = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(spread(every.clips, count))))]
+    return listening(some, [dyad.listener for dyad in some]) if len(some) == count else []
+
+
+def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_s: float, seed: int) -> Floats:
+    """Return the motion (N, 58) of one stream that hears one person after another for `drift_s`."""
+    frames: list[SpeakerFrame] = []
+    while len(frames) < drift_s * FRAME_HZ:
+        for speaker in heard:
+            frames += speaker
+    kept = frames[: round(drift_s * FRAME_HZ)]
+    timed = [changed(frame, time_s=(index + 1) * FRAME_S) for index, frame in enumerate(kept)]
+    motion: Floats = rollout(listener, timed, [seed]).motion[0]
+    return motion
+
+
+def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:
+    """Return the figures of `movement` of both, and the ratio of nod sizes; None where there is no data."""
+    ratio = ours["nod_deg"] / theirs["nod_deg"] if theirs["nod_deg"] else math.nan
+    figures = {"nod_amplitude_ratio": ratio, **ours, **{f"people_{name}": value for name, value in theirs.items()}}
+    return {name: round(value, 3) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
+    """Return how far the head is from the middle at the end of a long run, and outside people's 1 to 99 %."""
+    end = np.median(slow_poses_deg([motion])[-6:], axis=0)
+    low, high = np.percentile(slow_poses_deg(theirs), [1, 99], axis=0)
+    outside = np.maximum(np.maximum(low - end, end - high), 0.0)
+    return {
+        "drift_deg": round(float(np.abs(end).max()), 2),
+        "drift_outside_people_deg": round(float(outside.max()), 2),
+        "people_pose_deg": {name: [round(float(a), 2), round(float(b), 2)] for name, a, b in
+                            zip(("roll", "pitch", "yaw"), low, high, strict=True)},
+    }  # fmt: skip
+
+
+# --- two-sample tests -----------------------------------------------------------------------------------------------
+
+
+def two_samples(
+    ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequence[Floats], each: Callable[[], object]
+) -> dict[str, Any]:
+    """Return by region `two_sample_auc` of windows by dyad, each with its interval over dyads, and tests for scale.
+
+    For scale: people against other people of the same split and, if `training` is given, people of training against
+    them: a perfect imitation of training could be distinguished as often. `imitated_two_sample_auc`: ours
+    against people of training. `levelled_`: each motion standardised by its own mean and deviation.
+    """
+    half = 2 * (len(theirs) // 2)
+    pairs: dict[str, tuple[Sequence[Floats], ...]] = {
+        "two_sample_auc": (ours, theirs),
+        "person_two_sample_auc": (theirs[0:half:2], theirs[1:half:2]),
+    }
+    if training:
+        pairs |= {"training_two_sample_auc": (training, theirs), "imitated_two_sample_auc": (ours, training)}
+    pairs |= {f"levelled_{name}": tuple([*map(levelled, one)] for one in pair) for name, pair in pairs.items()}
+    found = {
+        name: {region: separability(one, other, region, each) for region in REGIONS}
+        for name, (one, other) in pairs.items()
+    }
+    return {
+        **{name: {region: round(auc, 3) for region, (auc, _, _) in one.items()} for name, one in found.items()},
+        "interval": {
+            name: {region: [round(low, 3), round(high, 3)] for region, (_, low, high) in one.items()}
+            for name, one in found.items()
+        },
+    }
+
+
+def windows(motion: Floats, rng: np.random.Generator, judged: Bools | None = None) -> Floats:
+    """Return consecutive windows (W, 50, 58) of motion (N, 58), low-passed, with a tracker's noise.
+
+    With `judged` (N,) only windows of such frames. A motion shorter than a window gives none.
+    """
+    if len(motion) < WINDOW:
+        return np.zeros((0, WINDOW, motion.shape[1]), np.float32)
+    sections = butter(4, _LOW_PASS_HZ, fs=FRAME_HZ, output="sos")
+    smooth = sosfiltfilt(sections, motion.astype(np.float64), axis=0)
+    seen = smooth + _NOISE * rng.standard_normal(smooth.shape)
+    whole = len(seen) // WINDOW
+    cut = np.asarray(seen[: whole * WINDOW].reshape(whole, WINDOW, -1), np.float32)
+    return cut if judged is None else cut[judged[: whole * WINDOW].reshape(whole, WINDOW).all(axis=1)]
+
+
+def levelled(part: Floats) -> Floats:
+    """Return windows (W, 50, 58) of one motion with each channel standardised over all of them.
+
+    Rest poses and amplitudes differ from take to take; the shape of the motion remains.
+    """
+    if not len(part):
+        return part
+    return np.asarray((part - part.mean(axis=(0, 1))) / part.std(axis=(0, 1)).clip(min=1e-6), np.float32)
+
+
+def separability(
+    ours: Sequence[Floats], theirs: Sequence[Floats], region: str, each: Callable[[], object] = lambda: None
+) -> tuple[float, float, float]:
+    """Return the area under the ROC curve and its 95 % interval over dyads, of windows (W, 50, 58) by dyad.
+
+    Dyad d of both is the same dyad, or at least not a person of another one. Calls `each()` after every fold. Raises
+    ValueError for fewer dyads than folds.
+    """
+    if len(ours) != len(theirs) or len(ours) < FOLDS:
+        raise ValueError(f"dyads: expected equally many, {FOLDS} or more, got {len(ours)} and {len(theirs)}")
+    channels = list(REGIONS[region])
+    clips = [part[..., channels] for part in (*ours, *theirs)]
+    sizes = [len(part) for part in clips]
+    dyad = np.repeat(np.tile(np.arange(len(ours)), 2), sizes)
+    label = np.repeat(np.repeat([1, 0], len(ours)), sizes)
+    values = torch.from_numpy(np.concatenate(clips))
+    fold = np.random.default_rng(_SEED).permutation(len(ours)) % FOLDS
+    scores = np.zeros(len(values))
+    for number in range(FOLDS):
+        held_out = fold[dyad] == number
+        if held_out.any() and not held_out.all():
+            scores[held_out] = _scores(values[~held_out], label[~held_out], values[held_out], _SEED + number)
+        each()
+    rng, drawn = np.random.default_rng(_SEED), []
+    rows = [np.flatnonzero(dyad == number) for number in range(dyad.max() + 1)]
+    for _ in range(_RESAMPLED):  # dyads, with replacement
+        chosen = np.concatenate([rows[number] for number in rng.integers(len(rows), size=len(rows))])
+        drawn.append(rank_auc(scores[chosen], label[chosen] == 1, label[chosen] == 0))
+    known = np.array(drawn)
+    low, high = ends(known[np.isfinite(known)]).tolist()
+    return rank_auc(scores, label == 1, label == 0), low, high
+
+
+def _scores(values: Tensor, label: NDArray[np.intp], unseen: Tensor, seed: int) -> Doubles:
+    """Train a network on values (N, 50, C) with labels (N,) 1 or 0; return log-odds (M,) of `unseen` (M, 50, C)."""
+    mean, deviation = values.mean((0, 1)), values.std((0, 1)).clamp(min=1e-6)
+    values, unseen = (((each - mean) / deviation).transpose(1, 2) for each in (values, unseen))  # channels first
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = _network(values.shape[1])
+        wanted = torch.from_numpy(label).float()
+        # Both kinds weigh the same, regardless of their numbers of windows.
+        loss = nn.BCEWithLogitsLoss(pos_weight=(1 - wanted).sum() / wanted.sum().clamp(min=1))
+        optimizer = torch.optim.AdamW(network.parameters(), _LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, _STEPS)
+        for _ in range(_STEPS):
+            rows = torch.randint(len(values), (_BATCH,))
+            optimizer.zero_grad()
+            loss(network(values[rows])[:, 0], wanted[rows]).backward()
+            optimizer.step()
+            schedule.step()
+        network.eval()
+        with torch.no_grad():
+            parts = [network(part)[:, 0] for part in torch.split(unseen, _CHUNK)]
+    return np.asarray(torch.cat(parts).double().numpy(), np.float64)
+
+
+def _network(channels: int) -> nn.Sequential:
+    """Build three convolutions over time, the mean and maximum of their output, and one number."""
+    return nn.Sequential(
+        nn.Conv1d(channels, _WIDTH, 5, padding=2), nn.GELU(),
+        nn.Conv1d(_WIDTH, _WIDTH, 5, stride=2, padding=2), nn.GELU(),
+        nn.Conv1d(_WIDTH, _WIDTH, 5, stride=2, padding=2), nn.GELU(),
+        _MeanAndMost(), nn.Dropout(0.2), nn.Linear(2 * _WIDTH, 1),
+    )  # fmt: skip
+
+
+class _MeanAndMost(nn.Module):
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, W, T) to (B, 2W)."""
+        return torch.cat([x.mean(-1), x.amax(-1)], dim=-1)

@@ -1,0 +1,406 @@
+"""`evaluate people`: a blind comparison of listeners by people: its clips, its answers, its table.
+
+A study is a folder: `study.json` describes what is compared, `clips/` holds each condition's motion to each voice under
+a name that does not reveal the condition, `answers.csv` gets a row per answer when it is given. Called again with the
+same arguments the command resumes the study.
+
+A trial shows two clips of the same voice, left and right, and asks `QUESTIONS` about them. Each participant sees every
+pair of conditions with every voice once, in a random order and on random sides. For each pair the table has the share
+of the first among the choices, with the exact (Clopper and Pearson) interval and the binomial test against one half;
+for three and more conditions also Bradley and Terry's strengths s, by which i is chosen before j with a chance of
+1 / (1 + exp(s_j - s_i)). Their intervals draw people with replacement, since answers of one person are dependent; for
+one person there is none.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import soundfile
+from rich.console import Console
+from rich.progress import Progress
+from scipy.stats import binomtest
+
+from sfms_robot.config import find
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Doubles, Floats, SpeakerFrame
+from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.formats import open_for
+from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
+from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread
+from sfms_robot.listeners.registry import load_listener, one_thread
+
+QUESTIONS: Final = {
+    "person": "Which listens more like a person?",
+    "attentive": "Which is more attentive?",
+    "natural": "Which moves more naturally?",
+    "in_time": "Which reacts more in time with the voice?",
+}
+NEITHER: Final = "neither"
+RECORDED: Final = "recorded"
+_STUDY, _ANSWERS, _CLIPS = "study.json", "answers.csv", "clips"
+_WARM_UP_S: Final = 10.0  # heard before a clip begins: a listener remembers
+_HOPS: Final = 997  # between the seeds of voices
+_HALF: Final = 0.5  # of a win in each direction of every pair: strengths stay finite if one always wins
+_STEPS: Final = 200
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Two conditions side by side, and the number of the voice that both hear."""
+
+    number: int
+    voice: int
+    left: str
+    right: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preference:
+    """One answer: `chosen` is the value of `left` or `right` (names of conditions), or NEITHER."""
+
+    participant: str
+    trial: int
+    voice: int
+    question: str
+    left: str
+    right: str
+    chosen: str
+
+
+_COLUMNS: Final = tuple(field.name for field in fields(Preference))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Options of the command.
+
+    Attributes:
+        conditions: Listeners by name or folder, and RECORDED for the people of `data`.
+        data: Composed dyads, or any data set with voices; None: the bundled voices that were never trained on.
+    """
+
+    conditions: Sequence[str]
+    data: Path | None
+    voices: int
+    seconds: float
+    seed: int
+    folder: Path
+
+
+class Study:
+    """A prepared study, answered by one participant after another."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        described = json.loads((folder / _STUDY).read_text(encoding="utf-8"))
+        self.conditions: list[str] = described["conditions"]
+        self._voices, self._seed = len(described["voices"]), int(described["seed"])
+        self._answers = read_answers(folder / _ANSWERS) if (folder / _ANSWERS).is_file() else []
+
+    @property
+    def questions(self) -> Mapping[str, str]:
+        return QUESTIONS
+
+    @property
+    def clips(self) -> Path:
+        return self.folder / _CLIPS
+
+    def begin(self) -> str:
+        """Return an anonymous name for a new participant, with which the page can resume later."""
+        return secrets.token_hex(6)
+
+    def next(self, participant: str) -> dict[str, Any]:
+        """Return the participant's next trial, clips without their conditions' names; or that all is answered."""
+        shown = self._trials(participant)
+        done = {answer.trial for answer in self._answers if answer.participant == participant}
+        left = [trial for trial in shown if trial.number not in done]
+        found: dict[str, Any] = {"answered": len(shown) - len(left), "trials": len(shown)}
+        if left:
+            trial = left[0]
+            found |= {"trial": trial.number, "audio": f"voice-{trial.voice}.wav"}
+            for side, condition in (("left", trial.left), ("right", trial.right)):
+                found[side] = f"{clip_name(self._seed, condition, trial.voice)}.f32"
+        return found
+
+    def answer(self, participant: str, number: int, chosen: Mapping[str, str]) -> None:
+        """Store an answer to each question (left, right or neither) before returning.
+
+        Raises ConfigError for an invalid answer, or if it cannot be written.
+        """
+        shown = self._trials(participant)
+        trial = next((trial for trial in shown if trial.number == number), None)
+        if trial is None:
+            raise ConfigError(f"trial = {number!r} is not one of this study (0 to {len(shown) - 1})")
+        if set(chosen) != set(QUESTIONS) or not set(chosen.values()) <= {"left", "right", NEITHER}:
+            raise ConfigError(f"answers: {', '.join(QUESTIONS)} want left, right or {NEITHER} each")
+        if any((answer.participant, answer.trial) == (participant, number) for answer in self._answers):
+            return  # sent twice on a bad connection
+        sides = {"left": trial.left, "right": trial.right, NEITHER: NEITHER}
+        rows = [
+            Preference(
+                participant=participant,
+                trial=number,
+                voice=trial.voice,
+                question=question,
+                left=trial.left,
+                right=trial.right,
+                chosen=sides[chosen[question]],
+            )
+            for question in QUESTIONS
+        ]
+        append_answers(self.folder / _ANSWERS, rows)
+        self._answers += rows
+
+    def results(self) -> dict[str, Any]:
+        return summary(self._answers)
+
+    def _trials(self, participant: str) -> list[Trial]:
+        return trials(self.conditions, self._voices, self._seed, participant)
+
+
+def trials(conditions: Sequence[str], voices: int, seed: int, participant: str) -> list[Trial]:
+    """Return every pair with every voice, in this participant's order and on this participant's sides."""
+    digest = hashlib.sha256(f"{seed} {participant}".encode()).digest()
+    rng = np.random.default_rng(list(digest[:8]))
+    pairs = [(voice, *pair) for voice in range(voices) for pair in combinations(conditions, 2)]
+    shown = []
+    for number, place in enumerate(rng.permutation(len(pairs))):
+        voice, one, other = pairs[int(place)]
+        left, right = (one, other) if rng.random() < 0.5 else (other, one)
+        shown.append(Trial(number, voice, left, right))
+    return shown
+
+
+def serve(study: Study, view: str, ready: Callable[[str, int | None], None]) -> None:
+    """Serve the page until interrupted. Calls `ready(url, taken port or None)` once. Raises ConfigError, PortError."""
+    from sfms_robot.viewer.page_process import Address
+    from sfms_robot.viewer.study_server import serve_study
+
+    serve_study(study, Address.parsed(view), ready)
+
+
+# --- clips ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _StudyVoice:
+    """One voice: the listener's input, the sound of the clip, and the recorded listener if there is one."""
+
+    name: str
+    frames: Sequence[SpeakerFrame]
+    audio: Floats
+    recorded: Floats | None
+
+
+def prepare(options: StudyOptions) -> Study:
+    """Return the study in `options.folder`, made if it is missing. Blocks for minutes. Raises RobotError."""
+    described = _described(options)
+    file, clips = options.folder / _STUDY, options.folder / _CLIPS
+    if file.is_file():
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if found != described | {"voices": found.get("voices")}:
+            raise ConfigError(f"{file}: another study (other conditions, voices or seed); name another folder (--out)")
+        return Study(options.folder)
+    voices = _voices(options)
+    clips.mkdir(parents=True, exist_ok=True)
+    one_thread()
+    with Progress(console=Console(stderr=True)) as progress:
+        for condition in progress.track(options.conditions, description="clips"):
+            for number, motion in enumerate(_motions(condition, voices, options)):
+                motion.astype("<f4").tofile(clips / f"{clip_name(options.seed, condition, number)}.f32")
+    for number, each in enumerate(voices):
+        soundfile.write(clips / f"voice-{number}.wav", each.audio, AUDIO_HZ, subtype="PCM_16")
+    plain = described | {"voices": [each.name for each in voices]}
+    file.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    return Study(options.folder)
+
+
+def clip_name(seed: int, condition: str, voice: int) -> str:
+    """Return a name that does not reveal the condition in the page's requests."""
+    return hashlib.sha256(f"{seed} {condition} {voice}".encode()).hexdigest()[:12]
+
+
+def _described(options: StudyOptions) -> dict[str, Any]:
+    """Return everything that identifies a study; listeners also by their weights."""
+    if len(set(options.conditions)) != len(options.conditions) or len(options.conditions) < 2:
+        raise ConfigError("--listener: two or more, each once; 'recorded' is what the people of --data did")
+    if RECORDED in options.conditions and options.data is None:
+        raise ConfigError("--listener recorded: needs --data (composed dyads, or a data set)")
+    weights = {}
+    for name in options.conditions:
+        if name != RECORDED:
+            folder = find("listeners", name, "config.yaml")
+            load_listener(folder)  # report its errors here
+            weights[name] = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    return {
+        "version": 1,
+        "conditions": list(options.conditions),
+        "weights": weights,
+        "data": None if options.data is None else options.data.name,
+        "seconds": options.seconds,
+        "asked_voices": options.voices,
+        "seed": options.seed,
+    }
+
+
+def _voices(options: StudyOptions) -> list[_StudyVoice]:
+    """Return the voices, each cut to warm-up and clip. Raises ConfigError if there are too few."""
+    length, warm_up = round(options.seconds * FRAME_HZ), round(_WARM_UP_S * FRAME_HZ)
+    found: list[_StudyVoice] = []
+
+    def cut(name: str, frames: Sequence[SpeakerFrame], audio: Floats, recorded: Floats | None, end: int) -> None:
+        """Add the clip of the last `length` frames before `end`, with the warm-up before it."""
+        begin = end - length
+        sound = audio[begin * FRAME_SAMPLES : end * FRAME_SAMPLES]
+        motion = None if recorded is None else recorded[begin:end]
+        found.append(_StudyVoice(name, frames[max(0, begin - warm_up) : end], sound, motion))
+
+    if options.data is not None:
+        for dyad in map(at_frame_rate, usable(open_for("arkit58", options.data, "test"))):
+            if dyad.audio is not None and len(dyad.speaker) >= length:
+                end = min(len(dyad.speaker), length + warm_up)
+                cut(dyad.name, frames_of_dyad(dyad), dyad.audio, dyad.listener, end)
+    else:  # consecutive pieces of the bundled voices that were never trained on
+        for speaker in unseen(voice_folders(None)):
+            count = len(speaker.voice) // FRAME_SAMPLES
+            face = np.full((count, 58), np.nan, np.float32) if speaker.face is None else speaker.face[:count]
+            frames = speaker_frames(speaker.voice, face, attention=np.ones(count, np.float32))
+            for end in range(length, count + 1, length):
+                cut(f"{speaker.name} {(end - length) / FRAME_HZ:.0f} s", frames, speaker.voice, None, end)
+    if len(found) < options.voices:
+        raise ConfigError(f"--voices {options.voices}: there are {len(found)} of {options.seconds:g} s or more")
+    return spread(found, options.voices)
+
+
+def _motions(condition: str, voices: Sequence[_StudyVoice], options: StudyOptions) -> list[Floats]:
+    """Return the motion (N, 58) to every voice."""
+    if condition == RECORDED:
+        return [each.recorded for each in voices if each.recorded is not None]
+    listener = load_listener(find("listeners", condition, "config.yaml"))
+    length = round(options.seconds * FRAME_HZ)
+    return [
+        rollout(listener, each.frames, [options.seed + _HOPS * number]).motion[0, -length:]
+        for number, each in enumerate(voices)
+    ]
+
+
+# --- answers --------------------------------------------------------------------------------------------------------
+
+
+def read_answers(file: Path) -> list[Preference]:
+    """Read answers. Raises ConfigError with the line of the file."""
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = csv.DictReader(lines)
+            if tuple(rows.fieldnames or ()) != _COLUMNS:
+                raise ConfigError(f"{file}: not answers of a comparison: its columns are not {', '.join(_COLUMNS)}")
+            return [_answer(file, number, row) for number, row in enumerate(rows, start=2)]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: cannot be read: {error}") from error
+
+
+def _answer(file: Path, line: int, row: Mapping[str, str | None]) -> Preference:
+    try:
+        values: dict[str, Any] = {key: value for key, value in row.items() if value is not None}
+        answer = Preference(**values | {"trial": int(values["trial"]), "voice": int(values["voice"])})
+    except (TypeError, ValueError, KeyError) as error:
+        raise ConfigError(f"{file}: line {line} is not an answer: {error}") from error
+    if answer.question not in QUESTIONS:
+        raise ConfigError.at(file, f"line {line}: question", answer.question, "is not a question", QUESTIONS)
+    if answer.chosen not in (choices := (answer.left, answer.right, NEITHER)):
+        raise ConfigError.at(file, f"line {line}: chosen", answer.chosen, "is not a choice", choices)
+    return answer
+
+
+def append_answers(file: Path, answers: Sequence[Preference]) -> None:
+    """Append answers to a CSV file. Raises ConfigError if it cannot be written."""
+    try:
+        new = not file.is_file()
+        with file.open("a", encoding="utf-8", newline="") as lines:
+            rows = csv.DictWriter(lines, _COLUMNS)
+            if new:
+                rows.writeheader()
+            rows.writerows(asdict(answer) for answer in answers)
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def summary(answers: Sequence[Preference], seed: int = 0) -> dict[str, Any]:
+    """Return per question and pair of conditions: counts, share of the first, interval, p; and strengths."""
+    conditions = sorted({name for answer in answers for name in (answer.left, answer.right)})
+    rows, strengths = [], {}
+    for question in QUESTIONS:
+        asked = [answer for answer in answers if answer.question == question]
+        rows += [_pair(question, first, second, asked) for first, second in combinations(conditions, 2)]
+        if len(conditions) > 2 and asked:
+            strengths[question] = _strengths(conditions, asked, seed)
+    chosen = [answer for answer in answers if answer.chosen != NEITHER]
+    left = sum(answer.chosen == answer.left for answer in chosen)
+    return {
+        "participants": len({answer.participant for answer in answers}),
+        "answers": len(answers),
+        "conditions": conditions,
+        "rows": [row for row in rows if row["answers"]],
+        "bradley_terry": strengths,
+        "sides": {"left": left, "right": len(chosen) - left},  # far from even: people did not look
+    }
+
+
+def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -> dict[str, Any]:
+    here = [answer for answer in asked if {answer.left, answer.right} == {first, second}]
+    wins = [sum(answer.chosen == name for answer in here) for name in (first, second)]
+    row: dict[str, Any] = {
+        "question": question, "first": first, "second": second, "answers": len(here), "first_chosen": wins[0],
+        "second_chosen": wins[1], "neither": len(here) - sum(wins), "share": None, "interval": None, "p": None,
+    }  # fmt: skip
+    if sum(wins):
+        test = binomtest(wins[0], sum(wins), 0.5)
+        low, high = test.proportion_ci(LEVEL, method="exact")
+        row |= {"share": wins[0] / sum(wins), "interval": [float(low), float(high)], "p": float(test.pvalue)}
+    return row
+
+
+def _strengths(conditions: Sequence[str], asked: Sequence[Preference], seed: int) -> dict[str, dict[str, Any]]:
+    people = sorted({answer.participant for answer in asked})
+    wins = np.zeros((len(people), len(conditions), len(conditions)))
+    for answer in asked:
+        place = people.index(answer.participant)
+        for better, worse in ((answer.left, answer.right), (answer.right, answer.left)):
+            share = 0.5 if answer.chosen == NEITHER else float(answer.chosen == better)
+            wins[place, conditions.index(better), conditions.index(worse)] += share
+    value, interval = bradley_terry(wins.sum(axis=0)), None
+    if len(people) > 1:
+        drawn = draw_people(len(people), seed)
+        interval = ends(np.array([bradley_terry(np.tensordot(counts, wins, axes=1)) for counts in drawn])).T.tolist()
+    return {
+        name: {"strength": float(value[place]), "interval": interval and interval[place]}
+        for place, name in enumerate(conditions)
+    }
+
+
+def bradley_terry(wins: Doubles) -> Doubles:
+    """Return log strengths (K,) with mean 0 of wins (K, K), row before column, by Hunter's minorization (2004)."""
+    padded = wins + _HALF * (1 - np.eye(len(wins)))
+    met, won = padded + padded.T, padded.sum(axis=1)
+    strength = np.ones(len(wins))
+    for _ in range(_STEPS):
+        strength = won / (met / (strength[:, None] + strength[None, :])).sum(axis=1)
+        strength /= np.exp(np.log(strength).mean())
+    return np.asarray(np.log(strength))
+
+
+def table(answers: Path) -> dict[str, Any]:
+    """Return the summary of the answers in a CSV file. Raises ConfigError."""
+    return summary(read_answers(answers))

@@ -1,0 +1,328 @@
+"""The tokenizers that tables III and IV of the SFMS paper compare: recipes by name, networks, one interface, files.
+
+Sizes: "small" has width 64, about a fifth of a million parameters, and takes one to two minutes each on one core;
+"paper" has about the parameters of table IV, for a GPU. Names state the content: sparse-all-k10 has a keyframe set for
+each channel and 10 keyframes a window; as-written ones have the paper's scores, learned by Algorithm 1, and its
+inpainter, which is not added to straight lines. The baselines have one code a frame, or one every eight frames.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import torch
+import yaml
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.config import load, parse
+from sfms_robot.config.training import HALVINGS
+from sfms_robot.frames import BLENDSHAPES, CHANNELS
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.layers import Block, sinusoidal
+from sfms_robot.listeners.sfms.model import Tokenizer
+from sfms_robot.listeners.sfms.placement import Strategy
+from sfms_robot.listeners.sfms.quantizer import Codebook, Grid
+
+SizeName = Literal["small", "paper"]
+KEYFRAMES: Final = (3, 7, 10)  # of table III
+AS_WRITTEN: Final = "as-written"
+
+# Of each size: width, layers of each part of the sparse inpainter, layers on either side of a baseline's codes, width
+# of the scores, training.
+SIZES: Final[dict[str, tuple[int, int, int, int, dict[str, Any]]]] = {
+    "small": (64, 1, 2, 32, {"steps": 1000, "batch": 16, "learning_rate": 2e-3, "score_tracks": 16}),
+    "paper": (
+        256, 4, 12, 128,
+        {"steps": 20_000, "batch": 128, "learning_rate": 3e-4, "precision": "bf16", "score_tracks": 64},
+    ),
+}  # fmt: skip
+_SCALAR: Final = (256,)  # of one channel: four coarse digits of one number are harder to learn, twice the error
+_PAPER: Final = {"placement": "learned_paper", "inpainter": "paper"}
+_ALL: Final = {"preset": "all", "levels": _SCALAR}
+_ONE: Final = {"preset": "one", "levels": (4, 4, 4, 4), "keyframes": 10}
+_SPARSE: Final[dict[str, dict[str, Any]]] = {  # the groups and what else differs, by name
+    **{
+        f"sparse-all-k{k}{ending}": {"groups": _ALL | {"keyframes": k}, **changes}
+        for k in KEYFRAMES  # table III
+        for ending, changes in (
+            ("", {}),
+            ("-static", {"placement": "static"}),
+            ("-static_paper", {"placement": "static_paper"}),
+            (f"-{AS_WRITTEN}", _PAPER),
+        )
+    },
+    "sparse-one-k10": {"groups": _ONE},
+    "sparse-one-k10-static_paper": {"groups": _ONE, "placement": "static_paper"},
+    "sparse-all-k10-vq-256": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq"},  # table IV
+    f"sparse-all-k10-vq-256-{AS_WRITTEN}": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq", **_PAPER},
+}
+_BASELINES: Final = {  # kind, quantizer, levels
+    "dense-vq-1024": ("dense", "vq", (1024,)),
+    "l2l-vq-256": ("grouped", "vq", (256,)),
+    "dense-fsq-1024": ("dense", "fsq", (8, 5, 5, 5)),
+}
+
+
+def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, config.Recipe]:
+    """Return every tokenizer of both tables."""
+    width, layers, baseline_layers, score_width, training = SIZES[size]
+    training = {**training, "evaluate_every": 0, **({} if steps is None else {"steps": steps})}
+    shared = {
+        "kind": "sfms", "placement": "learned", "tokenizer_width": width, "tokenizer_layers": layers,
+        "scores": {"width": score_width}, "quantizer": "fsq", "inpainter": "residual",
+    }  # fmt: skip
+    raw = {name: {"model": shared | changes, "training": training} for name, changes in _SPARSE.items()}
+    for name, (kind, quantizer, levels) in _BASELINES.items():
+        model = {"kind": kind, "quantizer": quantizer, "levels": levels, "width": width, "layers": baseline_layers}
+        # The encoder term of Learning2Listen's published configuration weighs a quarter.
+        raw[name] = {"model": model, "training": training | {"commitment": 0.25}}
+    return {name: parse(config.Recipe, each, name) for name, each in raw.items()}
+
+
+# --- baselines ------------------------------------------------------------------------------------------------------
+
+
+class Stack(nn.Module):
+    """Transformer blocks over x (B, T, width), with sinusoidal positions."""
+
+    def __init__(self, width: int, heads: int, layers: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
+        for block in self.blocks:
+            x = block(x)
+        out: Tensor = self.norm(x)
+        return out
+
+
+class Bottleneck(nn.Module):
+    """width -> a code -> width, one step of time at a time."""
+
+    def __init__(self, settings: config.Baseline) -> None:
+        super().__init__()
+        self.codebook: Grid | Codebook
+        if settings.quantizer == "fsq":
+            self.codebook = Grid([settings.levels])
+        else:
+            self.codebook = Codebook([math.prod(settings.levels)], settings.code_dims)
+        self.down = nn.Linear(settings.width, self.codebook.dims)
+        self.up = nn.Linear(self.codebook.dims, settings.width)
+
+    def latent(self, x: Tensor) -> Tensor:
+        """Map (B, T, width) to (B, T, 1, D)."""
+        out: Tensor = self.down(x)[..., None, :]
+        return out
+
+    def restore(self, codes: Tensor) -> Tensor:
+        """Map (B, T, 1, D) to (B, T, width)."""
+        out: Tensor = self.up(codes.flatten(2))
+        return out
+
+
+class DenseTokenizer(nn.Module):
+    """One code for every frame: motion (B, T, C), standardised <-> indices (B, T, 1).
+
+    Dense-FSQ-1024 and VQ-only of tables III and IV, after "Finite Scalar Quantization as Facial Tokenizer for Dyadic
+    Reaction Generation" ([10] of the SFMS paper), which published no code: a transformer reads the window, each frame
+    is quantized, a second transformer restores the window.
+    """
+
+    def __init__(self, settings: config.Baseline, channels: int) -> None:
+        super().__init__()
+        self.settings = settings
+        self.read = nn.Linear(channels, settings.width)
+        self.encoder = Stack(settings.width, settings.heads, settings.layers)
+        self.bottleneck = Bottleneck(settings)
+        self.decoder = Stack(settings.width, settings.heads, settings.layers)
+        self.write = nn.Linear(settings.width, channels)
+
+    @property
+    def bits_per_window(self) -> float:
+        """Return the size of the codes of a window; their places are known."""
+        return self.settings.window_frames * math.log2(self.settings.codes)
+
+    def encode(self, motion: Tensor) -> Tensor:
+        return self.bottleneck.codebook.indices(self.bottleneck.codebook.nearest(self.latent(motion)))
+
+    def decode(self, indices: Tensor) -> Tensor:
+        return self.synthesise(self.bottleneck.codebook.codes(indices))
+
+    def latent(self, motion: Tensor) -> Tensor:
+        """Map (B, T, C) to (B, T, 1, D), not yet codes."""
+        return self.bottleneck.latent(self.encoder(self.read(motion)))
+
+    def synthesise(self, codes: Tensor) -> Tensor:
+        """Map (B, T, 1, D) to (B, T, C)."""
+        out: Tensor = self.write(self.decoder(self.bottleneck.restore(codes)))
+        return out
+
+
+class GroupedTokenizer(DenseTokenizer):
+    """One code for every eight frames: motion (B, T, C), standardised <-> indices (B, T / 8, 1); T a multiple of 8.
+
+    The VQ-VAE of Ng et al. 2022, "Learning to Listen", table IV's L2L row, as its published configuration describes it
+    (evonneng/learning2listen @ a0825d58): three stages halve the time, one by a strided convolution and two by pooling,
+    with transformers on both sides of the codes. Its authors learn 200 vectors, the SFMS paper compares with 256.
+    """
+
+    def __init__(self, settings: config.Grouped, channels: int) -> None:
+        super().__init__(settings, channels)
+        width, kernel, strides = settings.width, 5, (2, 1, 1)
+        self.shorten = nn.ModuleList(nn.Conv1d(width, width, kernel, stride, kernel // 2) for stride in strides)
+        self.lengthen = nn.ModuleList(nn.Conv1d(width, width, kernel, padding=kernel // 2) for _ in strides)
+
+    @property
+    def bits_per_window(self) -> float:
+        return super().bits_per_window / (1 << HALVINGS)
+
+    def latent(self, motion: Tensor) -> Tensor:
+        x = self.read(motion).transpose(1, 2)
+        frames = x.shape[-1]
+        for stage in self.shorten:
+            frames //= 2
+            x = F.leaky_relu(stage(x), 0.2)
+            x = x if x.shape[-1] == frames else F.max_pool1d(x, 2)
+        return self.bottleneck.latent(self.encoder(x.transpose(1, 2)))
+
+    def synthesise(self, codes: Tensor) -> Tensor:
+        x = self.bottleneck.restore(codes).transpose(1, 2)
+        for stage in self.lengthen:
+            x = F.leaky_relu(stage(x.repeat_interleave(2, dim=-1)), 0.2)
+        out: Tensor = self.write(self.decoder(x.transpose(1, 2)))
+        return out
+
+
+def baseline_loss(
+    tokenizer: DenseTokenizer, motion: Tensor, commitment: float, generator: torch.Generator | None = None
+) -> Tensor:
+    """Return the squared error of the window plus the commitment of learned vectors, which move with a `generator`.
+
+    The papers' loss is L1 by parts; the tables compare the squared error, so all tokenizers learn that.
+    """
+    latent = tokenizer.latent(motion)
+    codebook = tokenizer.bottleneck.codebook
+    everywhere = torch.ones_like(latent[..., 0])
+    if generator is not None and isinstance(codebook, Codebook):
+        codebook.learn(latent, everywhere, generator)
+    restored = tokenizer.synthesise(codebook.nearest(latent))
+    return F.mse_loss(restored, motion) + commitment * codebook.commitment(latent, everywhere)
+
+
+# --- one interface --------------------------------------------------------------------------------------------------
+
+_CHUNK: Final = 64  # windows at a time
+_FREE_PLACES: Final = ("static", "static_paper")  # the reader knows where these keyframes are
+# Smallest deviation that a channel is divided by: rad, m, of 0..1. Smaller motion is noise.
+_STILL: Final = {"roll": 0.01, "pitch": 0.01, "yaw": 0.01, "x": 0.005, "y": 0.005, "z": 0.005}
+_STILL_SHAPE: Final = 0.02
+
+
+class TableModel(nn.Module):
+    """One tokenizer and the scales of the motion it was trained on. The score of a row is in these units."""
+
+    motion_mean: Tensor
+    motion_std: Tensor
+
+    def __init__(self, recipe: config.Recipe) -> None:
+        super().__init__()
+        self.recipe = recipe
+        self.register_buffer("motion_mean", torch.zeros(len(CHANNELS)))
+        self.register_buffer("motion_std", torch.ones(len(CHANNELS)))
+        settings = recipe.model
+        self.tokenizer: Tokenizer | DenseTokenizer
+        if isinstance(settings, config.Dense):
+            self.tokenizer = DenseTokenizer(settings, len(CHANNELS))
+        elif isinstance(settings, config.Grouped):
+            self.tokenizer = GroupedTokenizer(settings, len(CHANNELS))
+        else:
+            self.tokenizer = Tokenizer(settings)
+
+    @property
+    def window(self) -> int:
+        return self.recipe.model.window_frames
+
+    def fit_scales(self, motion: Tensor) -> None:
+        """Set means and deviations from motion (N, 58)."""
+        least = torch.tensor([_STILL_SHAPE if name in BLENDSHAPES else _STILL[name] for name in CHANNELS])
+        self.motion_mean.copy_(motion.mean(0))
+        self.motion_std.copy_(torch.maximum(motion.std(0), least))
+
+    def standardise(self, motion: Tensor) -> Tensor:
+        return (motion - self.motion_mean) / self.motion_std
+
+    @torch.no_grad()
+    def mask(self, motion: Tensor, strategy: Strategy | None = None, k: int | None = None) -> Tensor:
+        """Return the keyframes (W, T, G) of standardised windows, with another placement or number if given."""
+        tokenizer, counts = self.sparse(), self._counts(k)
+        return torch.cat([tokenizer.place(some, counts, strategy) for some in torch.split(motion, _CHUNK)])
+
+    @torch.no_grad()
+    def restore(self, motion: Tensor, strategy: Strategy | None = None, k: int | None = None) -> Tensor:
+        """Encode and decode standardised windows (W, T, C)."""
+        tokenizer = self.tokenizer
+        if isinstance(tokenizer, DenseTokenizer):
+            parts = [tokenizer.decode(tokenizer.encode(some)) for some in torch.split(motion, _CHUNK)]
+        else:
+            masks = torch.split(self.mask(motion, strategy, k), _CHUNK)
+            both = zip(torch.split(motion, _CHUNK), masks, strict=True)
+            parts = [tokenizer.decode(tokenizer.encode(some, at)) for some, at in both]
+        return torch.cat(parts)
+
+    def bits(self, strategy: Strategy | None = None, k: int | None = None) -> float:
+        """Return the bits of a window: codes at fixed length, and the places of keyframes unless they are known."""
+        settings = self.recipe.model
+        if isinstance(self.tokenizer, DenseTokenizer):
+            return self.tokenizer.bits_per_window
+        assert isinstance(settings, config.Sfms)
+        counts = zip(self._counts(k), (group.codes for group in settings.groups.values()), strict=True)
+        if (strategy or settings.placement) in _FREE_PLACES:
+            return sum(n * math.log2(size) for n, size in counts)
+        return sum(keyframe_bits(self.window, n, size) for n, size in counts)
+
+    def sparse(self) -> Tokenizer:
+        """Return the tokenizer if it has keyframes. Raises TypeError."""
+        if not isinstance(self.tokenizer, Tokenizer):
+            raise TypeError(f"{self.recipe.model.kind} has no keyframes")
+        return self.tokenizer
+
+    def _counts(self, k: int | None) -> list[int]:
+        counts = self.sparse().keyframes
+        return list(counts) if k is None else [k] * len(counts)
+
+
+def keyframe_bits(frames: int, k: int, codes: int) -> float:
+    """Return the bits of a track of a window: which k of its frames (log2 of the binomial), and k of `codes` codes."""
+    if not 0 <= k <= frames:
+        raise ValueError(f"keyframes: expected 0 to {frames}, got {k}")
+    return math.log2(math.comb(frames, k)) + k * math.log2(codes)
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def save(folder: Path, model: TableModel) -> None:
+    """Write config.yaml and weights, in half precision: the codes stay the same, and a table needs many tokenizers."""
+    folder.mkdir(parents=True, exist_ok=True)
+    raw = model.recipe.model_dump(mode="json", exclude_defaults=True)
+    raw["model"]["kind"] = model.recipe.model.kind
+    text = yaml.safe_dump(raw, sort_keys=False, width=110, default_flow_style=None)
+    (folder / checkpoint.CONFIG).write_text(text, encoding="utf-8")
+    checkpoint.save_weights(folder / checkpoint.WEIGHTS, model, bits=16)
+
+
+def read(folder: Path) -> TableModel:
+    """Read the tokenizer of a folder. Raises ConfigError or ModelError."""
+    model = TableModel(load(config.Recipe, folder / checkpoint.CONFIG))
+    checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
+    return model.eval()
+
+
+def is_there(folder: Path) -> bool:
+    return (folder / checkpoint.CONFIG).is_file() and (folder / checkpoint.WEIGHTS).is_file()

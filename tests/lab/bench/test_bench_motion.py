@@ -1,0 +1,81 @@
+"""What `bench retarget` and `bench lead` measure, on runs short enough for a test."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.config import load_head
+from sfms_robot.data import head_names
+from sfms_robot.lab.bench.lead import delay_ticks, delays
+from sfms_robot.lab.bench.retarget_bench import CHUNK, adversarial, retarget, torment, wild
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+
+HEADS = head_names()
+QUICK = ["op3_head", "open_duck_mini_v2_head", "poppy_head", "reachy_mini", "inmoov2_ssc32"]
+
+
+@pytest.mark.parametrize("shift", [-3.0, 0.0, 0.4, 3.7, 12.25])
+def test_a_delay_is_found_between_two_ticks(shift):
+    ticks = np.arange(600)[:, None]
+    rates, phases = np.array([[0.05, 0.11, 0.083]]), np.array([[0.3, 1.0, 2.0]])
+    meant = np.sin(ticks * rates + phases) + 0.5 * np.sin(ticks * 1.7 * rates)
+    seen = 0.3 + 0.8 * (np.sin((ticks - shift) * rates + phases) + 0.5 * np.sin((ticks - shift) * 1.7 * rates))
+    assert delay_ticks(meant, seen, 30) == pytest.approx(shift, abs=0.02)
+
+
+def test_a_joint_that_stands_still_has_no_delay():
+    meant = np.stack([np.zeros(200), np.sin(np.arange(200) / 9)], axis=1)
+    found = delay_ticks(meant, meant, 20)
+    assert np.isnan(found[0]) and found[1] == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
+    found = delays(name, duration_s=4.0)
+    moved = np.isfinite(found.led_s)
+    assert moved.any()
+    assert np.abs(found.led_s[moved]).max() < 0.010
+    assert found.unled_s[moved].min() > 0.030
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in HEADS if name not in QUICK])
+def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late(name):
+    found = delays(name)
+    moved = np.isfinite(found.led_s)
+    assert moved.mean() > 0.8 and np.abs(found.led_s[moved]).max() < 0.010
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_wild_faces_move_every_joint_that_anything_moves(name):
+    retargeter = HeadRetargeter(load_head(name))
+    faces = wild(np.random.default_rng(0), 1000)[:, None].repeat(len(retargeter.joints), axis=1)
+    travel = np.ptp(retargeter.angles(faces), axis=0)
+    assert (travel > 0.01).sum() >= len(travel) - len(retargeter.dead_joints)
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_faces_and_plans_that_no_face_makes_break_no_limit(name):
+    tally = torment(name, 1200, seed=3)
+    assert tally.violations == 0 and tally.frames == 1200 and tally.refused > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HEADS)
+def test_ten_thousand_of_them_break_no_limit_either(name):
+    assert torment(name, 10_000, seed=4).violations == 0
+
+
+def test_a_tick_is_measured_part_by_part_beside_a_matrix_product():
+    rows = retarget()
+    parts = {f"retarget.{part}" for part in ("tick", "timeline", "mapping", "limits", "calibration", "stewart")}
+    assert set(rows) == parts
+    assert all(row["median"] > 0 and row["ratio"] > 0 and row["unit"] == "ms" for row in rows.values())
+
+
+@pytest.mark.slow
+def test_wild_frames_are_counted_over_all_heads_and_chunks():
+    rows = adversarial(CHUNK + 1, ("poppy_head",), seed=2) | adversarial(50, ("op3_head",), seed=2)
+    assert {name: (row["frames"], row["violations"]) for name, row in rows.items()} == {
+        "retarget.wild.op3_head": (50, 0),
+        "retarget.wild.poppy_head": (CHUNK + 1, 0),
+    }

@@ -1,0 +1,58 @@
+"""A small version of `bench own-voice`."""
+
+import numpy as np
+import pytest
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.own_voice_bench import (
+    CHOSEN_ON,
+    CHOSEN_ON_GEAR_SEED,
+    GEAR_SEED,
+    VoiceCondition,
+    call_names,
+    gear_noise,
+    own_voice,
+)
+
+
+def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):
+    for name in (CHOSEN_ON[0], "other"):
+        (tmp_path / f"{name}_caller.flac").touch()
+    assert call_names(tmp_path) == ["other"]
+    assert len(call_names(data_dir("sim") / "conversations")) == 2
+    with pytest.raises(ConfigError, match="has no NAME_caller"):
+        call_names(tmp_path / "nothing")
+
+
+def test_the_gears_that_are_reported_on_are_not_those_that_parameters_were_chosen_on():
+    assert GEAR_SEED != CHOSEN_ON_GEAR_SEED
+
+
+def test_motors_that_stand_are_silent():
+    speed = np.zeros((20, 2))
+    speed[10:, 0] = 1.0
+    noise = gear_noise(speed).reshape(20, 640)
+    assert not noise[:9].any() and (np.abs(noise[11:]).max(axis=1) > 0.01).all()
+
+
+@pytest.mark.slow
+def test_own_voice_is_not_the_person_and_the_person_is_heard():
+    pytest.importorskip("pyroomacoustics")
+    turns = VoiceCondition(own_db=0.0)
+    over = VoiceCondition(own_db=0.0, talks_over=True)
+    result = own_voice(conditions=(turns, over))
+    in_turns, talking_over = result["conditions"]
+    assert result["echo_latency_ms"] <= 10.0
+    assert in_turns["own_voice_taken"] < 0.02 and in_turns["person_missed"] < 0.05
+    assert talking_over["own_voice_taken"] < 0.05 and talking_over["person_missed_in_double_talk"] < 0.15
+
+
+@pytest.mark.slow
+def test_a_head_that_moves_hears_the_person_and_no_one_where_nobody_is():
+    pytest.importorskip("pyroomacoustics")
+    moving = VoiceCondition(motors_db=0.0)
+    alone = VoiceCondition(motors_db=0.0, person=False)
+    with_person, nobody = own_voice(conditions=(moving, alone))["conditions"]
+    assert with_person["person_missed"] < 0.05 and with_person["nobody_taken"] < 0.02
+    assert nobody["person_missed"] is None and nobody["nobody_taken"] < 0.02

@@ -1,0 +1,128 @@
+"""The table of benches: every line of it can be measured, and options go where they mean something."""
+
+import importlib
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import tiny_arig_training
+import torch
+from torch.nn.functional import scaled_dot_product_attention
+
+from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.lab import bench
+from sfms_robot.lab.bench import BENCHES, Bench, measure_all, run_bench
+from sfms_robot.lab.bench.measure import BenchResult, environment, row, write_page
+from sfms_robot.lab.bench.operation_count import BoardCore, OperationCount
+from sfms_robot.lab.learning.dry_run import dry_run
+
+
+def quiet(line: str) -> None:
+    pass
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_every_bench_is_a_function_that_takes_what_its_line_says(name):
+    module, function = BENCHES[name].place.split(":")
+    measure = getattr(importlib.import_module(f"{bench.__name__}.{module}"), function)
+    taken = inspect.signature(measure).parameters
+    assert set(BENCHES[name].takes) <= set(taken)
+    needed = {key for key, one in taken.items() if one.default is one.empty}
+    assert needed <= {"say"}, "a bench without options has to run"
+
+
+def test_a_bench_that_is_none_is_told_those_that_are():
+    with pytest.raises(ConfigError, match=r'there is no "bos" \(all, startup, bus, .*fuzz'):
+        run_bench("bos", {}, quiet)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("bus", {"frames": 5}, "--frames 5: only 'bench retarget' takes it"),
+        ("all", {"torture": True}, "--torture True: only 'bench live' takes it"),
+        ("retarget", {"head": "face28"}, "takes a head with --frames"),
+    ],
+)
+def test_an_option_that_means_nothing_there_is_refused(name, given, said):
+    with pytest.raises(ConfigError, match=said):
+        run_bench(name, given, quiet)
+
+
+def test_a_page_has_every_row_and_says_where_it_was_measured(tmp_path):
+    rows = BenchResult.of_rows({"bus.tick": row([1.0, 2.0], [4.0], "ms", "somebody")}).figures
+    write_page(tmp_path / "page.md", {**rows, "notes": "no row"}, 1.5)
+    page = (tmp_path / "page.md").read_text()
+    assert "| bus.tick | 1.5 ms | 1.99 | 0.375 | somebody | 2 |" in page and "in 1.5 minutes" in page
+    with pytest.raises(ConfigError, match="cannot be written"):
+        write_page(tmp_path / "nowhere" / "page.md", rows, 1.0)
+
+
+def test_a_board_is_as_fast_as_the_slower_of_its_core_and_its_memory():
+    board = BoardCore(clock_ghz=1.0, per_cycle=4, memory_gb_s=2.0, call_us=10.0)
+    assert board.ms(1e6, 0, 0) == pytest.approx(1.0) and board.ms(1e6, 4e6, 0) == pytest.approx(2.0)
+    assert board.ms(0, 0, 100) == pytest.approx(1.0)
+
+
+def test_a_row_says_how_often_against_what_and_on_which_machine():
+    told = BenchResult.of_rows({"one": row([1.0, 2.0, 3.0], [4.0], "ms", "somebody")})
+    found = told.figures["one"]
+    assert (found["median"], found["repeats"], found["ratio"]) == (2.0, 3, 0.5)
+    assert "cores of" in found["machine"]
+    assert told.table[0] | {"p99": None} == {
+        "measured": "one", "median": 2.0, "unit": "ms", "p99": None, "ratio": 0.5, "to": "somebody",
+    }  # fmt: skip
+
+
+def test_a_bench_that_fails_does_not_cost_the_others_their_rows(monkeypatch):
+    def fails():
+        raise BusError("no servo answers")
+
+    module = ModuleType("of_the_test")
+    module.fails, module.works = fails, lambda: {"one": row([1.0], [2.0], "ms", "somebody")}
+    monkeypatch.setitem(sys.modules, f"{bench.__name__}.of_the_test", module)
+    both = {"first": Bench("of_the_test:fails", "fails"), "second": Bench("of_the_test:works", "works")}
+    told = measure_all(both, quiet)
+    assert not told.passed and list(told.lines) == ["first: no servo answers"] and list(told.figures) == ["one"]
+
+
+def test_a_folder_without_the_package_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"--against .*: no sfms_robot in it"):
+        environment(tmp_path)
+
+
+def test_a_folder_with_it_is_found_from_anywhere(tmp_path, monkeypatch):
+    (tmp_path / "other" / "sfms_robot").mkdir(parents=True)
+    (tmp_path / "other" / "sfms_robot" / "__init__.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    assert environment(Path("other"))["PYTHONPATH"] == str(tmp_path / "other")
+
+
+def test_a_layer_costs_two_operations_a_weight_and_row_and_its_gradient_as_many_again():
+    layer = torch.nn.Linear(10, 20)
+    with OperationCount() as count:
+        layer(torch.randn(5, 10)).sum().backward()
+    assert count.matrix == 2 * 5 * 10 * 20 * 2
+    assert count.drawn == 50
+
+
+def test_attention_counts_on_a_processor_too():
+    rows = torch.randn(2, 4, 16, 8)
+    with OperationCount() as count:
+        scaled_dot_product_attention(rows, rows, rows)
+    assert count.matrix == 2 * (2 * 2 * 4 * 16 * 16 * 8)
+    assert count.bytes >= rows.numel() * 4 * 4
+
+
+@pytest.mark.parametrize(("most_frames", "pieces"), [(1200, 1), (48, 2), (1, 4)])
+def test_a_step_costs_the_same_however_small_the_pieces_that_are_made_of_it(monkeypatch, most_frames, pieces):
+    """But for what is done once a piece: scaling the loss, sums of gradients."""
+    monkeypatch.setattr(dry_run, "MOST_FRAMES", most_frames)
+    (found,) = dry_run.dry_run(tiny_arig_training.settings())["stages"]
+    monkeypatch.undo()
+    (whole,) = dry_run.dry_run(tiny_arig_training.settings())["stages"]
+    assert (found["pieces"], found["batch"], found["steps"]) == (pieces, 4, 6)
+    assert found["operations"] == pytest.approx(whole["operations"], rel=0.1)
+    assert found["drawn"] == pytest.approx(whole["drawn"], rel=0.1)

@@ -1,0 +1,201 @@
+"""Faults and random bytes on every family: a short version of each, and the whole one marked slow."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfms_robot.emulator.faults import KINDS
+from sfms_robot.errors import ConfigError
+from sfms_robot.lab.bench.campaign import (
+    BYTES,
+    CASES,
+    CORRUPT,
+    HALF_DEAD,
+    MANY_TURNS,
+    MUTE_AT_STOP,
+    OUTSIDE,
+    SPECS,
+    STORED,
+    CaseOutcome,
+    corrupted_bytes,
+    fuzz_one,
+    one,
+    run_campaign,
+    table,
+)
+from sfms_robot.lab.bench.campaign_rig import FAMILIES, Judge, head_of, plugged_in
+
+BOARDS = ("maestro", "maestro-crc", "ssc32")
+UNCHECKED = ("maestro", "ssc32")
+IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in BOARDS} | {
+    (MANY_TURNS, family) for family in ("dynamixel1", "scs")
+}
+SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
+
+
+@pytest.fixture
+def rig():
+    with plugged_in(head_of("dynamixel2")) as rig:
+        rig.hold()
+        yield rig
+
+
+def test_every_kind_of_fault_is_tried():
+    assert set(SPECS) == set(KINDS) < set(CASES)
+
+
+def test_unknown_family_is_named():
+    with pytest.raises(ConfigError, match="'hitec' is not a family"):
+        head_of("hitec")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nothing_escapes_and_everybody_comes_back(family):
+    fault = SHORT[list(FAMILIES).index(family) % len(SHORT)]
+    outcome = one(family, fault, ticks=300)
+    assert outcome.passed, outcome
+    assert outcome.ticks == 300
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_servos_found_outside_their_range_come_in_and_nothing_escapes(family):
+    outcome = one(family, OUTSIDE, ticks=300)
+    assert outcome.possible and outcome.passed and outcome.refused is None, outcome
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("case", [STORED, MANY_TURNS])
+def test_servos_that_contradict_the_heads_file_are_refused_or_mended(family, case):
+    outcome = one(family, case, ticks=200)
+    assert outcome.passed, outcome
+    assert outcome.possible == ((case, family) not in IMPOSSIBLE)
+    if case == STORED and outcome.refused is not None:
+        assert "limit" in outcome.refused
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_torque_is_off_at_once_though_nobody_answers(family):
+    outcome = one(family, MUTE_AT_STOP)
+    assert outcome.off_s is not None and outcome.off_s <= 0.02 and outcome.stop_s <= 0.5 and outcome.passed, outcome
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_bus_that_dies_takes_no_other_with_it(family):
+    outcome = one(family, HALF_DEAD, ticks=1000 if family in ("maestro", "dynamixel2") else 250)
+    assert outcome.passed, outcome
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_corrupted_byte_moves_no_servo_out_of_its_limits_where_packets_have_a_checksum(family):
+    outcome = one(family, CORRUPT, ticks=500)
+    [(name, said)] = corrupted_bytes([outcome]).items()
+    assert outcome.passed and name == family, outcome
+    if family in UNCHECKED:
+        assert outcome.outside > 0 and said["checksum"] == "no checksum"
+        shortest_us, longest_us = (992, 2000) if family == "maestro" else (500, 2500)  # what the board itself allows
+        assert shortest_us <= outcome.pulse_us[0] <= outcome.pulse_us[1] <= longest_us
+    else:
+        assert outcome.outside == 0 and said["goals"] == "0 outside limits"
+
+
+@pytest.mark.parametrize("family", ["dynamixel2", "sts", "maestro-crc", "ssc32"])
+@pytest.mark.parametrize("fault", ["request-drop", "request-delay"])
+def test_requests_that_come_late_or_never_do_no_harm(family, fault):
+    outcome = one(family, fault, ticks=300)
+    assert outcome.passed and not outcome.outside, outcome
+
+
+@pytest.mark.parametrize("family", BOARDS)
+def test_a_family_that_cannot_have_a_fault_says_so(family):
+    outcome = one(family, "voltage", ticks=10)
+    assert not outcome.possible
+    assert table([outcome])[0]["passed"] == "-"
+
+
+def test_a_servo_that_stays_out_says_why():
+    outcome = one("sts", "voltage", ticks=200)
+    assert len(outcome.named) == 4 and all("input voltage" in each for each in outcome.named)
+    assert outcome.passed
+
+
+def test_same_campaign_has_the_same_outcome():
+    assert one("dynamixel2", "noise", ticks=60) == one("dynamixel2", "noise", ticks=60)
+
+
+def test_old_position_told_as_fresh_is_noticed(rig):
+    judge, told = Judge(rig), []
+    for _ in range(100):
+        told.append(rig.tick())
+        judge.see({name: replace(r, position_rad=told[-10:][0][name].position_rad) for name, r in told[-1].items()})
+    assert judge.stale > 0
+
+
+def test_bad_goal_that_is_taken_is_noticed(rig):
+    class TakesAnything:
+        def write(self, goals_rad, now_s):
+            return None
+
+    rig.tick()
+    rig.try_bad_goals(withheld=False)
+    rig.bus = TakesAnything()
+    with pytest.raises(AssertionError, match="a goal of nan rad is not refused"):
+        rig.try_bad_goals(withheld=False)
+
+
+def test_joint_that_does_not_follow_is_noticed(rig):
+    judge = Judge(rig)
+    for _ in range(60):
+        judge.see(rig.tick())
+    assert judge.well_since_s is not None
+    rig.goals = rig.goals + np.array([0.0, 0.5, 0.0, 0.0])
+    judge.see(rig.bus.poll(rig.clock.now_s()))
+    assert judge.well_since_s is None
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        {"escaped": "BusError: gone"},
+        {"outside": 1},
+        {"stale": 1},
+        {"recovered_s": None},
+        {"recovered_s": 2.5},
+        {"named": ["joint1: torque lost"]},
+        {"refused": "min_position_limit is 1900"},
+        {"left_on": 1},
+    ],
+)
+def test_anything_amiss_fails(what):
+    fine = CaseOutcome(family="sts", case="drop", recovered_s=0.1)
+    assert fine.passed
+    assert not replace(fine, **what).passed
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_goal_outside_limits_is_stated_and_no_failure_only_for_corrupted_bytes_without_a_checksum(family):
+    outcome = CaseOutcome(family=family, case=CORRUPT, recovered_s=0.1, outside=1)
+    assert outcome.passed == (family in UNCHECKED)
+    assert not replace(outcome, case="drop").passed
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_random_bytes_do_no_harm(family):
+    fuzzed = fuzz_one(family, 5_000)
+    assert fuzzed.passed, fuzzed
+    assert fuzzed.bytes >= 5_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_whole_campaign(family):
+    failed = [outcome for outcome in run_campaign([family]) if not outcome.passed]
+    assert not failed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_million_random_bytes_do_no_harm(family):
+    fuzzed = fuzz_one(family, BYTES)
+    assert fuzzed.passed, fuzzed
+    assert fuzzed.bytes >= BYTES

@@ -1,0 +1,196 @@
+"""Figures of listeners that speak: what each measures, on motion and states made up for it."""
+
+import numpy as np
+import pytest
+from tiny_arig_training import HZ, dyad, settings
+
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
+from sfms_robot.lab.corpora.conversational_states import STATE
+from sfms_robot.lab.evaluation import arig_tables as tables
+from sfms_robot.lab.evaluation import interaction as scores
+from sfms_robot.lab.evaluation.metrics import centres_of
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout
+from sfms_robot.listeners.arig import torch_engine
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.stream import ArigListener
+
+JAW = CHANNEL_INDEX["jawOpen"]
+
+
+def jaw(values: np.ndarray) -> np.ndarray:
+    motion = np.zeros((len(values), 58), np.float32)
+    motion[:, JAW] = values
+    return motion
+
+
+def talk(frames: int = 500, seed: int = 0) -> np.ndarray:
+    return np.convolve(np.random.default_rng(seed).random(frames + 4), np.ones(5) / 5, "valid")
+
+
+# --- states ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_voice_rule_says_the_most_frequent_state_of_each_pattern():
+    voiced = np.array([[1, 0]] * 3 + [[0, 1]] * 3 + [[0, 0]], bool)
+    states = np.array([0, 0, 6, 1, 6, 6, -1], np.int8)
+    rule = scores.voice_rule(voiced, states)
+    assert (rule[1, 0], rule[0, 1], rule[0, 0]) == (0, 6, STATE["waiting"])
+
+
+def test_confusion_counts_frames_that_have_both_and_adds_up():
+    table = scores.confusion(np.array([0, 1, 1, -1], np.int8), np.array([0, 1, 0, 2], np.int8))
+    assert table.sum() == 3 and table[0, 0] == table[1, 1] == table[0, 1] == 1
+    assert scores.accuracy(table) == pytest.approx(2 / 3)
+    assert scores.balanced_accuracy(table) == pytest.approx((0.5 + 1) / 2)
+    assert np.isnan(scores.accuracy(np.zeros((7, 7), int)))
+
+
+def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
+    one = dyad("a", "interaction", 0)
+    agent, user = scores.voice_tracks(one).T
+    speaks = np.arange(len(agent)) // HZ % 2 == 0
+    assert (agent == speaks).mean() > 0.9
+    assert (user[1:] == ~speaks[:-1]).mean() > 0.9 and not user[0]
+
+
+# --- lips -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [-3, 0, 2])
+def test_the_lag_of_a_jaw_is_found(lag):
+    values = talk(600)
+    recorded, late = values[20:-20], values[20 - lag : len(values) - 20 - lag]
+    found = scores.jaw_tracking([jaw(0.5 * late)], [jaw(recorded)])
+    assert found["lag_frames"] == lag and found["correlation_at_lag"] == pytest.approx(1, abs=1e-5)
+    assert found["correlation"] == pytest.approx(1, abs=1e-5) if lag == 0 else found["correlation"] < 0.9
+    assert found["jaw_spread"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_still_jaw_follows_nothing():
+    found = scores.jaw_tracking([jaw(np.zeros(100))], [jaw(talk(100))])
+    assert found["correlation"] == 0 and found["jaw_spread"] == 0
+
+
+def test_a_clip_too_short_to_be_shifted_does_not_count():
+    first, short = talk(100), talk(20)
+    assert scores.jaw_tracking([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.jaw_tracking(
+        [jaw(first)], [jaw(first)]
+    )
+    assert scores.jaw_tracking([jaw(short)], [jaw(short)])["correlation"] == 0
+
+
+def test_clips_are_each_taken_less_their_own_mean():
+    first, second = talk(200), talk(200, seed=1)
+    found = scores.jaw_tracking([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
+    assert found["correlation"] == pytest.approx(1, abs=1e-4)
+
+
+# --- smoothness -----------------------------------------------------------------------------------------------------
+
+
+def turning(frames: int = 3000) -> np.ndarray:
+    motion = np.zeros((frames, 58))
+    motion[:, :3] = np.random.default_rng(0).normal(size=(frames, 3)).cumsum(0)
+    return motion
+
+
+def test_motion_that_knows_no_chunks_has_a_ratio_of_one():
+    assert scores.border_ratio([turning()], 6) == pytest.approx(1, abs=0.08)
+
+
+def test_jumps_at_borders_are_seen_and_jumps_elsewhere_are_not():
+    motion = turning()
+    for at, high in ((1, True), (4, False)):  # frame 1 is the first of chunk 0
+        jumped = motion + 30 * ((np.arange(len(motion)) - at) // 6 % 2)[:, None]
+        assert (scores.border_ratio([jumped], 6) > 1.5) == high
+
+
+def test_a_jaw_that_stays_open_after_speech_is_seen():
+    one = dyad("a", "speaking", 0)
+    assert np.isnan(scores.listening_again([one.listener], [one]))  # it never stays silent for more than a second
+    silent = dyad("b", "listening", 1)
+    still = jaw(np.full(300, 0.2))
+    assert scores.listening_again([one.listener, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
+
+
+# --- played ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_agents_sound_comes_one_frame_early():
+    one = dyad("a", "interaction", 0)
+    frames = frames_of_dyad(one)
+    for index in (0, 30, len(frames) - 2):
+        said = one.agent_audio[(index + 1) * FRAME_SAMPLES : (index + 2) * FRAME_SAMPLES]
+        assert np.array_equal(frames[index].agent_audio, said)
+        assert np.array_equal(frames[index].audio, one.audio[index * FRAME_SAMPLES : (index + 1) * FRAME_SAMPLES])
+    assert not frames[-1].agent_audio.any()
+
+
+def test_what_is_played_has_a_frame_and_a_state_for_every_frame():
+    listener = settings().listener
+    one = dyad("a", "interaction", 0)
+    played = rollout(ArigListener(listener, torch_engine(listener, ArigModel(listener))), frames_of_dyad(one), [1])
+    assert played.motion[0].shape == one.listener.shape and np.isfinite(played.motion).all()
+    assert played.states[0, 0] == -1 and (played.states[0, 1:] >= 0).all()
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+
+def clips(seed: int = 0) -> np.ndarray:
+    walk = np.random.default_rng(seed).normal(size=(3, 250, 58)).cumsum(1)
+    return 0.01 * walk
+
+
+def test_the_truth_is_at_no_distance_of_itself():
+    found = tables.scores(clips(), clips(), clips(1), CENTRES)
+    for part in ("exp", "pose"):
+        assert found[f"FD {part}"] == pytest.approx(0, abs=1e-6) and found[f"RPCC {part}"] == 0
+        assert 0 < found[f"SID {part}"] <= np.log2(tables._CLUSTERS[part])
+
+
+def test_a_still_face_has_no_variance_and_no_diversity():
+    found = tables.scores(clips(), np.zeros_like(clips()), clips(1), CENTRES)
+    assert found["Var exp"] == found["Var pose"] == 0
+    assert found["SID exp"] == pytest.approx(0, abs=1e-5) and np.isnan(found["RPCC exp"])
+
+
+CENTRES = centres_of(clips(), tables.PARTS, tables._CLUSTERS)
+
+
+def test_clips_without_a_speakers_face_do_not_count_for_rpcc():
+    other = clips(1)
+    other[0] = np.nan
+    found = tables.scores(clips(), clips(2), other, CENTRES)
+    assert found["RPCC exp"] == tables.scores(clips()[1:], clips(2)[1:], clips(1)[1:], CENTRES)["RPCC exp"]
+    assert np.isnan(tables.scores(clips(), clips(2), np.full_like(other, np.nan), CENTRES)["RPCC exp"])
+
+
+def columns(rows):
+    """That all rows share; only of ours it is known who listens, for intervals over people."""
+    (shared,) = {tuple(key for key in row if key != "interval") for row in rows}
+    assert all(("interval" in row) == (row["source"] == "here") for row in rows)
+    return shared
+
+
+def test_rows_share_their_columns_and_hold_the_papers():
+    rows = tables.rows_of(2, clips(), clips(1), {"mine": clips(2)})
+    assert columns(rows)[:2] == ("name", "source")
+    assert rows[-1] == {"name": "ARIG", "source": "paper", "FD exp": 18.39, "FD pose": 0.06, "RPCC exp": 0.05,
+                        "RPCC pose": 0.01, "SID exp": 4.82, "SID pose": 3.94,
+                        "Var exp": 2.91, "Var pose": 0.17}  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [1, 4])
+def test_ablations_stand_beside_the_papers(number):
+    rows = tables.rows_of(number, clips(), clips(1), {"ARIG": clips(2)})
+    by_name = {row["name"]: row for row in rows}
+    assert by_name["ARIG"]["paper RPCC"] == 0.125 and by_name["ARIG"]["source"] == "here"
+    assert set(tables.ABLATIONS[number]) <= set(by_name)
+    assert "paper RPCC" in columns(rows)
+
+
+def test_figures_lie_in_their_intervals_over_people():
+    found = tables.rows_of(2, clips(), clips(1), {"mine": clips(2)}, ["a", "b", "c"])[1]
+    assert set(found["interval"]) >= {"Var exp", "RPCC pose"}
+    assert all(low <= found[name] <= high for name, (low, high) in found["interval"].items())

@@ -1,0 +1,99 @@
+"""An interval holds the truth about as often as it says, and hangs on people, not on how their minutes are cut."""
+
+import numpy as np
+import pytest
+from scipy.stats import t as student_t
+from tiny_arig_training import dyad
+
+from sfms_robot.lab.evaluation.intervals import added, distance, estimates, jackknife, people_of, quotient, ratio
+
+
+def people(rng, count=24, mean=2.0):
+    """People whose true rates scatter around `mean` a minute, each watched for 20 minutes."""
+    return [{"nods": np.array([rng.poisson(20 * rate), 20.0])} for rate in rng.gamma(4, mean / 4, count)]
+
+
+def test_an_interval_holds_the_truth_at_about_its_level():
+    held = 0
+    for trial in range(300):
+        found = estimates({"rate": quotient("nods")}, people(np.random.default_rng(trial)), seed=trial, draws=400)
+        low, high = found["rate"].interval
+        held += low <= 2.0 <= high
+    assert 0.88 <= held / 300 <= 0.98  # 0.95, less a little for so few people
+
+
+def test_more_people_are_surer():
+    few = people(np.random.default_rng(1), 8)
+    ends = [estimates({"rate": quotient("nods")}, few * times, seed=1)["rate"].interval for times in (1, 16)]
+    narrow, wide = ends[1][1] - ends[1][0], ends[0][1] - ends[0][0]
+    assert narrow == pytest.approx(wide / 4, rel=0.15)
+
+
+def test_the_value_is_that_of_the_sums():
+    rows = [
+        {"a": np.array([3.0, 1.0]), "b": np.array([1.0, 2.0])},
+        {"a": np.array([1.0, 3.0]), "b": np.array([3.0, 2.0])},
+    ]
+    found = estimates({"a": quotient("a"), "a over b": ratio("a", "b")}, rows, seed=1)
+    assert (found["a"].value, found["a over b"].value) == (1.0, 1.0)
+
+
+def test_people_who_are_alike_leave_no_doubt():
+    found = estimates({"a": quotient("a")}, [{"a": np.array([3.0, 2.0])}] * 5, seed=1)
+    assert found["a"].interval == (1.5, 1.5)
+
+
+def test_what_nothing_was_counted_of_is_none():
+    found = estimates({"a": quotient("a"), "r": ratio("b", "a")}, [{"a": np.zeros(2), "b": np.ones(2)}] * 5, seed=1)
+    assert found["a"].value is None and found["a"].interval is None and found["r"].value is None
+
+
+def test_one_person_has_no_interval():
+    assert estimates({"a": quotient("a")}, [{"a": np.ones(2)}], seed=1)["a"].interval is None
+
+
+def test_a_figure_that_most_draws_do_not_have_has_no_interval():
+    rows = [{"a": np.array([1.0, 1.0])}, *[{"a": np.zeros(2)}] * 9]
+    found = estimates({"a": quotient("a")}, rows, seed=1)["a"]
+    assert found.value == 1.0 and found.interval is None
+
+
+def test_cutting_the_minutes_of_a_person_changes_nothing():
+    whole = people(np.random.default_rng(3))
+    halves = [added([{"nods": person["nods"] / 2}] * 2) for person in whole]
+    figures = {"rate": quotient("nods")}
+    assert estimates(figures, whole, seed=1) == estimates(figures, halves, seed=1)
+
+
+def test_the_distance_of_two_histograms():
+    apart = [{"a": np.array([1.0, 0, 0]), "b": np.array([0, 0, 1.0]), "c": np.array([1.0, 1, 0])}] * 3
+    found = estimates({"a a": distance("a", "a"), "a b": distance("a", "b"), "a c": distance("a", "c")}, apart, seed=1)
+    assert [found[key].value for key in ("a a", "a b", "a c")] == [0.0, 1.0, pytest.approx(0.5)]
+
+
+# --- leaving out one person at a time ---------------------------------------------------------------------------
+
+
+def _mean_of(values):
+    return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
+
+
+def test_intervals_over_people_are_those_of_their_means() -> None:
+    """One clip each: the jackknife of a mean is Student's interval."""
+    values = np.random.default_rng(0).normal(3.0, 2.0, 20)
+    found = jackknife(_mean_of(values), [str(number) for number in range(20)])
+    low, high = student_t.interval(0.95, 19, values.mean(), values.std(ddof=1) / np.sqrt(20))
+    assert found == {"mean": (pytest.approx(low), pytest.approx(high))}
+
+
+def test_clips_of_one_person_hang_together() -> None:
+    values = np.repeat(np.random.default_rng(1).normal(0, 1, 6), 50)
+    (low, high) = jackknife(_mean_of(values), [str(number) for number in np.repeat(range(6), 50)])["mean"]
+    (near, far) = jackknife(_mean_of(values), [str(number) for number in range(300)])["mean"]
+    assert high - low > 3 * (far - near)
+    assert jackknife(_mean_of(values), ["a", "b"] * 150) == {}
+
+
+def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:
+    dyads = [dyad(name, "listening", 0) for name in ("IS1000a_B_0120", "IS1000d_B_0007", "IS1000a_C_0120", "clip_7")]
+    assert people_of(dyads, [250, 600, 249, 300], 250) == ["IS1000 B"] * 3 + ["clip_7"]

@@ -1,0 +1,263 @@
+"""The papers' metrics against scipy and plain loops over their definitions, and their laws."""
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from sfms_robot.lab.corpora.learning2listen import l2l_bilateral, l2l_mean_std
+from sfms_robot.lab.evaluation import metrics
+
+RNG = np.random.default_rng(3)
+
+
+def test_frechet_equals_the_matrix_root():
+    a, b = RNG.normal(size=(3, 200, 6)), RNG.normal(0.5, 2.0, size=(3, 200, 6))
+    x, y = a.reshape(-1, 6), b.reshape(-1, 6)
+    sx, sy = np.cov(x.T), np.cov(y.T)
+    gap = x.mean(0) - y.mean(0)
+    expected = gap @ gap + np.trace(sx + sy - 2 * np.real(linalg.sqrtm(sx @ sy)))
+    assert metrics.frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
+
+
+def test_frechet_of_a_set_with_itself_is_zero_and_of_a_shift_its_square():
+    a = RNG.normal(size=(2, 100, 4))
+    assert metrics.frechet_distance(a, a) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.frechet_distance(a, a + [1.0, 0, 2.0, 0]) == pytest.approx(5.0)
+
+
+def test_too_few_frames_are_said(caplog):
+    metrics.frechet_distance(RNG.normal(size=(5, 9)), RNG.normal(size=(5, 9)))
+    assert "singular" in caplog.text
+
+
+def test_paired_frechet_sees_what_frechet_cannot():
+    speaker = RNG.normal(size=(4, 500, 2))
+    target, other = speaker.copy(), RNG.normal(size=(4, 500, 2))
+    assert metrics.frechet_distance(target, other) < 0.02
+    assert metrics.paired_frechet_distance(target, other, speaker) > 1.0
+
+
+def test_the_three_variances():
+    x = RNG.normal(size=(5, 30, 4)) * [1, 2, 3, 4] + [0, 10, 20, 30]
+    assert metrics.variance(x) == pytest.approx(np.var(x))
+    assert metrics.variance(x, "time") == pytest.approx(np.mean([np.var(c, axis=0).mean() for c in x]))
+    assert metrics.variance(x, "sum") == pytest.approx(sum(np.var(x[..., d]) for d in range(4)))
+
+
+def test_l2_definitions():
+    a, b = RNG.normal(size=(2, 40, 3)), RNG.normal(size=(2, 40, 3))
+    assert metrics.l2(a, b) == pytest.approx(np.mean([np.linalg.norm(x) for x in (a - b).reshape(-1, 3)]))
+    assert metrics.mse(a, b) == pytest.approx(((a - b) ** 2).mean())
+
+
+def test_shannon_index_of_even_use_is_log_k_and_of_one_cluster_nothing():
+    centres = np.arange(8.0)[:, None] * 10
+    even = np.repeat(centres, 50, axis=0)[None]
+    assert metrics.shannon_index(even, centres) == pytest.approx(np.log(8), abs=1e-4)
+    assert metrics.shannon_index(even, centres, "bits") == pytest.approx(3.0, abs=1e-4)
+    assert metrics.shannon_index(np.zeros((1, 100, 1)), centres) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_shannon_index_counts_nearest_centres():
+    reference, pred = RNG.normal(size=(4, 50, 3)), RNG.normal(size=(4, 50, 3))
+    centres = metrics.cluster_centres(reference, 6)
+
+    def entropy(frames):
+        nearest = [int(np.argmin([np.linalg.norm(frame - centre) for centre in centres])) for frame in frames]
+        shares = [nearest.count(label) / len(nearest) for label in set(nearest)]
+        return -sum(share * np.log2(share + 1e-6) for share in shares)
+
+    assert metrics.shannon_index(pred, centres, "bits") == pytest.approx(entropy(pred.reshape(-1, 3)))
+    with pytest.raises(ValueError, match="200 frames do not make 201 clusters"):
+        metrics.cluster_centres(reference, 201)
+    with pytest.raises(ValueError, match="200 frames differ too little to make 3 clusters"):
+        metrics.cluster_centres(np.zeros_like(reference), 3)
+
+
+def test_centres_are_the_means_of_what_is_nearest_to_them():
+    frames = RNG.normal(size=(2, 400, 2))
+    centres = metrics.cluster_centres(frames, 5)
+    pooled = frames.reshape(-1, 2)
+    nearest = np.linalg.norm(pooled[:, None] - centres, axis=2).argmin(axis=1)
+    means = np.stack([pooled[nearest == label].mean(axis=0) for label in range(5)])
+    np.testing.assert_allclose(centres, means, atol=0.02)
+
+
+def test_rpcc():
+    speaker = RNG.normal(size=(3, 200, 2))
+    target, pred = 2 * speaker, RNG.normal(size=(3, 200, 2))
+    r = np.corrcoef(pred.ravel(), speaker.ravel())[0, 1]
+    assert metrics.rpcc_flat(target, pred, speaker) == pytest.approx(1 - r)
+    assert metrics.rpcc_channels(target, target, speaker) == 0.0
+    assert metrics.rpcc_channels(target, pred, speaker) == pytest.approx(1.0, abs=0.15)
+
+
+def test_sts_counts_the_borders_of_clips():
+    a = np.zeros((2, 3, 1))
+    b = a + np.array([0.0, 1.0])[:, None, None]
+    assert metrics.sts(a, b) == pytest.approx(np.sqrt(1 / 0.1))
+
+
+def test_l2l_std_is_the_std_of_stds():
+    x = RNG.normal(size=(6, 20, 2)) * np.arange(1, 7)[:, None, None]
+    mean, std = l2l_mean_std(x)
+    assert mean.shape == std.shape == (1, 1, 2)
+    assert std[0, 0, 1] == pytest.approx(np.std([np.std(clip[:, 1]) for clip in x]), rel=1e-9)
+
+
+def test_the_bilateral_filter_is_the_five_tap_kernel_on_small_values():
+    x = 0.1 * RNG.normal(size=(1, 50, 2))
+    padded = np.pad(x, ((0, 0), (2, 2), (0, 0)), mode="reflect")
+    kernel = np.array([1, 3, 5, 3, 1]) / 13
+    expected = sum(w * padded[:, i : i + 50] for i, w in enumerate(kernel))
+    np.testing.assert_allclose(l2l_bilateral(x), expected, atol=2e-3)
+    np.testing.assert_allclose(l2l_bilateral(np.full((3, 7, 1), 4.0)), 4.0)
+
+
+def test_the_bilateral_filter_equals_the_loop_over_a_circle_of_pixels():
+    x = 30 * RNG.normal(size=(2, 9, 3))
+    expected = np.zeros_like(x)
+    for clip, frame, channel in np.ndindex(x.shape):
+        total = weights = 0.0
+        for down in range(-2, 3):
+            for across in range(-2, 3):  # an image one pixel wide: reflection finds the same column
+                if down**2 + across**2 > 4:
+                    continue
+                at = abs(frame + down)
+                value = x[clip, min(at, 2 * 8 - at), channel]
+                far = (down**2 + across**2 + (value - x[clip, frame, channel]) ** 2) / (2 * 20.0**2)
+                total, weights = total + np.exp(-far) * value, weights + np.exp(-far)
+        expected[clip, frame, channel] = total / weights
+    np.testing.assert_allclose(l2l_bilateral(x), expected, rtol=1e-10)
+
+
+RNG = np.random.default_rng(7)
+
+
+def naive_dtw(a, b):
+    cost = np.full((len(a) + 1, len(b) + 1), np.inf)
+    cost[0, 0] = 0
+    for i in range(1, len(a) + 1):
+        for j in range(1, len(b) + 1):
+            step = ((a[i - 1] - b[j - 1]) ** 2).sum()
+            cost[i, j] = step + min(cost[i - 1, j], cost[i, j - 1], cost[i - 1, j - 1])
+    return np.sqrt(cost[-1, -1])
+
+
+def naive_ccc(x, y):
+    total = 0.0
+    for a, b in zip(x.T, y.T, strict=True):
+        rho = np.corrcoef(a, b)[0, 1] if a.std() > 0 and b.std() > 0 else 0.0
+        total += 2 * rho * a.std() * b.std() / (a.var() + b.var() + (a.mean() - b.mean()) ** 2 + 1e-8)
+    return total / x.shape[1]
+
+
+@pytest.mark.parametrize("sizes", [(1, 1), (1, 9), (13, 8), (20, 20)])
+def test_dtw_equals_the_textbook_loop(sizes):
+    a, b = RNG.normal(size=(sizes[0], 3)), RNG.normal(size=(sizes[1], 3))
+    others = np.stack([b, b[::-1]])
+    assert metrics.dtw(a, others) == pytest.approx([naive_dtw(a, other) for other in others], rel=1e-9)
+
+
+def test_dtw_forgives_a_pause():
+    x = RNG.normal(size=(30, 4))
+    held = np.concatenate([x[:10], np.repeat(x[10:11], 7, axis=0), x[11:]])
+    assert metrics.dtw(x, held[None]) == pytest.approx([0.0], abs=1e-6)
+
+
+def test_ccc_equals_its_definition_and_counts_constant_channels_as_zero():
+    x, y = RNG.normal(size=(40, 5)), RNG.normal(size=(40, 5))
+    x[:, 2] = y[:, 2] = 0.3
+    assert metrics.ccc(x, y) == pytest.approx(naive_ccc(x, y), rel=1e-9)
+    assert metrics.ccc(x, x) == pytest.approx(4 / 5, abs=1e-6)
+
+
+def test_ccc_of_many_tracks_is_the_mean_of_theirs():
+    x, y = RNG.normal(size=(2, 3, 40, 5)), RNG.normal(size=(2, 3, 40, 5))
+    each = [metrics.ccc(a, b) for a, b in zip(x.reshape(6, 40, 5), y.reshape(6, 40, 5), strict=True)]
+    assert metrics.ccc(x, y) == pytest.approx(np.mean(each), rel=1e-12)
+
+
+@pytest.mark.parametrize("as_challenge", [True, False])
+def test_frsyn_equals_the_loop_over_lags(as_challenge):
+    pred, speaker = RNG.normal(size=(2, 3, 70, 4)).cumsum(axis=2), RNG.normal(size=(2, 70, 4)).cumsum(axis=1)
+    pred[1, :, :, 2] = 0.25
+    offsets = []
+    for clip, person in zip(pred[:, :1] if as_challenge else pred, speaker, strict=True):
+        for sample in clip:
+            means = []
+            for lag in range(-49, 50):
+                late, early = (sample[lag:], person[: 70 - lag]) if lag >= 0 else (sample[:lag], person[-lag:])
+                of = [
+                    np.corrcoef(a, b)[0, 1] if np.ptp(a) > 0 else np.nan for a, b in zip(late.T, early.T, strict=True)
+                ]
+                means.append(np.mean(of) if as_challenge else np.nanmean(of))
+            offsets.append(abs(49 - int(np.argmax(means))))
+    assert metrics.frsyn(pred, speaker, as_challenge) == pytest.approx(np.mean(offsets))
+
+
+def test_dtw_of_a_track_with_itself_is_exactly_zero_wherever_it_lies():
+    x = np.pi + 1e-3 * RNG.normal(size=(40, 3))
+    assert metrics.dtw(x, x[None]) == 0.0
+
+
+def test_frc_and_frd_are_means_over_samples_and_contexts():
+    pred, target = RNG.random((3, 2, 12, 25)), RNG.random((3, 12, 25))
+    frc = frd = 0.0
+    for n in range(3):
+        for sample in pred[n]:
+            truth = target[n]
+            frc += naive_ccc(truth, sample)
+            frd += (
+                naive_dtw(truth[:, :15], sample[:, :15]) / 15
+                + naive_dtw(truth[:, 15:17], sample[:, 15:17])
+                + naive_dtw(truth[:, 17:], sample[:, 17:]) / 8
+            )
+    assert metrics.frc(pred, target) == pytest.approx(frc / 6, rel=1e-9)
+    assert metrics.frd(pred, target) == pytest.approx(frd / 6, rel=1e-9)
+
+
+def test_reactface_scales_by_ten_and_takes_any_width():
+    pred, target = RNG.random((2, 10, 58)), RNG.random((2, 10, 58))
+    expected = np.mean([naive_dtw(target[n], pred[n]) for n in range(2)])
+    assert metrics.reactface_frd(pred, target) == pytest.approx(10 * expected, rel=1e-9)
+
+
+def test_uniform_noise_has_the_analytic_diversities():
+    noise = RNG.random((40, 10, 100, 25))
+    assert metrics.frvar(noise) == pytest.approx(1 / 12, rel=0.01)
+    assert metrics.frdiv(noise) == pytest.approx(1 / 6, rel=0.01)
+    assert metrics.frdvs(noise) == pytest.approx(1 / 6, rel=0.01)
+
+
+def test_diversities_equal_the_sums_over_pairs():
+    x = RNG.normal(size=(4, 3, 6, 5))
+    pairs = [((x[n, i] - x[n, j]) ** 2).sum() / 30 for n in range(4) for i in range(3) for j in range(3) if i != j]
+    assert metrics.frdiv(x) == pytest.approx(np.sum(pairs) / 6 / 4)
+    between = [((x[n, k] - x[m, k]) ** 2).sum() / 30 for k in range(3) for n in range(4) for m in range(4) if n != m]
+    assert metrics.frdvs(x) == pytest.approx(np.sum(between) / 12 / 3)
+    assert metrics.frdiv(x[:, :1]) == 0.0
+
+
+@pytest.mark.parametrize("lag", [-20, -3, 0, 5, 49])
+def test_frsyn_finds_the_lag(lag):
+    speaker = RNG.normal(size=(1, 400, 3))
+    pred = np.roll(speaker, lag, axis=1)
+    for as_challenge in (True, False):
+        assert metrics.frsyn(pred, speaker, as_challenge) == abs(lag)
+
+
+def test_one_constant_channel_makes_the_challenges_frsyn_49_and_is_skipped_by_the_other():
+    speaker = RNG.normal(size=(2, 300, 3))
+    pred = np.repeat(np.roll(speaker, 4, axis=1)[:, None], 2, axis=1)
+    pred[..., 1] = 0.5
+    assert metrics.frsyn(pred, speaker) == 49.0
+    assert metrics.frsyn(pred, speaker, as_challenge=False) == 4.0
+    assert np.isnan(metrics.frsyn(np.zeros_like(pred), speaker, as_challenge=False))
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match="25 attributes"):
+        metrics.frd(np.zeros((2, 5, 58)), np.zeros((2, 5, 58)))
+    with pytest.raises(ValueError, match="target: expected shape"):
+        metrics.frc(np.zeros((2, 5, 25)), np.zeros((3, 5, 25)))
