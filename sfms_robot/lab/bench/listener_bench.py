@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.app.session import RunOptions, run
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import run
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame

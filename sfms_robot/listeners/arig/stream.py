@@ -356,8 +356,8 @@ class ArigListener(RunsOnEngine):
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
         parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
         streams = len(memories) // len(speakers)
-        sounds, present, voiced, face, seen = (np.repeat(part, streams, axis=0) for part in parts)
-        return BothPeople(sounds, present, voiced, face, seen, voices * streams)
+        first, there, speak, faces, known = (np.repeat(part, streams, axis=0) for part in parts)
+        return BothPeople(first, there, speak, faces, known, voices * streams)
 
     def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
         """Return the inputs of the network `frame`."""
