@@ -89,7 +89,14 @@ def page(
 def _show_answers(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], json: bool) -> None:
     """Print the answers of heads; exit code 1 when a named head did not answer, or none did."""
     silent = [name for name in asked if name not in {each.get("name") for each in answers}]
-    show({"answers": list(answers), "silent": silent}, json)
+
+    def printed(_: Mapping[str, Any]) -> None:
+        for each in answers:
+            print(f"{each.get('name')}: {each.get('error') or each.get('done')}")
+        for name in silent:
+            print(f"{name}: does not answer")
+
+    show({"answers": list(answers), "silent": silent}, json, printed)
     if silent or not answers:
         if not answers and not silent:
             print("no head answers", file=sys.stderr)

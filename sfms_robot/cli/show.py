@@ -83,7 +83,7 @@ def print_rows(
     *,
     alarming: Callable[[Mapping[str, Any]], bool] = lambda row: False,
 ) -> None:
-    """Print a table whose columns are the keys of the first row; nothing without rows. `alarming` rows are red.
+    """Print a table whose columns are the keys of the rows; nothing without rows. `alarming` rows are red.
 
     A column of mappings with more than `_NESTED` keys is left to --json.
     """
@@ -94,7 +94,9 @@ def print_rows(
     if not rows:
         return
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    keys = [key for key, value in rows[0].items() if not (isinstance(value, Mapping) and len(value) > _NESTED)]
+    columns = {key: value for row in reversed(rows) for key, value in row.items()}
+    order = dict.fromkeys(key for row in rows for key in row)
+    keys = [key for key in order if not (isinstance(columns[key], Mapping) and len(columns[key]) > _NESTED)]
     for key in keys:
         numbers = all(isinstance(row.get(key), int | float | None) for row in rows)
         table.add_column(key, justify="right" if numbers else "left", no_wrap=numbers, overflow="fold")

@@ -12,11 +12,22 @@ from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX
 
 
+def pixels_of(png):
+    with Image.open(png) as picture:
+        return np.asarray(picture).astype(float)
+
+
+def size_of(png):
+    """Return the height and width of a picture, px."""
+    with Image.open(png) as picture:
+        return picture.height, picture.width
+
+
 @pytest.mark.parametrize(("seconds", "voice"), [(2.0, True), (2.0, False), (0.01, True)])
 def test_a_plot_is_1600_by_1200(tmp_path, seconds, voice):
     pytest.importorskip("matplotlib")
     plot(read_recording(record(tmp_path, seconds, voice)), tmp_path / "a.png")
-    assert np.asarray(Image.open(tmp_path / "a.png")).shape[:2] == (1200, 1600)
+    assert size_of(tmp_path / "a.png") == (1200, 1600)
 
 
 def test_the_sheet_of_a_run_is_drawn(tmp_path):
@@ -71,7 +82,7 @@ def test_pictures_are_drawn_without_a_display(tmp_path):
     pytest.importorskip("vtkmodules")
     times_s, frames = run_with_events()
     instants = render_sheet(tmp_path / "sheet.png", times_s, frames, times_s > 5, "a run")
-    height, width = np.asarray(Image.open(tmp_path / "sheet.png")).shape[:2]
+    height, width = size_of(tmp_path / "sheet.png")
     assert width == pytest.approx(1600, abs=20) and 1000 < height < 1400
     assert instants == pick_instants(times_s, frames)
 
@@ -84,7 +95,7 @@ def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
     for name, tilt_rad in (("still", 0.0), ("down", 0.4)):
         angles_rad[:, 1] = tilt_rad
         render_sheet(tmp_path / f"{name}.png", times_s, frames, None, "a run", (scene, angles_rad))
-    still, down = (np.asarray(Image.open(tmp_path / f"{name}.png")).astype(float) for name in ("still", "down"))
+    still, down = (pixels_of(tmp_path / f"{name}.png") for name in ("still", "down"))
     change = np.abs(still - down).mean(axis=2)
     first = slice(8, 260), slice(268, 440)  # the virtual head and the robot, of the first instant
     face, robot = (change[80:360, columns] for columns in first)

@@ -124,7 +124,10 @@ def test_curves_that_were_asked_for_name_the_missing_extra(arguments):
     command = [sys.executable, "-c", without, "train", "tokenizer", *arguments(), "--tensorboard"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 2
-    assert ended.stderr == "sfms-robot: --tensorboard needs an optional part: pip install 'sfms-robot[train]'\n"
+    assert (
+        ended.stderr
+        == "sfms-robot: --tensorboard needs tensorboard, which is not installed: pip install 'sfms-robot[train]'\n"
+    )
 
 
 def test_a_finished_run_says_so(done, arguments):
@@ -144,7 +147,7 @@ def test_an_earlier_training_is_not_lost_unasked(done, fails, arguments, tmp_pat
     weights = tmp_path / "out" / "tokenizer.safetensors"
     before = weights.read_bytes()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")
-    assert code == 2 and f"{weights} is of an earlier training: --resume continues with it, --overwrite" in told
+    assert code == 2 and f"{weights} is of an earlier training: --resume continues it, --overwrite" in told
     assert weights.read_bytes() == before
     weights.unlink()
     code, told = fails("tokenizer", *arguments(), "--steps", "3")

@@ -1,6 +1,7 @@
 """The page on real sockets of this machine, in its process: told, worked, refused, and holding nothing up."""
 
 import gzip
+import itertools
 import json
 import logging
 import os
@@ -64,12 +65,19 @@ def process():
         yield page
 
 
+RUNS = itertools.count()
+
+
 @pytest.fixture
 def page(process):
     """Behind which a run has begun."""
     asked = process.asked = Asked()
     process.answered_by(asked)
-    process.say("begin", **HELLO)
+    number = next(RUNS)
+    process.say("begin", **HELLO, seed=number)
+    with visit(process) as visitor:  # until the page has begun to show this run
+        while heard(visitor, "hello").get("seed") != number:
+            pass
     return process
 
 

@@ -334,6 +334,8 @@ def metrics_server(wanted: str) -> LocalServer:
     from starlette.responses import Response
     from starlette.routing import Route
 
+    from sfms_robot.viewer.web_server import LocalServer
+
     host, _, number = wanted.rpartition(":")
     port = port_number(number)
     if port is None:

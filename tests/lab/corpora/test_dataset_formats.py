@@ -365,7 +365,7 @@ def test_manual_and_help_name_every_layout_as_it_is():
     rows = {line.split("|")[1].strip(" `"): line for line in manual.splitlines() if line.startswith("| `")}
     for name, layout in LAYOUTS.items():
         assert f"`{layout.space}`" in rows[name] and f"| {layout.fps:g} |" in rows[name]
-    help_text = (Path(formats.__file__).parents[2] / "cli" / "data_command.py").read_text(encoding="utf-8")
+    help_text = (Path(formats.__file__).parents[2] / "cli" / "train_command.py").read_text(encoding="utf-8")
     assert all(name in help_text for name in LAYOUTS)
 
 
