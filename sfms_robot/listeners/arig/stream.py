@@ -354,9 +354,10 @@ class ArigListener(RunsOnEngine):
             if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
-        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
         streams = len(memories) // len(speakers)
-        return BothPeople(*(np.repeat(part, streams, axis=0) for part in parts), voices * streams)
+        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
+        sounds, here, voiced, face, seen = (np.repeat(part, streams, axis=0) for part in parts)
+        return BothPeople(sounds, here, voiced, face, seen, voices * streams)
 
     def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
         """Return the inputs of the network `frame`."""
