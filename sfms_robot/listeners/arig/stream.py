@@ -354,7 +354,6 @@ class ArigListener(RunsOnEngine):
             if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
-        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
         streams = len(memories) // len(speakers)
         first, there, speak, faces, known = (np.repeat(part, streams, axis=0) for part in parts)
         return BothPeople(first, there, speak, faces, known, voices * streams)
