@@ -195,9 +195,9 @@ def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
     [
         ([EmulatedServo(1), EmulatedServo(1)], {}, "id = 1 is used twice"),
         ([EmulatedServo(253)], {}, "id = 253 is not a servo id"),
-        ([EmulatedServo(1, baud=12345)], {}, r"baud = 12345 is no rate of xl330-m288 \(9600, 57600"),
+        ([EmulatedServo(1, baud=12345)], {}, r"baud = 12345 is not a rate of xl330-m288 \(9600, 57600"),
         ([EmulatedServo(1, model="xl999")], {}, "'xl999' has no firmware map"),
-        ([EmulatedServo(1, registers={"homing": 3})], {}, "register = 'homing' is none of xl330-m288"),
+        ([EmulatedServo(1, registers={"homing": 3})], {}, "register = 'homing' is not a register of xl330-m288"),
         (
             [EmulatedServo(1, registers={"shutdown": 300})],
             {},
