@@ -60,7 +60,7 @@ def test_either_a_head_or_servos():
     ("stored", "message"),
     [
         ("joints: {nose: {shutdown: 52}}", "joints = 'nose' is no joint of this head"),
-        ("registers: {homing: 3}", "register = 'homing' is none of xl330-m288"),
+        ("registers: {homing: 3}", "register = 'homing' is not a register of xl330-m288"),
         ("supply_v: -1", "emulate.yaml: supply_v = -1"),
     ],
 )
@@ -87,7 +87,7 @@ def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
     ("more", "message"),
     [
         ({"stored": ("min_position_limit=3",)}, "stored = 'min_position_limit=3' cannot be read: IDS:REGISTER=VALUE"),
-        ({"stored": ("1:nose=3",)}, "register = 'nose' is none of xl330-m288"),
+        ({"stored": ("1:nose=3",)}, "register = 'nose' is not a register of xl330-m288"),
         ({"stored": ("1:shutdown=300",)}, "shutdown = 300 is out of range of xl330-m288"),
         ({"starts": ("1:4150",)}, "start = '1:4150' cannot be read: IDS=TICKS"),
         ({"starts": ("7=4150",)}, "start = '7=4150' names 7, which nobody has"),
