@@ -355,6 +355,7 @@ class ArigListener(RunsOnEngine):
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
         streams = len(memories) // len(speakers)
+        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
         first, there, speak, faces, known = (np.repeat(part, streams, axis=0) for part in parts)
         return BothPeople(first, there, speak, faces, known, voices * streams)
 
