@@ -73,7 +73,7 @@ def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(evaluate,
 
 def test_interaction_is_for_listeners_that_speak(evaluate, data):
     code, _, err = evaluate("interaction", "--listener", "sfms-small", "--data", data)
-    assert code == 2 and "--listener sfms-small: does not speak; this looks at listeners of kind arig" in err
+    assert code == 2 and "--listener sfms-small: does not speak; this command evaluates listeners of kind arig" in err
 
 
 def test_table_2_has_a_row_for_every_listener_given_and_the_papers(evaluate, listener, lively):
