@@ -14,8 +14,8 @@ import serial
 from emulated_port import ScriptedPort
 from virtual_time import Time
 
-from sfms_robot.config import load_firmware_map, load_head
-from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.config import load_head
+from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
@@ -101,10 +101,25 @@ def test_impossible_baud_rate_is_an_error_of_one_line(baud):
         SerialPort(device, 57600, Time()).close()
 
 
-def test_servo_at_four_and_a_half_megabaud_is_found(make_rig):
-    fast = [EmulatedServo(1, model="xm430-w350", baud=4_500_000)]
-    with make_rig(fast, baud=4_500_000, firmware_map=load_firmware_map("xm430-w350")) as rig:
-        assert rig.ticks(rig.hold(), 3)["joint1"].age_s == 0.0
+@contextmanager
+def virtual(servo, baud=1_000_000):
+    """The emulator of one servo in its own process: it, its clock, and what opens a port to it."""
+    clock = Time()
+    with launch([servo], virtual=True) as chain:
+        yield chain, clock, lambda: VirtualTimePort(chain.device, chain.control, baud, clock)
+
+
+@contextmanager
+def linked(open_port, baud=1_000_000):
+    link = Dynamixel2Link(open_port(), baud, 0.003)
+    yield link
+    link.port.close()
+
+
+def test_servo_at_four_and_a_half_megabaud_is_found():
+    fast = EmulatedServo(1, model="xm430-w350", baud=4_500_000)
+    with virtual(fast, 4_500_000) as (_, _, open_port), linked(open_port, 4_500_000) as link:
+        assert link.ping(1) is not None
 
 
 def test_device_that_takes_no_more_bytes_is_a_failure_and_no_hang():
@@ -161,31 +176,31 @@ def test_virtual_port_needs_an_emulator(tmp_path):
         VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Time())
 
 
-def test_rubbish_neither_hangs_nor_confuses(make_rig):
+def test_rubbish_neither_hangs_nor_confuses():
     noise = bytes((i * i * 31 + i // 7) & 0xFF for i in range(100_000))
-    with make_rig([EmulatedServo(1)]) as rig:
-        port = rig.port()
+    with virtual(EmulatedServo(1)) as (chain, clock, open_port):
+        port = open_port()
         port.write(noise)
         assert port.read(1 << 16, 0.0) == b""
         port.close()
-        rig.clock.t = 1.0
-        with rig.link() as link:
+        clock.t = 1.0
+        with linked(open_port) as link:
             assert link.ping(1) is not None
-        assert rig.chain.digest()[1] > 100_000
+        assert chain.digest()[1] > 100_000
 
 
-def test_a_busy_machine_is_no_reason_to_give_up_a_write_in_virtual_time(make_rig):
+def test_a_busy_machine_is_no_reason_to_give_up_a_write_in_virtual_time():
     """A process that gets no turn for half a second, with pyserial's own write under way, lost its bus for good."""
-    with make_rig([EmulatedServo(1)]) as rig:
-        port = rig.port()
+    with virtual(EmulatedServo(1)) as (_, _, open_port):
+        port = open_port()
         assert port._serial.write_timeout > 10 * WRITE_TIMEOUT_S
         port.close()
 
 
-def test_second_host_in_virtual_time_starts_from_zero(make_rig):
-    with make_rig([EmulatedServo(1)]) as rig:
+def test_second_host_in_virtual_time_starts_from_zero():
+    with virtual(EmulatedServo(1)) as (_, _, open_port):
         for _ in range(2):
-            with rig.link() as link:
+            with linked(open_port) as link:
                 assert link.read(1, 132, 4) is not None
 
 
