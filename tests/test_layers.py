@@ -36,18 +36,6 @@ ALLOWED = {
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
 
-# File names that stand more than once, each with the part that it plays for both families.
-SHARED_NAMES = {
-    "model": "the network of SFMS, that of ARIG, and the hazards of events",
-    "stream": "the listener that plans with SFMS, and that with ARIG",
-    "features": "what SFMS is trained on, and what ARIG is trained on",
-    "losses": "what SFMS learns by, and what ARIG learns by",
-    "bus": "what all buses share, and the bus of a chain of servos",
-    "protocol1": "bytes of the FF FF frame, and requests over a port",
-    "registry": "the kinds of listeners, and those of sources",
-    "idle": "what a listener adds to a face at rest, and what a head does without one",
-}
-
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -83,10 +71,10 @@ def test_module_imports_only_what_its_layer_may(module: Path) -> None:
             assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_EMULATOR, f"emulator may not import {'.'.join(target)}"
 
 
-def test_no_two_files_share_a_name_unless_they_play_the_same_part_for_two_families() -> None:
-    names = Counter(module.stem for module in MODULES if module.stem != "__init__")
-    families = dict.fromkeys(SHARED_NAMES, 2) | {"model": 3}
-    assert {name: count for name, count in names.items() if count > 1} == families
+def test_no_two_classes_share_a_name() -> None:
+    trees = [ast.parse(module.read_text(encoding="utf-8")) for module in MODULES]
+    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    assert not [name for name, count in names.items() if count > 1]
 
 
 def test_every_layer_has_a_rule() -> None:

@@ -22,7 +22,7 @@ class Size(StrEnum):
     paper = "paper"
 
 
-class Table(StrEnum):
+class TableName(StrEnum):
     """1 and 2 of SFMS; those of ARIG."""
 
     one = "1"
@@ -84,7 +84,7 @@ def listener_(
         [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
     ),
     data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
-    table: Table | None = Option(
+    table: TableName | None = Option(
         None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
     ),
     samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),

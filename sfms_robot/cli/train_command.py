@@ -40,7 +40,7 @@ class Placement(StrEnum):
     learned = "learned"
 
 
-class Device(StrEnum):
+class DeviceName(StrEnum):
     auto = "auto"
     cpu = "cpu"
     cuda = "cuda"
@@ -51,7 +51,7 @@ DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot da
 OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
 RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
 OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
-DEVICE = Option(Device.auto, help="auto: the GPU if there is one.")
+DEVICE = Option(DeviceName.auto, help="auto: the GPU if there is one.")
 STEPS = Option(None, min=1, help="Another number of steps than the file's.")
 TENSORBOARD = Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
 ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
@@ -74,7 +74,7 @@ def tokenizer(
     out: Path | None = OUT,
     resume: bool = RESUME,
     overwrite: bool = OVERWRITE,
-    device: Device = DEVICE,
+    device: DeviceName = DEVICE,
     steps: int | None = STEPS,
     placement: Placement | None = Option(None, help="Another keyframe placement than the file's, to compare."),
     tensorboard: bool | None = TENSORBOARD,
@@ -113,7 +113,7 @@ def listener(
     out: Path | None = OUT,
     resume: bool = RESUME,
     overwrite: bool = OVERWRITE,
-    device: Device = DEVICE,
+    device: DeviceName = DEVICE,
     steps: int | None = STEPS,
     tensorboard: bool | None = TENSORBOARD,
     order: Order | None = ORDER,

@@ -156,7 +156,7 @@ class Scores(Model):
         return self
 
 
-class Listener(Model):
+class ListenerSettings(Model):
     """Settings of every kind of listener: `configs/listeners/NAME/config.yaml`.
 
     Attributes:
@@ -188,7 +188,7 @@ class Listener(Model):
         return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
     @model_validator(mode="after")
-    def _fits_space(self) -> Listener:
+    def _fits_space(self) -> ListenerSettings:
         if self.neutral is not None and len(self.neutral) != len(self.channels):
             raise ValueError(f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}")
         if self.flame_matrix is not None and self.motion_space != "deca56":
@@ -198,7 +198,7 @@ class Listener(Model):
         return self
 
 
-class Sfms(Listener):
+class Sfms(ListenerSettings):
     """Sparse keyframe tokens and their predictor.
 
     `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
@@ -380,7 +380,7 @@ class Diffusion(Model):
         return self
 
 
-class Arig(Listener):
+class Arig(ListenerSettings):
     """Frame-wise autoregression with a diffusion head.
 
     Attributes:
@@ -450,7 +450,7 @@ class ListenerKind:
         package: of the kind, imported when such a listener is loaded; it has `load` and `export_graphs`.
     """
 
-    settings: type[Listener]
+    settings: type[ListenerSettings]
     package: str
 
     def load_folder(self, folder: Path, engine: str = "auto", threads: int | None = None) -> Any:
@@ -472,12 +472,12 @@ LISTENER_KINDS: Final[Mapping[str, ListenerKind]] = {
 }
 
 
-def load_listener(file: Path) -> Listener:
+def load_listener(file: Path) -> ListenerSettings:
     """Read one listener's YAML file, of any kind. Raises ConfigError."""
     return parse_listener(read(file), file)
 
 
-def parse_listener(raw: Any, file: Path | str) -> Listener:
+def parse_listener(raw: Any, file: Path | str) -> ListenerSettings:
     """Validate plain data of a listener. Raises ConfigError."""
     name = str(raw.get("kind")) if isinstance(raw, dict) else ""
     if name not in LISTENER_KINDS:

@@ -41,7 +41,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, EmulatedWire
+from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.emulator.servo_chains import Dynamixel2Chain, Protocol1Chain
@@ -295,7 +295,9 @@ def _json(value: object) -> str:
     return f"json {json.dumps(value)}"
 
 
-def plugged(servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> list[Device]:
+def plugged(
+    servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True
+) -> list[EmulatedDevice]:
     """Return a device for the servos of each protocol, and one for each board; `tables` by model."""
     groups: dict[tuple[Any, str], list[EmulatedServo]] = {}
     for servo in servos:

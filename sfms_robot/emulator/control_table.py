@@ -171,7 +171,7 @@ def mode_of(memory: ControlTable) -> Mode:
     return Mode.JOINT if is_feetech or limits[0] < limits[1] else Mode.NONE
 
 
-class Frame:
+class ServoFrame:
     """Position registers <-> ticks of the shaft: register = sign * shaft / divider + offset.
 
     Attributes:
@@ -220,7 +220,7 @@ class Frame:
 
 
 def motor_command(
-    memory: ControlTable, mode: Mode, frame: Frame, reference: float, stepped: float
+    memory: ControlTable, mode: Mode, frame: ServoFrame, reference: float, stepped: float
 ) -> MotorCommand | None:
     """Return the command of a motor under torque, or None where the registers command nothing.
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
-from sfms_robot.emulator.faults import TO_SERVOS, Fault, Faults, parse_fault
+from sfms_robot.emulator.faults import TO_SERVOS, Fault, WireFaults, parse_fault
 from sfms_robot.errors import ConfigError
 
 Timing = Literal["instant", "wire"]
@@ -54,7 +54,7 @@ class Reply(NamedTuple):
     pause_s: float = 0.0
 
 
-class Device(ABC):
+class EmulatedDevice(ABC):
     """All servos of one protocol, or one board. It receives every byte of the wire and keeps its own place in it."""
 
     servos: Sequence[Any]
@@ -99,12 +99,12 @@ class EmulatedWire:
     """
 
     def __init__(
-        self, devices: Sequence[Device], timing: Timing = "instant", faults: Iterable[Fault] = (), seed: int = 0
+        self, devices: Sequence[EmulatedDevice], timing: Timing = "instant", faults: Iterable[Fault] = (), seed: int = 0
     ) -> None:
         self.hung = False
         self._devices = list(devices)
         self._on_the_wire = timing == "wire"
-        self._faults = Faults(seed=seed)
+        self._faults = WireFaults(seed=seed)
         self._inbox: deque[tuple[float, bytes, int | None]] = deque()  # (arrives at, data, baud), in that order
         self._outbox: list[Out] = []
         self._number = 0

@@ -128,7 +128,7 @@ def parse_ids(text: str) -> list[int]:
     return out
 
 
-class Faults:
+class WireFaults:
     """The faults of one wire, and their random numbers."""
 
     def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:

@@ -19,7 +19,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, Reply
+from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, Reply
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
@@ -35,7 +35,7 @@ _FAULT_BITS: Final = {"overload": 0x20, "overheating": 0x04}  # a board has no s
 class Channel:
     """One output: its pulse in ticks, and the shaft of the servo behind it, which starts at `start_ticks`."""
 
-    def __init__(self, number: int, board: Board, start_ticks: int) -> None:
+    def __init__(self, number: int, board: EmulatedBoard, start_ticks: int) -> None:
         self.id = number
         self.dead = self.mute = self.on = False
         self.goal = 0.0
@@ -99,7 +99,7 @@ class Channel:
         return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
 
 
-class Board(Device):
+class EmulatedBoard(EmulatedDevice):
     """The part that all boards share. The id of a servo is its channel.
 
     Attributes:
@@ -157,7 +157,7 @@ class Board(Device):
             channel.send(min(max(goal, shortest), longest), now_s)
 
 
-class MaestroBoard(Board):
+class MaestroBoard(EmulatedBoard):
     """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home.
 
     "Enable CRC" is on where something stored says so: `crc` of any of its servos.
@@ -198,7 +198,7 @@ class MaestroBoard(Board):
             if channel.on:
                 channel.off(now_s)
 
-    def _obey(self, command: maestro.Command, now_s: float) -> bytes:
+    def _obey(self, command: maestro.MaestroCommand, now_s: float) -> bytes:
         code, data, error = command
         if error:
             self.fail(error, now_s)
@@ -241,7 +241,7 @@ class MaestroBoard(Board):
             self._send(self.channels[first + i], maestro.from_word(data[2 + 2 * i : 4 + 2 * i]), now_s)
 
 
-class Ssc32Board(Board):
+class Ssc32Board(EmulatedBoard):
     """A Lynxmotion SSC-32 with its rate set by jumpers: that of the first servo."""
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:

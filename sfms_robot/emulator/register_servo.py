@@ -28,8 +28,8 @@ from sfms_robot.emulator.control_table import (
     POSITIONING,
     TORQUE_ON_BY_GOAL,
     ControlTable,
-    Frame,
     Mode,
+    ServoFrame,
     angle_limits,
     mode_of,
     motor_command,
@@ -106,7 +106,7 @@ class RegisterServo(ABC):
             self._put(name, value)
         self._stored = bytes(self._memory.raw)
         self._mode = mode_of(self._memory)
-        self.frame = Frame(self._memory, self._mode)
+        self.frame = ServoFrame(self._memory, self._mode)
         shaft = self.frame.shaft(float(what.start_ticks))
         self.plant = Plant(shaft, reference=shaft)
         highest = self._volts("max_voltage_limit")
@@ -428,7 +428,7 @@ class RegisterServo(ABC):
         drive_mode = get("drive_mode") if self.table.protocol == 2 else TORQUE_ON_BY_GOAL
         self._goal_enables, self._by_time = bool(drive_mode & TORQUE_ON_BY_GOAL), bool(drive_mode & 0x04)
         self._mode = mode_of(self._memory)
-        self.frame = Frame(self._memory, self._mode)
+        self.frame = ServoFrame(self._memory, self._mode)
         self.drive = None
         if self.torque == 1:
             self.drive = motor_command(self._memory, self._mode, self.frame, self.plant.reference, stepped)

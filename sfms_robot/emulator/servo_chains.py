@@ -13,7 +13,7 @@ from functools import reduce
 from typing import Any, Final, Generic, TypeVar
 
 from sfms_robot.emulator.control_table import Mode
-from sfms_robot.emulator.emulated_wire import Device, EmulatedServo, Reply
+from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, Reply
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.registers import Field, Table
@@ -32,7 +32,7 @@ Request = tuple[int, int, int]  # id, address, length
 S = TypeVar("S", bound=RegisterServo)
 
 
-class ServoChain(Device, Generic[S]):
+class ServoChain(EmulatedDevice, Generic[S]):
     """The servos of one protocol. `tables` by model."""
 
     _servo_class: type[S]

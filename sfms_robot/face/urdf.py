@@ -115,10 +115,10 @@ def read_urdf(file: Path) -> Urdf:
         raise ConfigError(f"{file}: a xacro file: make a URDF of it (xacro {file.name} > robot.urdf)")
     if root.tag != "robot":
         raise ConfigError(f"{file}: not a URDF: its first element is <{root.tag}>, not <robot>")
-    return _Reader(file, root).robot()
+    return _UrdfReader(file, root).robot()
 
 
-class _Reader:
+class _UrdfReader:
     """A reader of one file, whose errors name the file and the element."""
 
     def __init__(self, file: Path, root: Element) -> None:

@@ -37,7 +37,7 @@ class AudioState:
     """Memory of one track: samples that unfinished rows need, and the phrase so far (None: not used)."""
 
     sound: Floats
-    phase: phase.State | None
+    phase: phase.PhaseState | None
 
     @property
     def voiced(self) -> bool:

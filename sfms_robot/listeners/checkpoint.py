@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 Shapes = Mapping[str, tuple[tuple[int, ...], bool]]  # of tensors by name; True where they hold real numbers
 Bits = Literal[8, 16, 32]
-Settings = TypeVar("Settings", bound=config.Listener)
+Settings = TypeVar("Settings", bound=config.ListenerSettings)
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
 BFLOAT16, INT8 = "BF16", "I8"
@@ -32,7 +32,7 @@ LARGE: Final = 4096  # numbers; a smaller matrix is not worth 8 bits
 LARGEST = 1e6  # of any value: an unmeasured speed is stored as this, weights are below 200, and 1e30 overflows
 
 
-def load_config(folder: Path) -> config.Listener:
+def load_config(folder: Path) -> config.ListenerSettings:
     """Read `folder`/config.yaml. Raises ConfigError."""
     return config.load_listener(folder / CONFIG)
 
@@ -46,7 +46,7 @@ def config_of(folder: Path, kind: type[Settings]) -> Settings:
     return settings
 
 
-def save_config(folder: Path, settings: config.Listener) -> None:
+def save_config(folder: Path, settings: config.ListenerSettings) -> None:
     """Write `folder`/config.yaml. Raises ModelError where it cannot be written."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, width=110, default_flow_style=None)
     try:

@@ -186,7 +186,7 @@ class GraphFolder:
         return any(graph.rounded for graph in self.graphs.values())
 
 
-def digest(settings: config.Listener) -> str:
+def digest(settings: config.ListenerSettings) -> str:
     """Return a hash of all settings that a listener's graphs depend on."""
     known = settings.model_dump(mode="json", exclude=set(OUTSIDE))
     for group in known.get("groups", {}).values():
@@ -200,7 +200,7 @@ def has_graphs(folder: Path) -> bool:
     return (folder / FOLDER / MANIFEST).is_file()
 
 
-def read_graphs(folder: Path, settings: config.Listener, integers: bool = False) -> GraphFolder:
+def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool = False) -> GraphFolder:
     """Read the graphs of a listener's folder; with `integers` each network that has a graph in 8 bits uses that.
 
     Raises ModelError when a file is missing, cut short, changed, or of another configuration.
@@ -371,7 +371,7 @@ def whole_integers() -> bool:
 
 def engine_of(
     folder: Path,
-    settings: config.Listener,
+    settings: config.ListenerSettings,
     wanted: EngineName,
     torch_engine: Callable[[], Engine],
     precision: str = "fp32",
@@ -400,7 +400,7 @@ def engine_of(
     return engine
 
 
-def _graphs(folder: Path, settings: config.Listener, wanted: EngineName, precision: str) -> GraphFolder | None:
+def _graphs(folder: Path, settings: config.ListenerSettings, wanted: EngineName, precision: str) -> GraphFolder | None:
     """Return the graphs to run; None for torch."""
     if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
         return None

@@ -71,7 +71,7 @@ class HeadSway:
     units of its motion space, of the S channels that move the head.
     """
 
-    def __init__(self, settings: config.Listener, tensors: Mapping[str, Floats]) -> None:
+    def __init__(self, settings: config.ListenerSettings, tensors: Mapping[str, Floats]) -> None:
         self._head = head_channels(settings.channels) if settings.sway else []
         self._lateral = lateral_channels(settings.channels)
         self._shifting = shifting_channels(settings.channels)

@@ -28,7 +28,7 @@ class MotionSpace:
     flame: FlameMatrix | None = None
 
     @classmethod
-    def of(cls, settings: config.Listener, folder: Path | None = None) -> MotionSpace:
+    def of(cls, settings: config.ListenerSettings, folder: Path | None = None) -> MotionSpace:
         """A matrix is read from the listener's `folder`, if that is given: only what is shown needs it.
 
         Raises ConfigError when the matrix file is missing or is none.

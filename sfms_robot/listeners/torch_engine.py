@@ -106,7 +106,11 @@ def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
 
 
 def export(
-    folder: Path, settings: config.Listener, networks: Networks, examples: Examples, integers: Iterable[str] = ()
+    folder: Path,
+    settings: config.ListenerSettings,
+    networks: Networks,
+    examples: Examples,
+    integers: Iterable[str] = (),
 ) -> list[Path]:
     """Write the graphs of a listener into its folder and return the files. Takes half a minute to two.
 

@@ -232,7 +232,7 @@ def _is_there(path: Path) -> bool:
 
 
 @contextmanager
-def watching_line(line: Line, name: str, latch: HaltLatch) -> Iterator[None]:
+def watching_line(line: GpioLine, name: str, latch: HaltLatch) -> Iterator[None]:
     """Close the latch when `line` becomes active, while inside; give the line back at the end."""
     try:
         with _watching(name, latch, line.active, line.pressed, line.fd):
@@ -274,7 +274,7 @@ def _watching(
         del latch.switches[name]
 
 
-class Line:
+class GpioLine:
     """A line of a GPIO chip as input; its file descriptor has an event to read at each edge."""
 
     def __init__(self, fd: int, ioctl: Ioctl) -> None:
@@ -297,7 +297,7 @@ class Line:
         return _EVENT.unpack(event)[1] == 1 or self.active()
 
 
-def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> Line:
+def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> GpioLine:
     """Return a line of a chip as input with its pull-up.
 
     Raises ConfigError for a chip or line that cannot be used, and for a line that is active already.
@@ -316,7 +316,7 @@ def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None
             ioctl(file.fileno(), _GET_LINE, request)
     except OSError as error:
         raise ConfigError(f"{name}: {error.strerror or error}") from error
-    opened = Line(int(_REQUEST.unpack(request)[-1]), ioctl)
+    opened = GpioLine(int(_REQUEST.unpack(request)[-1]), ioctl)
     if opened.active():
         os.close(opened.fd)
         raise ConfigError(f"{name}: is active already, or cannot be read: the head would be halted at once")

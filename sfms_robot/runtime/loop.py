@@ -2,7 +2,8 @@
 
     source -> listener -> timeline -> retarget -> limits -> bus -> observers
 
-One tick every 1/rate_hz s on absolute deadlines. All that changes during a run is a `State` passed from step to step.
+One tick every 1/rate_hz s on absolute deadlines. All that changes during a run is a `LoopState` passed from step to
+step.
 It is kept as soon as the limiter has decided, so after any later error the way to rest begins at the last command. The
 reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force goes); speed and
 acceleration are central differences, so one sample lies one tick ahead.
@@ -75,7 +76,7 @@ class Parts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class LoopState:
     """State of the loop between two ticks.
 
     Attributes:
@@ -183,7 +184,7 @@ def drive(
     return "interrupted" if interrupted() else "done"
 
 
-def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> State | None:
+def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> LoopState | None:
     """Switch torque on, joint by joint; None if the run is interrupted meanwhile."""
     held_rad = np.zeros(len(parts.retargeter.joints))
     for index, joint in enumerate(parts.retargeter.joints):
@@ -194,7 +195,7 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
             parts.bus.torque_off("release")  # again: what the watcher sent may have come between two joints
             raise BusError(f"halted by {', '.join(parts.halt.causes)} while joints were switched on")
     log.start(held_rad)
-    return State(
+    return LoopState(
         timeline=parts.timeline.start(),
         limiter=parts.limiter.start(held_rad),
         held_rad=held_rad,
@@ -208,7 +209,7 @@ def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> Stat
     )
 
 
-def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: State) -> State:
+def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state: LoopState) -> LoopState:
     """Pass frames of the person to the listener, and plans that are ready to the timeline."""
     presence = state.presence
     for frame in parts.source.read(now_s):
@@ -227,7 +228,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
     return replace(state, timeline=timeline, presence=presence)
 
 
-def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
+def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
     """Return the state with the state of the run from here on."""
     presence = state.presence
     lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
@@ -245,14 +246,19 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     return replace(state, run=run, released=released)
 
 
-def _ending(log: RunLog, now_s: float, state: State) -> State:
+def _ending(log: RunLog, now_s: float, state: LoopState) -> LoopState:
     run = following(state.run, Situation(ending=True), now_s)
     log.entered(run, now_s)
     return replace(state, run=run)
 
 
 def _seen_on_the_way(
-    observers: Observers, state: State, now_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]
+    observers: Observers,
+    state: LoopState,
+    now_s: float,
+    ahead: float,
+    goals_rad: Doubles,
+    readings: Mapping[str, Reading],
 ) -> None:
     """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
     motion = state.motion * np.float32(ahead)
@@ -265,7 +271,7 @@ def turned_by_hand(planned: Floats, asked: Floats) -> bool:
 
 
 @dataclass(frozen=True)
-class Command:
+class TickCommand:
     """Command of a tick: goals (J,), the limiter's reference (J,), the face (58,) behind it.
 
     `reach_s`: latest instant of the timeline that it used.
@@ -277,7 +283,7 @@ class Command:
     reach_s: float
 
 
-def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tuple[State, Command]:
+def _commanded(parts: Parts, now_s: float, period_s: float, state: LoopState) -> tuple[LoopState, TickCommand]:
     """Return the goals inside the limits for the face of this instant, each joint ahead by its lead."""
     ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
     times_s = np.concatenate([[now_s], now_s + ahead_s])
@@ -307,10 +313,10 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: State) -> tup
         state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, goals_rad=goals_rad,
         life=life, retargeter=retargeter, answer=answer, motion=motion[0],
     )  # fmt: skip
-    return state, Command(goals_rad, reference[0], motion[0], float(times_s.max()))
+    return state, TickCommand(goals_rad, reference[0], motion[0], float(times_s.max()))
 
 
-def _halted(parts: Parts, now_s: float, state: State) -> tuple[State, Command]:
+def _halted(parts: Parts, now_s: float, state: LoopState) -> tuple[LoopState, TickCommand]:
     """Brake; once all joints stand, release those that need not hold."""
     goals_rad, limiter = parts.limiter.brake(state.limiter)
     released, stands = state.released, state.stands
@@ -319,7 +325,7 @@ def _halted(parts: Parts, now_s: float, state: State) -> tuple[State, Command]:
     if not stands and np.array_equal(goals_rad, state.goals_rad):
         stands, released = True, np.ones_like(released) if parts.holds is None else released | ~parts.holds
         _let_go(parts, released)
-    command = Command(goals_rad, goals_rad, np.zeros(MOTION_DIM, np.float32), -math.inf)
+    command = TickCommand(goals_rad, goals_rad, np.zeros(MOTION_DIM, np.float32), -math.inf)
     return replace(state, limiter=limiter, goals_rad=goals_rad, released=released, stands=stands), command
 
 
@@ -327,7 +333,7 @@ def _let_go(parts: Parts, which: NDArray[np.bool_]) -> None:
     parts.bus.release([joint for joint, each in zip(parts.retargeter.joints, which, strict=True) if each])
 
 
-def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
+def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
     """End a halt: held joints ease in from their present angles, the others from those they return at."""
     parts.bus.resume(parts.retargeter.joints)
     every = np.ones_like(state.released)
@@ -335,7 +341,7 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: State) -> State:
     return replace(_eased_in_from(parts, log, state.goals_rad, every, state, now_s), released=back, stands=False)
 
 
-def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: State, now_s: float) -> State:
+def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: LoopState, now_s: float) -> LoopState:
     """Ease in joints that were away again from their present angles, as at the start."""
     joints = parts.retargeter.joints
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
@@ -349,8 +355,8 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
 
 
 def _eased_in_from(
-    parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: State, now_s: float
-) -> State:
+    parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: LoopState, now_s: float
+) -> LoopState:
     """Return the state in which `which` (J,) joints ease in from standing at `stands_rad` (J,), from `now_s` on."""
     log.restart(which, stands_rad)
 
@@ -364,7 +370,9 @@ def _eased_in_from(
     )  # fmt: skip
 
 
-def _noticed(parts: Parts, readings: Mapping[str, Reading], state: State, now_s: float, period_s: float) -> State:
+def _noticed(
+    parts: Parts, readings: Mapping[str, Reading], state: LoopState, now_s: float, period_s: float
+) -> LoopState:
     """Use the readings: servos that are away, faulty or warm; a pinch while halted releases all at once."""
     heat = state.heat
     if parts.heat:

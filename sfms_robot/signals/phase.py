@@ -87,25 +87,25 @@ class SpeechPhase:
 
 
 @dataclass(frozen=True)
-class State:
+class PhaseState:
     """Memory of a stream."""
 
     ear: Ear
     phase: SpeechPhase
 
 
-def start() -> State:
+def start() -> PhaseState:
     """Return the memory of a new stream."""
-    return State(voice_activity.start(), SpeechPhase())
+    return PhaseState(voice_activity.start(), SpeechPhase())
 
 
-def step(samples: Floats, state: State) -> tuple[Floats, State]:
+def step(samples: Floats, state: PhaseState) -> tuple[Floats, PhaseState]:
     """Return the features (21,) of one frame (640,), or of none without a microphone, and the next state."""
     rows, (after,) = step_each([[energy_db(samples)]], [state])
     return rows[0], after
 
 
-def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[State]) -> tuple[Floats, list[State]]:
+def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[PhaseState]) -> tuple[Floats, list[PhaseState]]:
     """Return the features (N, 21) of all N frames of several streams, one stream after the other, and their states.
 
     `levels_db`: of any number of frames per stream.
@@ -118,7 +118,7 @@ def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[State]) -> 
             ear = voice_activity.step(level_db, ear)
             phase = phase.after(ear.active)
             counts.append((min(phase.speech, LONGEST), min(phase.silence, LONGEST), min(phase.last, LONGEST)))
-        after.append(State(ear, phase))
+        after.append(PhaseState(ear, phase))
     return _features_of(counts), after
 
 

@@ -78,7 +78,7 @@ class ToWorker:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeardFrame:
+class MicrophoneFrame:
     """A frame of the loop.
 
     Attributes:
@@ -96,7 +96,7 @@ class HeardFrame:
     said: Floats | None = None
 
 
-MicrophoneMessage = str | HeardFrame | dict[str, Any]  # the first is the name of the device
+MicrophoneMessage = str | MicrophoneFrame | dict[str, Any]  # the first is the name of the device
 
 
 def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker | None, None]:
@@ -138,7 +138,7 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
 
 # --- from what is recorded to what a person said, on the grid of the loop -----------------------------------------
 #
-#     pieces by their time stamps -> frames of 40 ms -> what the robot itself says taken out -> `HeardFrame`
+#     pieces by their time stamps -> frames of 40 ms -> what the robot itself says taken out -> `MicrophoneFrame`
 #
 # Microphone and reference each drift by their own clock; both are resampled to the computer's (`LiveVoice`), so that
 # they stay together. The echo canceller is a few milliseconds late: its frames begin that much later, so that its
@@ -197,9 +197,9 @@ class FrontEnd:
         self._origin_s, self._waiting = origin_s, None
         self._next = max(0, math.floor((now_s - origin_s) * FRAME_HZ))
 
-    def frames(self, now_s: float) -> list[HeardFrame]:
+    def frames(self, now_s: float) -> list[MicrophoneFrame]:
         """Return frames that are whole, oldest first; one whose microphone is missing for too long is left out."""
-        frames: list[HeardFrame] = []
+        frames: list[MicrophoneFrame] = []
         while self._origin_s is not None:
             late_s = now_s - self._origin_s - (self._next + 1) * FRAME_S
             if self._waiting is None:
@@ -226,7 +226,7 @@ class FrontEnd:
             figures["reference"] = dict(self._reference.statistics())
         return figures
 
-    def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> HeardFrame:
+    def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> MicrophoneFrame:
         """Return a frame without the robot's own voice: one in, one out, since the gate counts samples."""
         own = None if self._reference is None else (_SILENCE if said is None else said)
         (frame,) = self._gate.push(_SILENCE if mic is None else mic, own, self.speed_rad_s)
@@ -234,7 +234,7 @@ class FrontEnd:
         self._counts["own_voice_frames"] += own is not None and bool(own.any())
         self._counts["without_reference"] += own is not None and said is None
         own_said = said if isinstance(self._reference, LiveVoice) else None
-        return HeardFrame(index=self._next, known_s=now_s, audio=frame.audio, voice=frame.voice, said=own_said)
+        return MicrophoneFrame(index=self._next, known_s=now_s, audio=frame.audio, voice=frame.voice, said=own_said)
 
 
 # --- the run's side --------------------------------------------------------------------------------------------------
@@ -256,7 +256,7 @@ class Microphone:
     def __init__(self, worker: SourceWorker, agent: OwnVoice | None = None) -> None:
         self._worker, self._agent = worker, agent
         self._origin_s: float | None = None
-        self._frames: dict[int, HeardFrame] = {}
+        self._frames: dict[int, MicrophoneFrame] = {}
         self.device = ""
         self.latency_s = 0.0
         self._late_frames = 0
@@ -317,14 +317,14 @@ class Microphone:
         for old in [index for index in self._frames if index < wanted]:
             del self._frames[old]
         for message in self._worker.messages(now_s):
-            if isinstance(message, HeardFrame):
+            if isinstance(message, MicrophoneFrame):
                 self._take_in(message, wanted)
             elif isinstance(message, str):
                 self.device = message
             else:
                 self._figures = message
 
-    def _take_in(self, heard: HeardFrame, wanted: int) -> None:
+    def _take_in(self, heard: MicrophoneFrame, wanted: int) -> None:
         assert self._origin_s is not None
         late_s = heard.known_s - self._origin_s - (heard.index + 1) * FRAME_S
         self.latency_s = max(late_s, self.latency_s - _LATENCY_FALLS_S, 0.0)

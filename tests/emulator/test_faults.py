@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.emulator.faults import KINDS, TO_SERVOS, Faults, parse_fault
+from sfms_robot.emulator.faults import KINDS, TO_SERVOS, WireFaults, parse_fault
 from sfms_robot.errors import ConfigError
 
 SENDER, REPLY = (3,), bytes(range(40))
@@ -64,7 +64,7 @@ def test_any_text_is_a_fault_or_a_config_error(text):
 
 
 def spoilt(*specs: str, servos=SENDER, now_s: float = 0.0, seed: int = 0):
-    return Faults([parse_fault(spec) for spec in specs], seed).spoil(servos, REPLY, now_s)
+    return WireFaults([parse_fault(spec) for spec in specs], seed).spoil(servos, REPLY, now_s)
 
 
 def test_what_becomes_of_a_reply():
@@ -80,10 +80,10 @@ def test_what_becomes_of_a_reply():
 
 
 def test_faults_of_requests_and_of_replies_stay_apart():
-    faults = Faults(map(parse_fault, ("request-drop", "request-delay=0.01", "drop:3")))
+    faults = WireFaults(map(parse_fault, ("request-drop", "request-delay=0.01", "drop:3")))
     assert faults.spoil(SENDER, REPLY, 0.0) == [] and faults.spoil((4,), b"x", 0.0) == [(b"x", 0.0)]
     assert faults.spoil((), b"x", 0.0, TO_SERVOS) == []
-    late = Faults(map(parse_fault, ("request-delay=0.01", "request-corrupt", "delay", "drop")))
+    late = WireFaults(map(parse_fault, ("request-delay=0.01", "request-corrupt", "delay", "drop")))
     [(wrong, late_s)] = late.spoil(SENDER, REPLY, 0.0, TO_SERVOS)
     assert late_s == 0.01 and sum(a != b for a, b in zip(wrong, REPLY, strict=True)) == 1
 
@@ -95,7 +95,7 @@ def test_fault_is_only_there_in_its_time_and_for_its_ids():
 
 def test_one_seed_throws_the_same_dice():
     def run(seed):
-        faults = Faults([parse_fault("drop=0.5"), parse_fault("corrupt=0.5")], seed)
+        faults = WireFaults([parse_fault("drop=0.5"), parse_fault("corrupt=0.5")], seed)
         return [faults.spoil(SENDER, REPLY, 0.01 * k) for k in range(200)]
 
     assert run(1) == run(1) != run(2)
@@ -103,7 +103,7 @@ def test_one_seed_throws_the_same_dice():
 
 
 def test_beginnings_and_ends_come_once_in_order():
-    faults = Faults([parse_fault("stuck:1@2-3"), parse_fault("overload:2@1")])
+    faults = WireFaults([parse_fault("stuck:1@2-3"), parse_fault("overload:2@1")])
     assert faults.next_s == 1.0
     assert [(t, f.kind, began) for t, f, began in faults.edges(2.5)] == [(1.0, "overload", True), (2.0, "stuck", True)]
     assert [(t, f.kind, began) for t, f, began in faults.edges(9.0)] == [(3.0, "stuck", False)]
@@ -111,7 +111,7 @@ def test_beginnings_and_ends_come_once_in_order():
 
 
 def test_clearing_lets_go_what_goes_on():
-    faults = Faults([parse_fault("stuck:1"), parse_fault("drop@5"), parse_fault("drop")])
+    faults = WireFaults([parse_fault("stuck:1"), parse_fault("drop@5"), parse_fault("drop")])
     assert len(list(faults.edges(1.0))) == 2
     faults.clear(1.0)
     assert [(f.kind, began) for _, f, began in faults.edges(1.0)] == [("stuck", False), ("drop", False)]

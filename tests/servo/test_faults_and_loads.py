@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.member import Member, State
+from sfms_robot.servo.chain.member import Member, MemberState
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
 from sfms_robot.servo.policy import counts, load_rules
 from sfms_robot.servo.registers import Table
@@ -124,7 +124,7 @@ def test_current_below_the_rule_never_breaks_it(currents_mA):
     member.enabled()
     for k, current in enumerate(currents_mA):
         member.take_current(current, 0.05 * k)
-    assert member.state is State.ONLINE
+    assert member.state is MemberState.ONLINE
 
 
 def test_pinch_needs_current_without_a_break():
@@ -132,9 +132,9 @@ def test_pinch_needs_current_without_a_break():
     member.enabled()
     for current_mA, now_s in ((150, 0.00), (50, 0.06), (-150, 0.08)):
         member.take_current(current_mA, now_s)
-        assert member.state is State.ONLINE
+        assert member.state is MemberState.ONLINE
     member.take_current(-150, 0.19)
-    assert member.state is State.LIMP and member.fault == "pinched"
+    assert member.state is MemberState.LIMP and member.fault == "pinched"
 
 
 def test_every_servo_with_a_current_sensor_has_a_pinch_rule():

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from published import byte_by_byte, rows
 
 from sfms_robot.servo.codecs import maestro
-from sfms_robot.servo.codecs.maestro import Command, maybe_command
+from sfms_robot.servo.codecs.maestro import MaestroCommand, maybe_command
 
 PUBLISHED = {
     row["name"]: bytes.fromhex(row["bytes"]) for row in rows("board_commands.csv") if row["protocol"] == "maestro"
@@ -57,7 +57,7 @@ def test_value_beyond_14_bits_is_refused(value):
 @given(commands, st.booleans())
 def test_reader_gives_back_what_the_builders_made(command, addressed):
     buffer = bytearray(maestro.addressed(command, 7) if addressed else command)
-    assert maybe_command(buffer, 7) == Command(command[0], command[1:])
+    assert maybe_command(buffer, 7) == MaestroCommand(command[0], command[1:])
     assert not buffer
 
 
@@ -66,7 +66,9 @@ def test_reader_gives_back_commands_with_a_crc(command, addressed):
     sealed = maestro.addressed(command, 7) if addressed else command
     if command[0] != maestro.MINI_SSC:
         sealed = maestro.sealed(sealed)
-    assert byte_by_byte(lambda buffer: maybe_command(buffer, 7, crc=True), sealed) == Command(command[0], command[1:])
+    assert byte_by_byte(lambda buffer: maybe_command(buffer, 7, crc=True), sealed) == MaestroCommand(
+        command[0], command[1:]
+    )
 
 
 @pytest.mark.parametrize("addressed", [False, True])
@@ -84,30 +86,30 @@ def test_byte_that_becomes_ff_begins_a_command_without_a_crc():
     wrong = bytearray(maestro.sealed(maestro.set_target(3, 2)))
     wrong[1] = maestro.MINI_SSC
     assert maybe_command(wrong, crc=True).error
-    assert maybe_command(wrong, crc=True) == Command(maestro.MINI_SSC, bytes([2, 0]))
+    assert maybe_command(wrong, crc=True) == MaestroCommand(maestro.MINI_SSC, bytes([2, 0]))
 
 
 @given(commands, st.booleans())
 def test_command_arriving_one_byte_at_a_time(command, addressed):
     sent = maestro.addressed(command) if addressed else command
-    assert byte_by_byte(maybe_command, sent) == Command(command[0], command[1:])
+    assert byte_by_byte(maybe_command, sent) == MaestroCommand(command[0], command[1:])
 
 
 @given(st.lists(commands, max_size=5))
 def test_commands_in_a_row_stay_apart(row):
     buffer = bytearray(b"".join(row))
-    assert [maybe_command(buffer) for _ in row] == [Command(c[0], c[1:]) for c in row]
+    assert [maybe_command(buffer) for _ in row] == [MaestroCommand(c[0], c[1:]) for c in row]
 
 
 def test_commands_to_another_board_are_passed_over():
     buffer = bytearray(maestro.addressed(bytes([maestro.GO_HOME]), 3) + maestro.get_errors())
-    assert maybe_command(buffer, device=4) == Command(maestro.GET_ERRORS)
+    assert maybe_command(buffer, device=4) == MaestroCommand(maestro.GET_ERRORS)
 
 
 def test_interrupted_command_is_an_error_and_the_next_one_counts():
     buffer = bytearray(maestro.set_target(0, 6000)[:2] + maestro.set_target(1, 5000))
-    assert maybe_command(buffer) == Command(maestro.SET_TARGET, error=maestro.PROTOCOL_ERROR)
-    assert maybe_command(buffer) == Command(maestro.SET_TARGET, bytes([1]) + maestro.word(5000))
+    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, error=maestro.PROTOCOL_ERROR)
+    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, bytes([1]) + maestro.word(5000))
 
 
 @given(st.binary(max_size=300))

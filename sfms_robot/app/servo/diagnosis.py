@@ -12,7 +12,7 @@ from shlex import quote
 from typing import Any, Final, Literal, cast
 
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
-from sfms_robot.app.servo.single_servo import State
+from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
@@ -73,7 +73,7 @@ class Wanted:
     faults: Faults = field(default_factory=Faults)
     needs: JointNeeds | None = None
 
-    def lives_with(self, fault: str, state: State) -> bool:
+    def lives_with(self, fault: str, state: ServoState) -> bool:
         """Return whether the head's file says that this fault does not count."""
         measured = {"input voltage": state.in_unit("voltage"), "overheating": state.in_unit("temperature")}
         return not counts(fault, self.faults, measured)
@@ -224,7 +224,7 @@ def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
 Judged = Iterator[tuple[Severity, str, str]]  # severity, problem, fix
 
 
-def judge_servo(state: State, want: Wanted | None, command: Command) -> Iterator[Finding]:
+def judge_servo(state: ServoState, want: Wanted | None, command: Command) -> Iterator[Finding]:
     """Yield the problems of settings and health of a servo whose registers were read."""
     seen, table = state.seen, state.seen.table
     about = _name(seen.id, want)
@@ -252,7 +252,7 @@ def _firmware(seen: FoundServo, table: Table) -> Judged:
         yield "note", f"firmware {seen.firmware} of {seen.model}: {why}", ""
 
 
-def _faults(state: State, table: Table, want: Wanted | None, command: Command) -> Judged:
+def _faults(state: ServoState, table: Table, want: Wanted | None, command: Command) -> Judged:
     names = [name for name in state.faults().split(", ") if name]
     masked = [name for name in names if want and want.lives_with(name, state)]
     if masked:
@@ -263,7 +263,7 @@ def _faults(state: State, table: Table, want: Wanted | None, command: Command) -
         yield "error", f"hardware error: {named}", fix
 
 
-def _measured(state: State, want: Wanted | None) -> Judged:
+def _measured(state: ServoState, want: Wanted | None) -> Judged:
     volt, low, high = (state.in_unit(name) for name in ("voltage", "min_voltage_limit", "max_voltage_limit"))
     tolerated = want is not None and want.lives_with("input voltage", state)
     if volt is not None and low is not None and high is not None and not (low <= volt <= high or tolerated):
@@ -274,7 +274,7 @@ def _measured(state: State, want: Wanted | None) -> Judged:
         yield "warning", f"{warm:.0f} degC, it switches off at {limit:.0f}", "let it cool down"
 
 
-def _settings(state: State, table: Table, command: Command) -> Judged:
+def _settings(state: ServoState, table: Table, command: Command) -> Judged:
     delay, level = table.role("return_delay"), table.role("status_level")
     if delay is not None and (waits := state.in_unit("return_delay")):
         fix = command.servo(f"write {{id}} {delay.name} 0", state.seen.baud)
@@ -286,7 +286,7 @@ def _settings(state: State, table: Table, command: Command) -> Judged:
         yield "note", "torque is on", ""
 
 
-def _stored(state: State, want: Wanted | None, command: Command) -> Judged:
+def _stored(state: ServoState, want: Wanted | None, command: Command) -> Judged:
     """Yield each stored value that is not what its joint needs; without a head, against itself."""
     seen, severities = state.seen, {"refused": "error", "set": "note", "told": "warning"}
     for each in stored_contradictions(state, want):
@@ -303,7 +303,7 @@ def _stored(state: State, want: Wanted | None, command: Command) -> Judged:
         yield severity, str(each), fix
 
 
-def stored_contradictions(state: State, want: Wanted | None) -> list[Contradiction]:
+def stored_contradictions(state: ServoState, want: Wanted | None) -> list[Contradiction]:
     """Return the contradictions that startup would find, with the faults that the head's file says to live with."""
     table = state.seen.table
     if table is None or not state.values:

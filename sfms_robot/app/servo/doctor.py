@@ -41,7 +41,7 @@ from sfms_robot.app.servo.serial_line import (
     protocol_hint,
     table_of,
 )
-from sfms_robot.app.servo.single_servo import Progress, State, no_progress, read_all, scan
+from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
@@ -249,7 +249,7 @@ def _look(
     hint = "" if here or elsewhere else protocol_hint(wire)
     findings = list(judge_presence(line.wanted, here, elsewhere, baud, command, hint))
     fixed: list[str] = []
-    states: list[State] = []
+    states: list[ServoState] = []
     double: list[int] = []
     for done, seen in enumerate([*here.values(), *elsewhere.values()]):
         progress(done, len(here) + len(elsewhere), f"id {seen.id}")
@@ -319,7 +319,7 @@ def _as_wanted(seen: FoundServo, line: Line) -> FoundServo:
     return replace(seen, table=table_of(line.family, seen.model_number, seen.firmware, want.model))
 
 
-def _fix(state: State, line: Line, confirm: Confirm) -> list[str]:
+def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
     """Write what can be mended without harm, each confirmed and verified; return what was done.
 
     A value that zero and direction depend on goes into the head's file, never into the servo. Raises ConfigError for a
@@ -354,7 +354,7 @@ def _clear_turns(seen: FoundServo) -> None:
         raise ServoError(f"id {seen.id} does not clear its turns: {refusal if answer else 'no answer'}")
 
 
-def _fast_read_works(wire: Wire, members: Sequence[State]) -> bool | None:
+def _fast_read_works(wire: Wire, members: Sequence[ServoState]) -> bool | None:
     """Try a fast read on the servos themselves, which is surer than a table of firmware numbers."""
     if wire.family != "dynamixel2" or not members:
         return None
@@ -366,7 +366,7 @@ def _fast_read_works(wire: Wire, members: Sequence[State]) -> bool | None:
     return any(set(wire.link.read_many(*where, alike, fast=True)) == set(alike) for _ in range(2))
 
 
-def _budget(line: Line, baud: int, members: Sequence[State], adapter: SerialDevice) -> Budget | None:
+def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: SerialDevice) -> Budget | None:
     if not members:
         return None
     table = members[0].seen.registers()
@@ -383,7 +383,7 @@ def _budget(line: Line, baud: int, members: Sequence[State], adapter: SerialDevi
     )
 
 
-def _servo_row(state: State, line: Line) -> dict[str, Any]:
+def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
     want = line.wanted.get(state.seen.id)
     units = {"voltage_V": "voltage", "temperature_degC": "temperature", "return_delay_us": "return_delay"}
     measured = {key: None if (x := state.in_unit(role)) is None else round(x, 1) for key, role in units.items()}

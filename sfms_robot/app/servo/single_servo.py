@@ -79,7 +79,7 @@ def checked_ids(text: str) -> list[int]:
 
 
 @dataclass(frozen=True)
-class State:
+class ServoState:
     """A servo and its registers as read.
 
     Attributes:
@@ -92,7 +92,7 @@ class State:
     error: int = 0
 
     @classmethod
-    def of(cls, seen: FoundServo, start: int, data: bytes, error: int) -> State:
+    def of(cls, seen: FoundServo, start: int, data: bytes, error: int) -> ServoState:
         """Return the state of a servo whose table holds `data` from address `start` on."""
         fields = seen.registers().fields.values()
         inside = [each for each in fields if start <= each.address and each.address + each.size <= start + len(data)]
@@ -139,16 +139,16 @@ class State:
         return {**who, **measured, "torque": self.torque(), "faults": self.faults() if faults is None else faults}
 
 
-def read_all(seen: FoundServo) -> State:
+def read_all(seen: FoundServo) -> ServoState:
     """Read the whole table of a known model. Raises ServoError for a servo that only answers pings."""
     if seen.table is None:
-        return State(seen, {})
+        return ServoState(seen, {})
     ends = [field.address + field.size for field in seen.table.fields.values() if field.address < 2 * _LONGEST]
     data, error = b"", 0
     while len(data) < max(ends):
         answer = seen.block(len(data), min(_LONGEST, max(ends) - len(data)), "its registers")
         data, error = data + answer.data, answer.error
-    return State.of(seen, 0, data, error)
+    return ServoState.of(seen, 0, data, error)
 
 
 def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[dict[str, Any]]]:
@@ -165,12 +165,12 @@ def watched(seen: FoundServo) -> dict[str, Any]:
     """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
     names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
     if seen.table is None or not names:
-        return State(seen, {}).row("no firmware map")
+        return ServoState(seen, {}).row("no firmware map")
     start, length = seen.table.span(names)
     answer = seen.wire.at(seen.baud).read(seen.id, start, length)
     if answer is None or seen.wire.link.refusal(answer):
-        return State(seen, {}).row("silent")
-    return State.of(seen, start, answer.data, answer.error).row()
+        return ServoState(seen, {}).row("silent")
+    return ServoState.of(seen, start, answer.data, answer.error).row()
 
 
 # --- registers --------------------------------------------------------------------------------------------------

@@ -330,7 +330,7 @@ def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]
     return found
 
 
-def _of_precision(folder: Path, settings: config.Listener, precision: str, scratch: Path) -> Path:
+def _of_precision(folder: Path, settings: config.ListenerSettings, precision: str, scratch: Path) -> Path:
     """Return a folder of the listener with another precision; its own folder if it has that one, or has none."""
     if not isinstance(settings, config.Arig) or settings.precision == precision:
         return folder

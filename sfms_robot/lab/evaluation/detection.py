@@ -187,20 +187,20 @@ def added_up(parts: Iterable[Mapping[str, Sightings]]) -> dict[str, Sightings]:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class DetectorCalibration:
     """Sightings of known events by the detectors, by kind."""
 
     known: Mapping[str, Sightings]
 
     @classmethod
-    def of(cls, motions: Motions, listeners: int = 60, seed: int = 1) -> Calibration:
+    def of(cls, motions: Motions, listeners: int = 60, seed: int = 1) -> DetectorCalibration:
         """Measure on a minute of each of `listeners` composed listeners, with nods of many sizes. Takes seconds."""
         drawn = [np.random.default_rng([seed, number]) for number in range(listeners)]
         acted = [act(busy_minute(rng), motions, rng) for rng in drawn]
         return cls.on([(one.events, one.motion) for one in acted])
 
     @classmethod
-    def on(cls, listeners: Sequence[tuple[Sequence[ListenerEvent], Floats]]) -> Calibration:
+    def on(cls, listeners: Sequence[tuple[Sequence[ListenerEvent], Floats]]) -> DetectorCalibration:
         """Measure on listeners (events, motion); "in time" is relative to the median lateness of each kind."""
         known = [(asked, Detected.of(motion)) for asked, motion in listeners]
         lag_s = cls(added_up(asked_and_seen(asked, detected) for asked, detected in known)).lag_s

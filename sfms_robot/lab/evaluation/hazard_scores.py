@@ -21,7 +21,7 @@ import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, ListenerEvent, SpeakerFrame
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S
 from sfms_robot.lab.evaluation.whole_recordings import heard_in, most_in, scene_in, steps_in
 from sfms_robot.lab.learning.events.event_trainer import (
@@ -59,7 +59,7 @@ def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) ->
     return heard_in(scene), heard_in(replace(scene, speaks=alone))
 
 
-def annotated(person: Person, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
     """Return the evidence (frames, len(HEARD)) that annotators saw in place of a microphone and a camera.
 
     With the listener's own voice, without it, and without it while the others are a minute off.
@@ -112,7 +112,7 @@ def spans_of(events: Sequence[ListenerEvent], kind: str) -> Doubles:
     return np.array([(one.start_s, one.end_s) for one in events if one.kind == kind], np.float64).reshape(-1, 2)
 
 
-def mute(person: Person) -> Person:
+def mute(person: MeetingPerson) -> MeetingPerson:
     """Return the person without a word; the time of listening still excludes the person's speech."""
     words = {agent: spans for agent, spans in person.words.items() if agent != person.agent}
     return replace(person, words=words)
@@ -126,14 +126,14 @@ class ReferenceHazard:
     silent: Logistic
 
     @classmethod
-    def of(cls, people: Sequence[Person]) -> Self:
+    def of(cls, people: Sequence[MeetingPerson]) -> Self:
         """Fit on these people; takes some seconds for a hundred meetings."""
         rng = np.random.default_rng(0)
         with_voice = [student(person, rng) for person in people]
         without = [student(mute(person), rng) for person in people]
         return cls(teach(with_voice, "nod", NOD), teach(without, "nod", _SILENT))
 
-    def scores(self, person: Person, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+    def scores(self, person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
         """Return (frames,) each: with the own speech, without it, and without it while the others are a minute off."""
         rng = np.random.default_rng(0)
         heard = student(person, rng).evidence

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, heard, own_voice
 from sfms_robot.lab.corpora.compose.render_events import speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import sent
-from sfms_robot.lab.corpora.compose.voices import Voice, laugh, lay, mouth_over
+from sfms_robot.lab.corpora.compose.voices import VoiceClip, laugh, lay, mouth_over
 from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.signals import events
@@ -134,7 +134,11 @@ def frames_before(starts_s: Doubles, frames: int) -> Ints:
 
 
 def listener_meeting(
-    person: Person, voices: Sequence[Voice], laughter: Sequence[Floats], motions: Motions, rng: np.random.Generator
+    person: MeetingPerson,
+    voices: Sequence[VoiceClip],
+    laughter: Sequence[Floats],
+    motions: Motions,
+    rng: np.random.Generator,
 ) -> ListenerMeeting:
     """Compose the annotated time: one voice and face for all others, one voice for the listener."""
     whole = Stretch(person, 0.0, FRAME_S * int(person.until_s * FRAME_HZ))
@@ -176,14 +180,14 @@ def _spoken(spans: Doubles, stretch: Stretch) -> Doubles:
     return np.asarray(spoken[spoken[:, 1] > spoken[:, 0]])
 
 
-def _speakers(person: Person, stretch: Stretch) -> Ints:
+def _speakers(person: MeetingPerson, stretch: Stretch) -> Ints:
     """Return (N,) how many of the others speak."""
     agents = sorted({agent for _, _, agent in person.floor})
     masks = [active(_spans(person.floor, agent), stretch) for agent in agents]
     return np.asarray(np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0), np.int64)
 
 
-def _floor(person: Person, stretch: Stretch, alone: Bools) -> NDArray[np.str_]:
+def _floor(person: MeetingPerson, stretch: Stretch, alone: Bools) -> NDArray[np.str_]:
     """Return (N,) the only other who speaks, else the last of them who spoke for a second; "" before the first."""
     floor = np.full(stretch.frames, "", dtype="<U1")
     taken = sorted((start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S)

@@ -19,11 +19,11 @@ from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
-from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
-from sfms_robot.lab.corpora.compose.voices import Voice, find_laughter, find_voices, split_voices
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
 from sfms_robot.lab.corpora.splits import Split
 from sfms_robot.lab.evaluation import timing
-from sfms_robot.lab.evaluation.detection import Calibration, Detected, Sightings, added_up, asked_and_seen
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, added_up, asked_and_seen
 from sfms_robot.lab.evaluation.hazard_scores import ReferenceHazard, annotated, decisions, delayed, sensed
 from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates
 from sfms_robot.lab.evaluation.listener_meetings import (
@@ -85,11 +85,11 @@ class _MeetingTask:
     """
 
     options: TimingOptions
-    person: Person
+    person: MeetingPerson
     number: int
     table: Doubles | None
     reference: ReferenceHazard | None
-    calibration: Calibration
+    calibration: DetectorCalibration
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     training = split_series(everybody)["train"]
     table = timing.table_rates(training) if training else None
     reference = ReferenceHazard.of(training) if training else None
-    calibration = Calibration.of(_motions(options.split))
+    calibration = DetectorCalibration.of(_motions(options.split))
     tasks = [
         _MeetingTask(
             options=options,
@@ -149,7 +149,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     }
 
 
-def people_of(everybody: Sequence[Person], split: Split, allow_training: bool) -> list[Person]:
+def people_of(everybody: Sequence[MeetingPerson], split: Split, allow_training: bool) -> list[MeetingPerson]:
     """Return the people of a split. Raises ConfigError if listeners were trained on them, or there are none."""
     if split == "train" and not allow_training:
         raise ConfigError(
@@ -210,7 +210,12 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
 
 
 def _by_events(
-    model: EventModel, calmness: Calmness, person: Person, one: ListenerMeeting, seeds: Sequence[int], own_voice: bool
+    model: EventModel,
+    calmness: Calmness,
+    person: MeetingPerson,
+    one: ListenerMeeting,
+    seeds: Sequence[int],
+    own_voice: bool,
 ) -> Sums:
     """Return how the hazards, given the person's history, rank the person's events; and the listener's decisions.
 
@@ -241,7 +246,7 @@ def _load(name: str, hop: int | None, engine: EngineName) -> Listener | EventMod
 
 
 @cache
-def _material(split: Split, data: Path) -> tuple[Sequence[Voice], Sequence[Floats], Motions]:
+def _material(split: Split, data: Path) -> tuple[Sequence[VoiceClip], Sequence[Floats], Motions]:
     """Return voices, laughter and motions of the split."""
     folders = voice_folders(data)
     return split_voices(find_voices(folders))[split], find_laughter(folders)[split], _motions(split)

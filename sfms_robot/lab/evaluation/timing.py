@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
-from sfms_robot.lab.evaluation.detection import Calibration, Detected, gaze_shifts
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_shifts
 from sfms_robot.lab.evaluation.hazard_scores import spans_of
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
@@ -147,7 +147,7 @@ def motion_sums(
     motions: Floats,
     detected: Sequence[Detected],
     first: int,
-    calibration: Calibration,
+    calibration: DetectorCalibration,
     own_voice: bool = False,
 ) -> Sums:
     """Return the sums of events detected in motion (S, N', 58), made of the meeting's frames from `first` on.
@@ -241,7 +241,7 @@ def cells(times_s: Doubles) -> Ints:
     return np.asarray(row * (len(_LAST_S) + 1) + np.digitize(last, _LAST_S), np.int64)
 
 
-def table_rates(people: Sequence[Person]) -> Doubles:
+def table_rates(people: Sequence[MeetingPerson]) -> Doubles:
     """Return nods per minute (CELLS,) over the whole annotated time of all people."""
     parts = []
     for person in people:

@@ -186,8 +186,8 @@ def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
 
 
 def without_gaze(dyad: Dyad) -> Dyad:
-    """Return the dyad without its gaze, for listeners that get events (`config.Listener.events`): eyeLook* are 0, and
-    the head's part of a gaze shift is removed from the pose, where it is known.
+    """Return the dyad without its gaze, for listeners that get events (`config.ListenerSettings.events`): eyeLook* are
+    0, and the head's part of a gaze shift is removed from the pose, where it is known.
 
     Raises ConfigError for motion in another space than ours.
     """

@@ -131,7 +131,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainingOutcome:
     """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
     holds.
     """

@@ -26,7 +26,7 @@ from torch.nn.parallel import DistributedDataParallel
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError
 from sfms_robot.lab.learning import resume
-from sfms_robot.lab.learning.job import Job, LossOf, Outcome, Position, Report, Run
+from sfms_robot.lab.learning.job import Job, LossOf, Position, Report, Run, TrainingOutcome
 from sfms_robot.lab.learning.process_group import ProcessGroup
 
 SMOOTHING = 0.98  # of the loss that is shown
@@ -40,7 +40,7 @@ def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> 
     return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
 
 
-def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> Outcome:  # noqa: B008
+def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> TrainingOutcome:  # noqa: B008
     """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
     Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
@@ -100,7 +100,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
                 )
     if best is not None:
         job.model.load_state_dict(best)
-    return Outcome(
+    return TrainingOutcome(
         loss=math.nan if position.loss is None else position.loss,
         held_out=position.best,
         steps=position.step,

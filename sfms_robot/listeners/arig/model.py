@@ -3,7 +3,7 @@
 Frame T of the agent's motion is made from both people's sound and motion of frames 0..T-1 and the agent's own sound of
 frame T. Offline everything is parallel over T (teacher forcing):
 
-    dyad = Dyad(...)                          # N aligned frames of both people, in plain units
+    dyad = ArigDyad(...)                          # N aligned frames of both people, in plain units
     found = model.condition(dyad, states)     # of frames 1..N-1: z, logits of the states, coarse motion
     motion = model.sample_loss(found.z.flatten(0, 1), model.moved(...).flatten(0, 1))
 
@@ -71,7 +71,7 @@ MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dyad:
+class ArigDyad:
     """N aligned frames of a conversation; frame t of every array is the same 40 ms.
 
     Attributes:
@@ -316,7 +316,7 @@ class ArigModel(nn.Module):
 
     # --- All frames at once -------------------------------------------------------------------------------------------
 
-    def condition(self, dyad: Dyad, states: Tensor | None = None) -> SamplerCondition:
+    def condition(self, dyad: ArigDyad, states: Tensor | None = None) -> SamplerCondition:
         """Return the inputs of the sampler for frames 1..N-1 at once.
 
         `states` (B, N): the state of every frame; each frame is given the one before. Without, each frame continues
@@ -358,7 +358,7 @@ class ArigModel(nn.Module):
         moved = torch.cat([torch.zeros_like(standard[:, :1]), moved], dim=1)
         return SamplerCondition(self.beside(z.view(b, t, d), events, moved), logits, outline.view(b, t, d), moved)
 
-    def rows(self, dyad: Dyad) -> Tensor | None:
+    def rows(self, dyad: ArigDyad) -> Tensor | None:
         """Return control (B, N - 1, 2K) of the frames before and of frames 1..N-1, or None without events."""
         if dyad.control is None or not self.settings.events:
             return None

@@ -3,7 +3,8 @@
 Nothing is computed twice: behaviours of old frames, keys and values of old sounds, motions and whole chunks are kept.
 Only the chunk in progress is read again, since the newest sounds modulate all of it.
 
-Ours: a listener with events (`config.Listener.events`) takes two control rows a frame, of the frame taken and of the
+Ours: a listener with events (`config.ListenerSettings.events`) takes two control rows a frame, of the frame taken and
+of the
 frame to be made. Its conversational state is drawn (`draw_sojourn`); a stream of the paper's continues from its most
 probable one.
 

@@ -132,7 +132,7 @@ def load_tables(file: Path | None = None) -> EventTables:
 
 
 @dataclass(frozen=True)
-class _Knots:
+class _CurveKnots:
     """All knots of all curves of all kinds, one after the other (K,), and numbers as curves of one knot.
 
     Attributes:
@@ -187,7 +187,7 @@ class HazardBank:
         return {self.terms[at][index]: round(float(own[index]), 3) for index in largest if own[index]}
 
 
-def _flat(hazards: Mapping[str, Hazard]) -> _Knots:
+def _flat(hazards: Mapping[str, Hazard]) -> _CurveKnots:
     rows: list[tuple[float, ...]] = []
     first: list[int] = []
     kind: list[int] = []
@@ -197,14 +197,14 @@ def _flat(hazards: Mapping[str, Hazard]) -> _Knots:
             first.append(len(rows))
             rows += _curve(AT[name], weight)
     column, weights, left, left_slope, right, right_slope, number = np.array(rows, np.float64).T
-    return _Knots(
+    return _CurveKnots(
         column.astype(np.int64), weights, left, left_slope, right, right_slope, number.astype(bool),
         np.array(first), np.array(kind),
     )  # fmt: skip
 
 
 def _curve(column: int, weight: float | Mapping[float, float]) -> list[tuple[float, ...]]:
-    """Return a row of `_Knots` for each knot. The first hat is 1 before its knot, the last behind it."""
+    """Return a row of `_CurveKnots` for each knot. The first hat is 1 before its knot, the last behind it."""
     if not isinstance(weight, Mapping):
         return [(column, weight, 0.0, 0.0, 0.0, 0.0, True)]
     at = log_time(list(weight)).tolist()

@@ -49,7 +49,7 @@ FORGET_S: Final = 60.0
 NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands continues from there
 
 
-class State(Enum):
+class MemberState(Enum):
     """The states of a member; see the module."""
 
     __hash__ = object.__hash__  # each is one object; Enum's own hash is Python code, run a hundred times a tick
@@ -67,13 +67,13 @@ class State(Enum):
     RELEASED = "released"
 
 
-ONLINE: Final = State.ONLINE  # through the class each is a call, for every servo in every tick
-REDUCED: Final = State.REDUCED
-REJOINING: Final = State.REJOINING
+ONLINE: Final = MemberState.ONLINE  # through the class each is a call, for every servo in every tick
+REDUCED: Final = MemberState.REDUCED
+REJOINING: Final = MemberState.REJOINING
 _DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
-POWERED: Final = _DRIVEN | {State.FAULTY, State.REJOINING}  # torque is wanted, and was seen
-_LIMP: Final = frozenset({State.LIMP, State.GIVEN_UP, State.RELEASED})  # torque off is wanted
-_COMING: Final = frozenset({State.RETURNING, State.REBOOTING})
+POWERED: Final = _DRIVEN | {MemberState.FAULTY, MemberState.REJOINING}  # torque is wanted, and was seen
+_LIMP: Final = frozenset({MemberState.LIMP, MemberState.GIVEN_UP, MemberState.RELEASED})  # torque off is wanted
+_COMING: Final = frozenset({MemberState.RETURNING, MemberState.REBOOTING})
 
 
 class Member:
@@ -105,7 +105,7 @@ class Member:
         self.servo = startup.servo
         self.id = self.servo.id
         self.identified = False
-        self.state = State.OFF
+        self.state = MemberState.OFF
         self.torque_seen: bool | None = None
         self.job: Steps[int] | None = None
         self.job_due_s = 0.0
@@ -164,7 +164,7 @@ class Member:
 
     def connected(self, there: bool) -> None:
         """Note that `connect` has identified and prepared it, or (not `there`) that it did not answer."""
-        self._reset(State.OFF)
+        self._reset(MemberState.OFF)
         self._forget_silence(there)
         self.identified, self.torque_seen = there, None if there else False
         if not there:
@@ -173,29 +173,29 @@ class Member:
     def enabled(self) -> None:
         """Note that `enable` switched torque on, and saw it. Faults it had before are not acted upon again."""
         self._drop_job()
-        self.state, self._trouble, self.mismatch = State.ONLINE, None, None
+        self.state, self._trouble, self.mismatch = MemberState.ONLINE, None, None
         self.identified = self.torque_seen = True
         self._attempts_s.clear()
 
     def awaited(self) -> None:
         """Note that `enable` wants it, and it is absent: it is brought in when it appears."""
-        self._reset(State.SILENT)
+        self._reset(MemberState.SILENT)
         self._trouble = NO_ANSWER
 
     def stopped(self) -> None:
         """Note that no torque is wanted any more; `stop` switches it off."""
         self._drop_job()
-        self.state = State.OFF
+        self.state = MemberState.OFF
 
     def released(self) -> None:
         """Ask for torque off until `enable`; the poll writes it."""
-        if self.state is not State.OFF:
+        if self.state is not MemberState.OFF:
             self._release(math.inf)
-            self.state = State.RELEASED
+            self.state = MemberState.RELEASED
 
     def called_back(self, now_s: float) -> None:
         """Bring it back as if it had been away, unless it is driven or on its way; its faults count as known."""
-        if self.state in _DRIVEN | _COMING | {State.REJOINING, State.SILENT}:
+        if self.state in _DRIVEN | _COMING | {MemberState.REJOINING, MemberState.SILENT}:
             return
         self._attempts_s.clear()
         if self.listed:
@@ -204,7 +204,7 @@ class Member:
         else:
             self.awaited()
 
-    def _reset(self, state: State) -> None:
+    def _reset(self, state: MemberState) -> None:
         self._drop_job()
         self.state = state
         self._bits, self._named, self._trouble, self.mismatch = 0, [], None, None
@@ -233,7 +233,7 @@ class Member:
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self.probe_s = now_s + self._pause_s
         self._log_silence(now_s, again=False)
-        if self.state is not State.REBOOTING:  # a servo that reboots does not answer
+        if self.state is not MemberState.REBOOTING:  # a servo that reboots does not answer
             self.gone()
 
     def hurry(self, now_s: float) -> None:
@@ -242,12 +242,12 @@ class Member:
 
     def gone(self) -> None:
         """Note that it does not answer, and not because of one lost packet; or that the port is gone."""
-        if self.state in _DRIVEN | _COMING | {State.REJOINING}:
+        if self.state in _DRIVEN | _COMING | {MemberState.REJOINING}:
             self._drop_job()
-            self.state = State.SILENT
+            self.state = MemberState.SILENT
             self.torque_seen = None
             self._trouble = self._trouble or NO_ANSWER
-        elif self.state in _LIMP or self.state is State.FAULTY:
+        elif self.state in _LIMP or self.state is MemberState.FAULTY:
             self.torque_seen = None  # it may have changed
 
     def back(self, now_s: float) -> None:
@@ -255,7 +255,7 @@ class Member:
         if self._logged_silent:
             self._logged_silent = False
             log.warning("%s answers again", self.servo)
-        if self.state is State.SILENT:
+        if self.state is MemberState.SILENT:
             self._return(now_s)
         elif self._trouble == NO_ANSWER:
             self._trouble = None
@@ -288,7 +288,9 @@ class Member:
                 self._ignored.add(name)
                 log.info("%s reports %s, which this head's configuration allows", self.servo, name)
         new = set(names) - set(self._named)
-        if names or self.state not in _LIMP | {State.FAULTY}:  # one that stays out keeps its reason, also a past one
+        if names or self.state not in _LIMP | {
+            MemberState.FAULTY
+        }:  # one that stays out keeps its reason, also a past one
             self._named = names
         if new:
             self._report(", ".join(names))
@@ -315,7 +317,7 @@ class Member:
                 self._blame(TORQUE_ON)
             elif self._trouble == TORQUE_ON:
                 self._trouble = None
-        elif self.state is State.SILENT and not on and self.identified:
+        elif self.state is MemberState.SILENT and not on and self.identified:
             self._report(TORQUE_LOST)  # it was away because it restarted
         elif self.state in POWERED and not on:
             if self._named:
@@ -333,7 +335,7 @@ class Member:
 
     def distrust(self, fault: str, now_s: float) -> None:
         """Start it up as if it had been away: something may have happened unseen."""
-        if self.state in _DRIVEN | {State.REJOINING}:
+        if self.state in _DRIVEN | {MemberState.REJOINING}:
             self._trouble = fault
             self._return(now_s)
 
@@ -341,7 +343,7 @@ class Member:
 
     def due(self, now_s: float) -> bool:
         """Return whether its job may take a step; a limp one whose time is over begins one."""
-        if self.state is State.LIMP and now_s >= self._back_s and self.torque_seen is False:
+        if self.state is MemberState.LIMP and now_s >= self._back_s and self.torque_seen is False:
             self._back_s = math.inf
             self._try_again(now_s, now_s)
         return self.job is not None and self.job_due_s <= now_s
@@ -354,7 +356,7 @@ class Member:
     @property
     def comes_back(self) -> bool:
         """Return whether it is away or on its way back, and was checked against the head's file in this run."""
-        return self.identified and self.state in _COMING | {State.SILENT}
+        return self.identified and self.state in _COMING | {MemberState.SILENT}
 
     def step(self, now_s: float) -> None:
         """Take one exchange of its job. Raises BusError if the port fails."""
@@ -379,12 +381,12 @@ class Member:
         """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
         if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
-        self.state = State.ONLINE
+        self.state = MemberState.ONLINE
         return True
 
     def _holds(self, ticks: int) -> None:
         recalled, bits, named = self.recalled, self._bits, self._named
-        self._reset(State.REJOINING)
+        self._reset(MemberState.REJOINING)
         self.identified = self.torque_seen = self.rejoined = True
         self.stands_ticks = ticks
         if recalled:
@@ -400,10 +402,12 @@ class Member:
 
     def _act(self, policy: str, now_s: float, limp_s: float) -> None:
         if policy == "hold":
-            self.state = State.FAULTY
+            self.state = MemberState.FAULTY
         elif policy == "reduce":
-            if self.state is not State.FAULTY:  # one that holds got no goals: the next may be far from where it stands
-                self.state = State.REDUCED
+            if (
+                self.state is not MemberState.FAULTY
+            ):  # one that holds got no goals: the next may be far from where it stands
+                self.state = MemberState.REDUCED
         elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)
         else:
@@ -411,7 +415,7 @@ class Member:
 
     def _release(self, back_s: float) -> None:
         self._drop_job()
-        self.state, self._back_s, self.off_written = State.LIMP, back_s, False
+        self.state, self._back_s, self.off_written = MemberState.LIMP, back_s, False
         if self.torque_seen:
             self.torque_seen = None
 
@@ -424,12 +428,12 @@ class Member:
             return
         log.warning("%s came back %d times in %g s and is left alone", self.servo, len(recent), FORGET_S)
         self._release(math.inf)
-        self.state = State.GIVEN_UP
+        self.state = MemberState.GIVEN_UP
         self._trouble = GIVEN_UP
 
     def _return(self, due_s: float, reboot: bool = False) -> None:
         self._drop_job()
-        self.state = State.REBOOTING if reboot else State.RETURNING
+        self.state = MemberState.REBOOTING if reboot else MemberState.RETURNING
         self.torque_seen = None
         self.job, self.job_due_s = self.startup.bring_back(reboot), due_s
         self.stands_s = None

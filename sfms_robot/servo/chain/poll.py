@@ -63,7 +63,7 @@ _TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answe
 
 
 @dataclass
-class Outcome:
+class PollOutcome:
     """Answers to a read of all servos. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
 
     answers: dict[int, Answer] = field(default_factory=dict)
@@ -244,9 +244,9 @@ class StatusPoll:
                 answers[servo] = answer
         return answers
 
-    def _read_all(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> Outcome:
+    def _read_all(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> PollOutcome:
         """Read all by one request, and those behind a silent one by a second: see the table of the module."""
-        out = Outcome()
+        out = PollOutcome()
         # Behind a dead servo in front all are silent: after a quiet poll another servo is asked first.
         start = self.quiet_polls * (len(ids) // QUIET_POLLS or 1) % max(1, len(ids))
         rest = [*ids[start:], *ids[:start]]
@@ -290,9 +290,9 @@ class StatusPoll:
             self._plan()
             log.warning("bus %r: fast sync read is not answered; plain sync read from now on", self._bus)
 
-    def _read_in_turn(self, link: RegisterLink, ids: Sequence[int]) -> Outcome:
+    def _read_in_turn(self, link: RegisterLink, ids: Sequence[int]) -> PollOutcome:
         """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
-        out, where = Outcome(), self._telemetry.block
+        out, where = PollOutcome(), self._telemetry.block
         place = {servo: i for i, servo in enumerate(self._ids)}
         order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
         for number, servo in enumerate(order[: self._many]):
@@ -313,7 +313,7 @@ class StatusPoll:
 
     # --- which servos are there ---------------------------------------------------------------------------------
 
-    def _suspect(self, outcome: Outcome, now_s: float) -> None:
+    def _suspect(self, outcome: PollOutcome, now_s: float) -> None:
         """Notify the members that missed an answer or are suspect after a read of all."""
         if outcome.answers:
             self.quiet_polls = 0

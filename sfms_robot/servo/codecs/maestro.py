@@ -58,7 +58,7 @@ _DATA_LENGTH: Final = {
 }
 
 
-class Command(NamedTuple):
+class MaestroCommand(NamedTuple):
     """A command as a board reads it. `error` is a bit of the error register if it cannot be obeyed, else 0."""
 
     code: int
@@ -121,19 +121,19 @@ def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
     return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
-def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> Command | None:
+def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> MaestroCommand | None:
     """Take the next command for board `device` off the front of `buffer`, or return None: more bytes are needed.
 
     `crc`: a CRC byte follows every command but Mini SSC.
 
-    An error is returned as a Command with `error` set, and its bytes are removed. Commands to other boards are dropped
-    silently. What stays in the buffer after None is at most one unfinished command.
+    An error is returned as a MaestroCommand with `error` set, and its bytes are removed. Commands to other boards are
+    dropped silently. What stays in the buffer after None is at most one unfinished command.
     """
     while buffer:
         code, start = buffer[0], 1
         if code < 0x80:
             del buffer[0]
-            return Command(code, error=PROTOCOL_ERROR)
+            return MaestroCommand(code, error=PROTOCOL_ERROR)
         if code == BAUD_INDICATION:
             if len(buffer) < 2:
                 return None
@@ -145,19 +145,19 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
             code, start = buffer[2] | 0x80, 3
             if buffer[2] >= 0x80:
                 del buffer[:2]
-                return Command(BAUD_INDICATION, error=PROTOCOL_ERROR)
+                return MaestroCommand(BAUD_INDICATION, error=PROTOCOL_ERROR)
         end = _end(buffer, code, start)
         if end is None:
             return None
         if end < 0:
             del buffer[:start]
-            return Command(code, error=PROTOCOL_ERROR)
+            return MaestroCommand(code, error=PROTOCOL_ERROR)
         checked = crc and code != MINI_SSC
         end += checked
         cut = next((i for i in range(start, min(end, len(buffer))) if code != MINI_SSC and buffer[i] >= 0x80), None)
         if cut is not None:  # another command interrupts this one
             del buffer[:cut]
-            return Command(code, error=PROTOCOL_ERROR)
+            return MaestroCommand(code, error=PROTOCOL_ERROR)
         if len(buffer) < end:
             return None
         whole, other = bytes(buffer[:end]), start == 3 and buffer[1] != device
@@ -165,8 +165,8 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
         if other:
             continue
         if checked and crc7(whole):
-            return Command(code, error=CRC_ERROR)
-        return Command(code, whole[start : end - checked])
+            return MaestroCommand(code, error=CRC_ERROR)
+        return MaestroCommand(code, whole[start : end - checked])
     return None
 
 

@@ -5,7 +5,15 @@ import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, ListenerEvent
-from sfms_robot.lab.evaluation.detection import Calibration, Detected, Sightings, added_up, asked_and_seen, paired, seen
+from sfms_robot.lab.evaluation.detection import (
+    Detected,
+    DetectorCalibration,
+    Sightings,
+    added_up,
+    asked_and_seen,
+    paired,
+    seen,
+)
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import find_nods
 from sfms_robot.signals.motion_primitives import read_motions
@@ -93,7 +101,7 @@ def test_blinks_and_smiles_are_seen_too():
         names = ("eyeBlinkLeft", "eyeBlinkRight") if event.kind == "blink" else ("mouthSmileLeft", "mouthSmileRight")
         for name in names:
             motion[:, CHANNEL_INDEX[name]] += np.where((over > 0) & (over < 1), event.size * np.sin(np.pi * over), 0)
-    known = Calibration.on([(asked, motion)])
+    known = DetectorCalibration.on([(asked, motion)])
     for kind in ("blink", "smile"):
         assert (known.known[kind].recall, known.known[kind].precision) == (1.0, 1.0)
 
@@ -121,7 +129,7 @@ def test_recall_for_other_sizes_goes_by_the_recall_at_each_size():
 def test_composed_listeners_are_seen_through():
     """The detector finds nods of every size, and next to nothing else."""
     motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["validation"]
-    known = Calibration.of(motions, listeners=30)
+    known = DetectorCalibration.of(motions, listeners=30)
     report = known.report()
     assert report["nod"]["recall"] > 0.9 and report["nod"]["precision"] > 0.95
     recalls = [row["recall"] for row in report["nod"]["by_size"] if row["asked"] >= 20]

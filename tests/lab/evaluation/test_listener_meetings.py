@@ -5,7 +5,7 @@ import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FaceFrame, SpeakerFrame
-from sfms_robot.lab.corpora.compose.ami import Person, phrases
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, phrases
 from sfms_robot.lab.corpora.compose.voices import read_voice
 from sfms_robot.lab.evaluation.listener_meetings import listener_meeting, part, shifted, without_own_voice
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
@@ -20,7 +20,7 @@ def person():
     starts = np.arange(1.0, 115.0, 5.0)
     a = [(start, start + 3.0, "A") for start in starts]
     c = [(start + 1.0, start + 1.5, "C") for start in starts[::4]]
-    return Person(
+    return MeetingPerson(
         "M1a", "B", "MEE1", 120.0, nods=np.stack([starts + 3.2, starts + 4.0], axis=1), shakes=NONE, tilts=NONE,
         unseen=np.array([[100.0, 110.0]]), gaze=((2.0, 40.0, "A"), (40.0, 50.0, "table"), (50.0, 120.0, "A")),
         laughs=np.array([[50.0, 51.0]]), talk=np.array([[80.0, 82.0]]), backchannels=NONE,

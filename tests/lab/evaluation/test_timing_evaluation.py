@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.evaluation import timing
-from sfms_robot.lab.evaluation.detection import Calibration, Detected, Sightings
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings
 from sfms_robot.lab.evaluation.intervals import estimates
 from sfms_robot.lab.evaluation.listener_meetings import ListenerMeeting
 from sfms_robot.lab.evaluation.meetings import middle, people_of
@@ -153,9 +153,9 @@ def test_what_a_finder_misses_is_made_up_for():
     for start in range(5, 115, 10):
         inside = (when_s >= start) & (when_s < start + 0.5)
         motion[0, inside, 1] = np.radians(5) * np.sin(np.pi * (when_s[inside] - start) / 0.5) ** 2
-    half = Calibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
+    half = DetectorCalibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
     detected = [Detected.of(each) for each in motion]
-    plain, made_up = (timing.motion_sums(one, motion, detected, 0, known) for known in (Calibration({}), half))
+    plain, made_up = (timing.motion_sums(one, motion, detected, 0, known) for known in (DetectorCalibration({}), half))
     assert plain["nods_per_minute"][0] > 0
     assert made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
     assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
@@ -271,7 +271,7 @@ def someone(meeting="TS3003a", participant="P1", **changed):
         "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE, "backchannels": NONE, "others": NONE,
         "floor": (), "others_laughs": NONE, "asked": np.zeros(0),
     }  # fmt: skip
-    return Person(**whole | changed)
+    return MeetingPerson(**whole | changed)
 
 
 def test_people_who_were_trained_on_are_refused_unless_asked_for():

@@ -9,7 +9,7 @@ from tiny_arig import RAW, arig_model, losses
 
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
-from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import LongRange
 from sfms_robot.listeners.arig.stream import FIRST, rotary
 from sfms_robot.listeners.layers import windows
@@ -38,14 +38,14 @@ def tiny() -> ArigModel:
     return arig_model(events=True)
 
 
-def random_dyad(model: ArigModel, frames: int = 14, batch: int = 2, seed: int = 0) -> Dyad:
+def random_dyad(model: ArigModel, frames: int = 14, batch: int = 2, seed: int = 0) -> ArigDyad:
     drawn = torch.Generator().manual_seed(seed)
     sound, motion = (batch, frames, model.sound_width), (batch, frames, model.channels)
 
     def chance(*shape):
         return torch.rand(shape, generator=drawn) > 0.3
 
-    return Dyad(
+    return ArigDyad(
         user_sound=torch.randn(sound, generator=drawn),
         user_heard=chance(batch, frames),
         agent_sound=torch.randn(sound, generator=drawn),
@@ -63,7 +63,7 @@ def long_range(**changes) -> LongRange:
     return LongRange(config.parse(config.Arig, raw, "tiny"))
 
 
-def states_of(dyad: Dyad, seed: int = 0) -> torch.Tensor:
+def states_of(dyad: ArigDyad, seed: int = 0) -> torch.Tensor:
     return torch.randint(0, len(STATES), dyad.user_heard.shape, generator=torch.Generator().manual_seed(seed))
 
 
@@ -79,7 +79,7 @@ def test_gradients_reach_every_parameter(changes):
     assert unmoved == []
 
 
-@given(frame=st.integers(1, 13), field=st.sampled_from([field.name for field in dataclasses.fields(Dyad)]))
+@given(frame=st.integers(1, 13), field=st.sampled_from([field.name for field in dataclasses.fields(ArigDyad)]))
 def test_a_frame_is_made_from_what_equation_1_allows(tiny, frame: int, field: str):
     """Both people up to T - 1, and of T the agent's sound and events: nothing of that or later changes z of T."""
     first = frame + 1 if field.startswith(("agent_sound", "agent_heard", "control")) else frame
@@ -93,7 +93,7 @@ def test_a_frame_is_made_from_what_equation_1_allows(tiny, frame: int, field: st
     torch.testing.assert_close(after[:, :frame], z[:, :frame], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Dyad)])
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(ArigDyad)])
 def test_everything_that_is_told_counts(tiny, field: str):
     dyad, other = random_dyad(tiny), random_dyad(tiny, seed=7)
     with torch.no_grad():
@@ -104,7 +104,7 @@ def test_everything_that_is_told_counts(tiny, field: str):
 
 def test_a_batch_is_its_rows(tiny):
     dyad = random_dyad(tiny)
-    second = Dyad(**{field.name: getattr(dyad, field.name)[1:] for field in dataclasses.fields(Dyad)})
+    second = ArigDyad(**{field.name: getattr(dyad, field.name)[1:] for field in dataclasses.fields(ArigDyad)})
     with torch.no_grad():
         torch.testing.assert_close(tiny.condition(dyad).z[1:], tiny.condition(second).z)
 

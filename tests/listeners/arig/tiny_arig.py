@@ -8,7 +8,7 @@ from sfms_robot import config
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import torch_engine
-from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.stream import FIRST, ArigListener
 from sfms_robot.listeners.stream_rng import Use, normals
 
@@ -69,7 +69,7 @@ def noise_of(listener: ArigListener, frames: int, seed: int = 1) -> torch.Tensor
 
 def dyad_of(
     listener: ArigListener, speaker: list[SpeakerFrame], agent_motion: torch.Tensor, control: np.ndarray | None = None
-) -> Dyad:
+) -> ArigDyad:
     """Frames 0..T of a stream of T steps; agent_motion (T, C) is what it made of frames 1..T.
 
     The agent says nothing in frame 0; what it says at step t belongs to frame t + 1. Nothing looks at the user's last.
@@ -83,7 +83,7 @@ def dyad_of(
     agent, agent_voiced = audio_frontend.track(samples([frame.agent_audio for frame in speaker]))
     faces = [frame.face.motion if frame.face else np.zeros(58, np.float32) for frame in speaker]
     still = torch.tensor(listener.space.neutral, dtype=torch.float32)[None]
-    return Dyad(
+    return ArigDyad(
         user_sound=torch.from_numpy(user)[None],
         user_heard=torch.tensor([[len(frame.audio) > 0 for frame in speaker] + [False]]),
         agent_sound=torch.from_numpy(np.concatenate([agent[:1], agent]))[None],
@@ -96,7 +96,7 @@ def dyad_of(
     )
 
 
-def losses(model: ArigModel, dyad: Dyad, states: torch.Tensor, seed: int = 0):
+def losses(model: ArigModel, dyad: ArigDyad, states: torch.Tensor, seed: int = 0):
     """Return equation (3) and the cross-entropy of the states (None without); every frame is given the true past."""
     found = model.condition(dyad, torch.where(states < 0, FIRST, states))
     standard = model.standardise(dyad.agent_motion)
@@ -108,7 +108,7 @@ def losses(model: ArigModel, dyad: Dyad, states: torch.Tensor, seed: int = 0):
 
 
 @torch.no_grad()
-def generate(model: ArigModel, dyad: Dyad, noise: torch.Tensor, states: torch.Tensor | None = None) -> torch.Tensor:
+def generate(model: ArigModel, dyad: ArigDyad, noise: torch.Tensor, states: torch.Tensor | None = None) -> torch.Tensor:
     """Return motion (B, N-1, C) of frames 1..N-1 from the given past; noise (B, N-1, *noise_shape)."""
     found = model.condition(dyad, states)
     made = model.sample(found.z.flatten(0, 1), noise.flatten(0, 1)).view(found.moved.shape)

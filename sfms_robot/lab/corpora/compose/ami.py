@@ -35,7 +35,7 @@ _Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
 
 
 @dataclass(frozen=True)
-class Person:
+class MeetingPerson:
     """One participant of one meeting, as a listener to all the others.
 
     Attributes:
@@ -82,7 +82,7 @@ class Person:
     words: Mapping[str, Doubles] = field(default_factory=dict)
 
 
-def read_people(folder: Path) -> list[Person]:
+def read_people(folder: Path) -> list[MeetingPerson]:
     """Everybody whose head was annotated. Raises ConfigError naming the table, and the column that is missing."""
     gestures, gaze = _spans(folder, "head_gestures", "type", "form"), _spans(folder, "gaze_focus", "target")
     words, acts = _spans(folder, "words", "kind", "text"), _spans(folder, "dialogue_acts", "type")
@@ -98,7 +98,7 @@ def read_people(folder: Path) -> list[Person]:
             continue
         key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
         people.append(
-            Person(
+            MeetingPerson(
                 meeting,
                 agent,
                 participant,
@@ -154,7 +154,7 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
     return np.asarray(spans[short & (before >= _ALONE_S) & (after >= _ALONE_S)], np.float64)
 
 
-def split_series(people: Iterable[Person]) -> dict[Split, list[Person]]:
+def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPerson]]:
     """Return people by the split of their meeting (`splits`); people of the training split are left out of the
     others.
     """

@@ -36,11 +36,11 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubl
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad, save
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
-    Voice,
+    VoiceClip,
     find_laughter,
     find_voices,
     laugh,
@@ -83,7 +83,7 @@ class Stretch:
         addressed: share of the time in which the person with the floor is known to look at the listener.
     """
 
-    person: Person
+    person: MeetingPerson
     start_s: float
     end_s: float
     nods_per_minute: float = 0.0
@@ -112,8 +112,8 @@ class Stretch:
 class Material:
     """Recordings and annotations that the dyads of one split are made of."""
 
-    people: Sequence[Person]
-    voices: Sequence[Voice]
+    people: Sequence[MeetingPerson]
+    voices: Sequence[VoiceClip]
     laughter: Sequence[Floats]
     motions: Motions
     dwell: Dwell
@@ -225,14 +225,14 @@ def monologues(material: Mapping[Split, Material], seed: int, minutes: float) ->
             yield split, dyad
 
 
-def cast(voices: Sequence[Voice], rng: np.random.Generator) -> Voice:
+def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
     """A voice by lot, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
     return fitting[int(rng.integers(len(fitting)))]
 
 
-def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -> Voice | None:
+def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
     """A filmed voice for the listener, another one than the speaker's if there is one; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
@@ -242,7 +242,7 @@ def own_voice(voices: Sequence[Voice], other: Voice, rng: np.random.Generator) -
 # --- which stretches --------------------------------------------------------------------------------------------
 
 
-def stretches(people: Sequence[Person], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
+def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
     """Cut the time of each person into pieces of 30 to 60 s; keep those on camera that fit the scene.
 
     Listening: the person mostly listens. Interaction: the person talks at least a fifth of the time, and so do the
@@ -344,7 +344,9 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     )
 
 
-def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) -> tuple[Floats | None, Floats | None]:
+def _own_words(
+    stretch: Stretch, voice: VoiceClip | None, rng: np.random.Generator
+) -> tuple[Floats | None, Floats | None]:
     """The listener's own voice (N * 640,), as a program would send it to a loudspeaker, and its mouth (N, 52)."""
     if voice is None:
         return None, None
@@ -355,7 +357,7 @@ def _own_words(stretch: Stretch, voice: Voice | None, rng: np.random.Generator) 
 
 def speaker_of(
     stretch: Stretch,
-    voice: Voice,
+    voice: VoiceClip,
     motions: Motions,
     rng: np.random.Generator,
     laughter: Sequence[Floats] = (),
@@ -432,7 +434,7 @@ _LOST_A_MINUTE: Final = 2.0
 _LOST_S: Final = (0.3, 3.0)
 
 
-def heard(speech: Floats, voice: Voice, rng: np.random.Generator) -> Floats:
+def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     """Speech (n,) with room, spectral tilt, gain and noise floor."""
     direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
     tilt = np.float32(rng.uniform(*_TILT))

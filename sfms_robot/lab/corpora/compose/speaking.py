@@ -15,9 +15,9 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.render_events import Score, act
-from sfms_robot.lab.corpora.compose.voices import Voice, room
+from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.event_sizes import aside_s
 from sfms_robot.signals.events import runs
@@ -30,7 +30,7 @@ _GAIN_DB: Final = (-10.0, 6.0)
 
 
 def dyads(
-    voices: Sequence[Voice], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
+    voices: Sequence[VoiceClip], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
 ) -> Iterator[Dyad]:
     """About `minutes` of pieces of the filmed ones among the voices; none where none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
@@ -44,7 +44,7 @@ def dyads(
         frames, count = frames - len(dyad.listener), count + 1
 
 
-def take(name: str, voice: Voice, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
+def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
     """A piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
     if voice.mouth is None:
         raise ValueError(f"{voice.name} was not filmed")
@@ -123,7 +123,7 @@ class Dwell:
         return tuple(found)
 
 
-def learn_dwell(people: Sequence[Person]) -> Dwell:
+def learn_dwell(people: Sequence[MeetingPerson]) -> Dwell:
     """Return the durations of all people with annotated gaze; empty where there are none."""
     rng = np.random.default_rng(0)
     at_s: list[float] = []
@@ -135,7 +135,7 @@ def learn_dwell(people: Sequence[Person]) -> Dwell:
     return Dwell(tuple(lasts for lasts in at_s if lasts > 0), tuple(elsewhere))
 
 
-def away(person: Person, start_s: float, end_s: float, rng: np.random.Generator) -> list[Look]:
+def away(person: MeetingPerson, start_s: float, end_s: float, rng: np.random.Generator) -> list[Look]:
     """His kept looks away between two times of the meeting."""
     found: list[Look] = []
     near = [(a, b, who) for a, b, who in person.floor if a < end_s + _NEAR_S and b > start_s - _NEAR_S]

@@ -39,7 +39,7 @@ _LEVEL: Final = 0.06  # RMS of speech
 
 
 @dataclass(frozen=True)
-class Voice:
+class VoiceClip:
     """One person's speech without its pauses.
 
     Attributes:
@@ -61,7 +61,7 @@ class Voice:
     recording: Floats
 
 
-def find_voices(folders: Sequence[Path]) -> list[Voice]:
+def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
     """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
     files = [file for folder in folders for file in sorted([*folder.glob("*"), *folder.glob("*/*")])]
     voices = [read_voice(file) for file in files if file.suffix in _SOUNDS and not file.stem.startswith(_UNFIT)]
@@ -70,7 +70,7 @@ def find_voices(folders: Sequence[Path]) -> list[Voice]:
     return voices
 
 
-def split_voices(voices: Sequence[Voice]) -> dict[Split, list[Voice]]:
+def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
     """Whole recordings by part (`splits.VOICES`); a part that has none uses all there are."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
@@ -118,7 +118,7 @@ def _eased(sound: Floats) -> Floats:
     return np.asarray(np.clip(sound, -1, 1) * ramp, np.float32)
 
 
-def read_voice(file: Path) -> Voice:
+def read_voice(file: Path) -> VoiceClip:
     """Read a WAV file, and the mouth recorded with it (FACEGOOD weights, NAME.npz, or a face track) where there is
     one.
     """
@@ -146,7 +146,7 @@ def read_voice(file: Path) -> Voice:
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
     loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
     whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
-    return Voice(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active), whole)
+    return VoiceClip(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active), whole)
 
 
 def _levelled(speech: Floats) -> Floats:
@@ -185,7 +185,7 @@ def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.floa
 
 
 def lay(
-    segments_s: NDArray[np.float64], frames: int, voice: Voice, rng: np.random.Generator
+    segments_s: NDArray[np.float64], frames: int, voice: VoiceClip, rng: np.random.Generator
 ) -> tuple[Floats, Floats | None]:
     """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
     audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
@@ -216,7 +216,7 @@ def _soften(mouth: Floats) -> Floats:
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
-def room(samples: int, voice: Voice, rng: np.random.Generator) -> Floats:
+def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     """Noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, slowly breathing."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)

@@ -149,7 +149,7 @@ def _found(split: str, files: Mapping[str, Mapping[str, Path]], interactions: in
 
 def _pair(
     interaction: str, names: Sequence[str], files: Mapping[str, Mapping[str, Path]], seen: _Seen
-) -> tuple[Person, Person]:
+) -> tuple[SeamlessPerson, SeamlessPerson]:
     if len(names) != 2:
         others = ", ".join(names)
         problem = "his partner's files are not here" if len(names) == 1 else f"{len(names)} people, not two"
@@ -167,7 +167,7 @@ def _pair(
     return one, two
 
 
-def _clips(pair: tuple[Person, Person], mirrored: bool, row: int) -> list[Clip]:
+def _clips(pair: tuple[SeamlessPerson, SeamlessPerson], mirrored: bool, row: int) -> list[Clip]:
     """Both directions: every stretch in which the listener's face is valid."""
     frames = min(len(person.valid) for person in pair)
     found: list[Clip] = []
@@ -185,7 +185,9 @@ def stretches(valid: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(first, end) for first, end in cut if end - first >= LEAST_FRAMES]
 
 
-def _read(name: str, speaker: Person, listener: Person, first: int, frames: int, mirrored: bool) -> Dyad:
+def _read(
+    name: str, speaker: SeamlessPerson, listener: SeamlessPerson, first: int, frames: int, mirrored: bool
+) -> Dyad:
     faces = [motion_of(person, mirrored)[first : first + frames] for person in (speaker, listener)]
     if missing := int((~np.isfinite(faces[1]).all(axis=1)).sum()):
         detail = f"{missing} of {frames} frames from {first} on are zeros and said to be valid"
@@ -309,7 +311,7 @@ _LAG_GAIN: Final = 0.15  # by which another lag has to agree better
 
 
 @dataclass(frozen=True)
-class Person:
+class SeamlessPerson:
     """One person's part of an interaction, from headers and flags.
 
     Attributes:
@@ -337,7 +339,7 @@ class Person:
         return out[first : first + frames]
 
 
-def person_of(name: str, files: Mapping[str, Path]) -> Person:
+def person_of(name: str, files: Mapping[str, Path]) -> SeamlessPerson:
     """From files by their ending. Raises ClipError for one that is missing, and for ends that do not fit together."""
     somewhere = next(iter(files.values()))
     for ending in FILES:
@@ -346,7 +348,7 @@ def person_of(name: str, files: Mapping[str, Path]) -> Person:
             raise ClipError.of(kind, somewhere.with_suffix(ending), "no such file")
     prefix = prefix_of(files[".npz"])
     valid = guarded(str(files[".npz"]), lambda: _flags(files[".npz"], prefix))
-    person = Person(name, files[".npz"], files[".wav"], prefix, valid, _speech(files[".json"]))
+    person = SeamlessPerson(name, files[".npz"], files[".wav"], prefix, valid, _speech(files[".json"]))
     sound_s = guarded(str(person.wav), lambda: _sound_s(person.wav))
     if abs(sound_s - person.seconds) > SLACK_S:
         detail = f"{sound_s:.2f} s of sound for {person.seconds:.2f} s of face"
@@ -405,7 +407,7 @@ def _sound_s(file: Path) -> float:
     return sound.length / AUDIO_HZ
 
 
-def motion_of(person: Person, mirrored: bool) -> Floats:
+def motion_of(person: SeamlessPerson, mirrored: bool) -> Floats:
     """(T, 27): rotation about the head at rest, action units; NaN where the face was not tracked."""
     from scipy.spatial.transform import Rotation
 
@@ -421,13 +423,13 @@ def motion_of(person: Person, mirrored: bool) -> Floats:
     return out
 
 
-def _rows(person: Person, key: str, frames: int) -> Floats:
+def _rows(person: SeamlessPerson, key: str, frames: int) -> Floats:
     where = f"{person.prefix}:{key}"
     with person.npz.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return track(f"{person.npz} {where}", arrays[where], frames, KEYS[key], gaps=True)
 
 
-def voice_of(person: Person, first: int, frames: int) -> Floats:
+def voice_of(person: SeamlessPerson, first: int, frames: int) -> Floats:
     """Mono 16 kHz, from that frame on; silence where it ends a little early."""
     start, wanted = samples_of(first, FPS), samples_of(frames, FPS)
     heard = read_audio(person.wav)[start : start + wanted]

@@ -29,7 +29,7 @@ from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.lab.learning.staged_frames import Scratch
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import event_curves
-from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import StateUnderstanding
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelledDyad(Dyad):
+class LabelledDyad(ArigDyad):
     """Inputs of the model, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
 
     `control` is (..., N, 0) for a listener without events. `sway` (..., N, S) is the agent's slow motion, where that is

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.stream import FIRST
 from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.layers import weighted_mean
@@ -53,7 +53,7 @@ class Student(nn.Module):
 
 
 @dataclass(frozen=True)
-class Parts:
+class LossParts:
     """Means over frames: equation (3), cross-entropy of labelled frames, squared error of the coarse motion."""
 
     motion: Tensor
@@ -66,14 +66,14 @@ class Parts:
 
 def loss_parts(
     student: Student,
-    told: Dyad,
+    told: ArigDyad,
     states: Tensor,
     truth: Tensor,
     draws: int,
     generator: torch.Generator,
     previous: Tensor,
     group_weights: config.GroupWeights | None = None,
-) -> Parts:
+) -> LossParts:
     """Return the losses of frames 1..N-1.
 
     Args:
@@ -95,7 +95,7 @@ def loss_parts(
     state = motion.new_zeros(())
     if found.states is not None and bool(known.any()):
         state = F.cross_entropy(found.states[known], states[:, 1:][known])
-    return Parts(motion, state, coarse)
+    return LossParts(motion, state, coarse)
 
 
 def group_of(channel: str) -> str:
@@ -114,7 +114,9 @@ def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tenso
     return weights / weights.sum()
 
 
-def augment(dyad: Dyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> tuple[Dyad, Tensor]:
+def augment(
+    dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[ArigDyad, Tensor]:
     """Missing modalities, other microphones, and a past that is not quite what it was.
 
     Also the motion (B, N, C) that comes after such a past.

@@ -14,11 +14,11 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
-from sfms_robot.lab.learning.arig.losses import Parts, Student, augment, loss_parts, previous_states
+from sfms_robot.lab.learning.arig.losses import LossParts, Student, augment, loss_parts, previous_states
 from sfms_robot.lab.learning.job import Job, Run
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.arig.model import ArigModel, Dyad
+from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 
@@ -143,7 +143,7 @@ def draw(
 
 
 @torch.no_grad()
-def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> Parts:
+def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> LossParts:
     """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
     student.eval()
     generator = torch.Generator().manual_seed(0)
@@ -154,12 +154,12 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
         dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
         found.append(_loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
-    return Parts(**mean)
+    return LossParts(**mean)
 
 
 def _loss_parts(
-    student: Student, told: Dyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
-) -> Parts:
+    student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
+) -> LossParts:
     """`losses.loss_parts` as the phase says, previous states drawn."""
     previous = previous_states(states, phase.state_noise, generator, len(student.model.settings.states))
     return loss_parts(student, told, states, truth, phase.draws, generator, previous, phase.group_weights)

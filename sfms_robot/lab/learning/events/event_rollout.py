@@ -15,7 +15,7 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, Doubles, ListenerEvent
 from sfms_robot.lab.evaluation.phrase_timing import phrase_end_counts, phrase_ends, ratio_of
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
-from sfms_robot.lab.learning.events.event_trainer import Student
+from sfms_robot.lab.learning.events.event_trainer import EventStudent
 from sfms_robot.lab.learning.events.labels import minutes, steps_of
 from sfms_robot.listeners.events.evidence import AT, COUNTED_S, DONE, HEARD
 from sfms_robot.listeners.events.model import STEP_S, EventModel, HazardBank
@@ -44,7 +44,7 @@ class Nodding:
         return ratio_of(self.phrase_end)
 
 
-def roll_out(model: EventModel, one: Student, per_minute: float, seed: int) -> list[ListenerEvent]:
+def roll_out(model: EventModel, one: EventStudent, per_minute: float, seed: int) -> list[ListenerEvent]:
     """The nods (nothing else is decided) of one person's place at a knob."""
     evidence = one.evidence.copy()
     own = len(HEARD)
@@ -84,14 +84,14 @@ def _done(nods: Sequence[ListenerEvent], now_s: Doubles, log_rate: float) -> Dou
     return rows
 
 
-def people_did(one: Student) -> Doubles:
+def people_did(one: EventStudent) -> Doubles:
     """Seconds at which he began to nod while listening."""
     starts = one.person.nods[:, 0]
     at = np.floor(starts * FRAME_HZ + 1e-6).astype(np.int64)
     return np.asarray(starts[(at < len(one.listening)) & one.listening[np.minimum(at, len(one.listening) - 1)]])
 
 
-def count(one: Student, onsets_s: Doubles) -> Nodding:
+def count(one: EventStudent, onsets_s: Doubles) -> Nodding:
     """Of one person."""
     listening = steps_of(one.listening)[: len(one.evidence)]
     steps = np.minimum(np.floor(onsets_s / STEP_S + 1e-6).astype(np.int64), len(listening) - 1)

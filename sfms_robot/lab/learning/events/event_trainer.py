@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
 from sfms_robot.lab.learning.events.labels import (
@@ -92,7 +92,7 @@ GROUPS: Final[Mapping[str, Groups]] = {
 
 
 @dataclass(frozen=True)
-class Student:
+class EventStudent:
     """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
@@ -101,14 +101,14 @@ class Student:
         lessons: by kind.
     """
 
-    person: Person
+    person: MeetingPerson
     evidence: Doubles
     listening: Bools
     others: Bools
     lessons: Mapping[str, Lesson]
 
 
-def student(person: Person, rng: np.random.Generator) -> Student:
+def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     meeting = meeting_evidence(person)
     scene = scene_of(meeting)
@@ -123,7 +123,7 @@ def student(person: Person, rng: np.random.Generator) -> Student:
     lessons = {kind: lesson(spans[kind], meeting.listening) for kind in spans}
     if looks is not None:
         lessons["gaze_shift"] = _looking(looks)
-    return Student(
+    return EventStudent(
         person,
         _as_steps_begin(evidence),
         meeting.listening,
@@ -182,7 +182,7 @@ def inputs(evidence: Doubles, groups: Groups) -> Floats:
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
-def sampled(students: Iterable[Student], kind: str, seed: int) -> tuple[Doubles, Doubles, Doubles]:
+def sampled(students: Iterable[EventStudent], kind: str, seed: int) -> tuple[Doubles, Doubles, Doubles]:
     """Evidence (R, E) of all onsets and of a sixth of the other steps, whether it happens (R,), how often it counts."""
     rows, happens, counts = [], [], []
     for number, one in enumerate(students):
@@ -199,7 +199,7 @@ def sampled(students: Iterable[Student], kind: str, seed: int) -> tuple[Doubles,
     return np.concatenate(rows), np.concatenate(happens).astype(np.float64), np.concatenate(counts)
 
 
-def teach(students: Sequence[Student], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
+def teach(students: Sequence[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
     """The hazard of one kind."""
     rows, happens, counts = sampled(students, kind, seed)
     return fit(inputs(rows, groups), happens, counts, ridge=ridge)
@@ -249,7 +249,7 @@ class Ranked:
         return float(low), float(high)
 
 
-def ranked(students: Iterable[Student], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
+def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
     """Return how well `score`, (M, E) -> (M,), ranks onsets above other steps; meetings of a person weighted by
     onsets.
     """
@@ -267,7 +267,7 @@ def ranked(students: Iterable[Student], kind: str, score: Callable[[Doubles], Do
     return Ranked(tuple(found), np.array(means))
 
 
-def rate_per_minute(students: Iterable[Student], kind: str) -> float:
+def rate_per_minute(students: Iterable[EventStudent], kind: str) -> float:
     """Of the time in which they might."""
     pairs = [(len(one.lessons[kind].onsets), minutes(one.lessons[kind].may)) for one in students if kind in one.lessons]
     onsets, time = np.sum(pairs, axis=0) if pairs else (0.0, 0.0)

@@ -18,7 +18,7 @@ from rich.progress import MofNCompleteColumn, Progress
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
-from sfms_robot.lab.corpora.compose.ami import Person, read_people, split_series
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
 from sfms_robot.lab.evaluation.meetings import tables
@@ -28,8 +28,8 @@ from sfms_robot.lab.learning.events.event_trainer import (
     NOD,
     RIDGE,
     STUDY_RIDGE,
+    EventStudent,
     Groups,
-    Student,
     hazard,
     inputs,
 )
@@ -117,14 +117,14 @@ def save(file: Path, found: EventTables) -> None:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def _one(person: Person, seed: int, step: Any) -> Student:
+def _one(person: MeetingPerson, seed: int, step: Any) -> EventStudent:
     made = event_trainer.student(person, np.random.default_rng([seed, *person.meeting.encode(), ord(person.agent)]))
     step()
     return made
 
 
 def _taught(
-    students: Sequence[Student], kind: str, groups: Mapping[str, Groups], ridge: float, seed: int, step: Any
+    students: Sequence[EventStudent], kind: str, groups: Mapping[str, Groups], ridge: float, seed: int, step: Any
 ) -> Hazard:
     learned = event_trainer.teach(students, kind, groups[kind], seed, ridge)
     step()
@@ -132,7 +132,9 @@ def _taught(
     return event_trainer.hazard(learned, groups[kind], FROM[kind], rate)
 
 
-def _figures(given: Hazard, kind: str, taught: Sequence[Student], judged: Sequence[Student]) -> dict[str, Any]:
+def _figures(
+    given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Sequence[EventStudent]
+) -> dict[str, Any]:
     found: dict[str, Any] = {
         "onsets": sum(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons),
         "steps": sum(int(one.lessons[kind].may.sum()) for one in taught if kind in one.lessons),
@@ -167,7 +169,7 @@ def _score(given: Hazard, kind: str, left_out: Sequence[str] = ()) -> Any:
     return score
 
 
-def _rolled_out(model: EventModel, judged: Sequence[Student], seed: int) -> dict[str, Any]:
+def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
     """By knob, and of the people themselves."""
     theirs = event_rollout.total([event_rollout.count(one, event_rollout.people_did(one)) for one in judged])
     found: dict[str, Any] = {"people": _rounded(event_rollout.figures(theirs))}
@@ -231,7 +233,7 @@ _SHARES: Final = np.linspace(0, 1, STEPS + 1)
 _INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # a tail has no end
 
 
-def shapes(students: Sequence[Student], motions: Motions) -> dict[str, Shape]:
+def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shape]:
     """Of every kind, durations from these people."""
     least, usual, most = sizes.NOD_DEG
     nod_deg = np.clip(usual * np.exp(sizes.NOD_SPREAD * _normal(_INNER)), least, most)
@@ -341,7 +343,7 @@ def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
     return found.model_copy(update={"weights": {**found.weights, **BLINK_CUES}})
 
 
-def look_away_hazard(found: Hazard, students: Iterable[Student]) -> Hazard:
+def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
     """`found` in the meetings, brought to how often people look away from one another."""
     weights = {name: weight for name, weight in found.weights.items() if name not in ("at_person_s", "own_voice_s")}
     more = round(float(np.log(AT_PERSON_S / AT_PERSON_SPEAKING_S)), 3)
@@ -351,7 +353,7 @@ def look_away_hazard(found: Hazard, students: Iterable[Student]) -> Hazard:
     return at_rate(away, "gaze_shift", students, 60.0 / AT_PERSON_S)
 
 
-def at_rate(given: Hazard, kind: str, students: Iterable[Student], per_minute: float) -> Hazard:
+def at_rate(given: Hazard, kind: str, students: Iterable[EventStudent], per_minute: float) -> Hazard:
     """The same with the intercept that gives so many a minute, in the steps of others in which it may happen."""
     rows = np.concatenate(
         [one.evidence[one.lessons[kind].may & (one.evidence[:, AT["own_voice_s"]] > 1.0)] for one in students

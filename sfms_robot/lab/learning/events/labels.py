@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
-from sfms_robot.lab.corpora.compose.ami import Person
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, near
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
@@ -49,7 +49,7 @@ def steps_of(mask: Bools) -> Bools:
     return before[: len(mask) // STEP_FRAMES]
 
 
-def spans_of(person: Person, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
+def spans_of(person: MeetingPerson, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
     """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
     others = person.others_laughs[:, 0]
     smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
@@ -100,7 +100,7 @@ class Looks:
     away_s: Doubles
 
 
-def looks_of(person: Person, meeting: MeetingEvidence, counts: Bools) -> Looks:
+def looks_of(person: MeetingPerson, meeting: MeetingEvidence, counts: Bools) -> Looks:
     """Return the gaze of a person with annotations; `counts` (N, P) marks people who speak or have the floor."""
     frames, gaze = len(counts), person.gaze or ()
     target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
@@ -155,7 +155,7 @@ class MeetingEvidence:
     spans_s: Mapping[str, Doubles]
 
 
-def meeting_evidence(person: Person) -> MeetingEvidence:
+def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
     """Of the whole time in which his head was annotated."""
     whole = Stretch(person, 0.0, int(person.until_s * FRAME_HZ) / FRAME_HZ)
     others = sorted(set(person.words) - {person.agent})

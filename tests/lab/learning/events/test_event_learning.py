@@ -13,7 +13,7 @@ from ami_tables import UNTIL_S, words, write_tables
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
-from sfms_robot.lab.corpora.compose.ami import Person, phrases
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, phrases
 from sfms_robot.lab.evaluation.whole_recordings import Scene, counts_in
 from sfms_robot.lab.learning.events import event_rollout, event_trainer
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
@@ -32,7 +32,7 @@ def person(nods=NONE, other=None, **more):
         "shakes": NONE, "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE,
         "backchannels": NONE, "others_laughs": NONE, "asked": np.zeros(0),
     } | more  # fmt: skip
-    return Person(
+    return MeetingPerson(
         "M1a", "A", "one", UNTIL_S, nods=nods, others=talk,
         floor=tuple((a, b, "B") for a, b in talk), words={"A": NONE, "B": other}, **given,
     )  # fmt: skip
