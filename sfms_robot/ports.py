@@ -323,7 +323,7 @@ class Timeline(Protocol):
         """Return the longest time after a tick [s] that `sample` can give; inf if the whole future is known."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Watched:
     """The person that the head listens to, as known at a tick.
 

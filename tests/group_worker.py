@@ -27,7 +27,14 @@ def main() -> None:
     with joined(torch.device("cpu")) as group:
         resume = given.get("resume", False) or (group.restarts > 0)
         scratch = Path(given["scratch"]) if "scratch" in given else None
-        run = Run(resume, torch.device("cpu"), watch, group, given.get("accumulate"), scratch)
+        run = Run(
+            resume=resume,
+            device=torch.device("cpu"),
+            watch=watch,
+            group=group,
+            accumulate=given.get("accumulate"),
+            scratch=scratch,
+        )
         chosen = settings(steps=given["steps"], batch=8, evaluate_every=4, checkpoint_every=given.get("every", 500))
         figures = train_arig(chosen, Path(given["data"]), out, run)
         if group.first:

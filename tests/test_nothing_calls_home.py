@@ -152,13 +152,13 @@ def watched(request, tmp_path):
     """Both watchers, for what is quick."""
     if not request.param.usable():
         pytest.skip("strace may not be used here")
-    return Watched(request.param(tmp_path), tmp_path)
+    return Watched(seen_s=request.param(tmp_path), place_m=tmp_path)
 
 
 @pytest.fixture
 def best(tmp_path):
     """The one that sees most, for what takes its time."""
-    return Watched((Strace if Strace.usable() else Hook)(tmp_path), tmp_path)
+    return Watched(seen_s=(Strace if Strace.usable() else Hook)(tmp_path), place_m=tmp_path)
 
 
 def python(code):
@@ -241,7 +241,13 @@ def test_commands_that_speak_to_servos_stay_here(best):
 def dyad(name, seed):
     rng = np.random.default_rng(seed)
     motion = (0.2 + 0.1 * np.sin(np.arange(110)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
-    return clips.Dyad(name, rng.normal(0, 0.05, 110 * 640).astype(np.float32), motion, motion, np.ones(110, bool))
+    return clips.Dyad(
+        name=name,
+        audio=rng.normal(0, 0.05, 110 * 640).astype(np.float32),
+        speaker=motion,
+        listener=motion,
+        listening=np.ones(110, bool),
+    )
 
 
 def training():

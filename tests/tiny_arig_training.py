@@ -47,11 +47,11 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
     face = motion[::-1].copy() if scene != "speaking" else np.full((frames, 58), np.nan, np.float32)
     states = labels.label(labels.of_activity(agent, user))
     return clips.Dyad(
-        name,
-        voice(user),
-        face,
-        motion,
-        user & ~agent,
+        name=name,
+        audio=voice(user),
+        speaker=face,
+        listener=motion,
+        listening=user & ~agent,
         agent_audio=voice(agent),
         states=states,
         events=tuple(ListenerEvent("nod", start_s, 0.6, 0.05, 2) for start_s in (2.0, 5.0, 9.0)),

@@ -67,7 +67,7 @@ Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], Abst
 
 def run_log(opened: OpenHead) -> RunLog:
     """Return an empty log for `drive_head`."""
-    return RunLog(opened.motion.retargeter.joints, 1.0 / opened.rate_hz, opened.motion.audit)
+    return RunLog(joints=opened.motion.retargeter.joints, period_s=1.0 / opened.rate_hz, audit=opened.motion.audit)
 
 
 def run_parts(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:

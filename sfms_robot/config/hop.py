@@ -29,7 +29,7 @@ P95_S: Final = 0.135
 _EPS_S: Final = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Probe:
     """Measurements of a listener: frames of a plan, possible hops, and the time of a plan."""
 
@@ -40,7 +40,7 @@ class Probe:
     step_p99_s: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Latencies:
     """Measurements of a run before its hop is chosen, in seconds.
 

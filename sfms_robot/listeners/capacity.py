@@ -42,7 +42,7 @@ def step_each(
     return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Capacity:
     """Costs of batches on this machine.
 
@@ -105,7 +105,7 @@ def measure_capacity(
         planned, others = _timed(listener, size, rounds, now_s)
         plan_s.append(float(np.median(planned)))
         other_s.append(float(np.median(others)) if others else 0.0)
-    return Capacity(listener.hop, tuple(sizes), tuple(plan_s), tuple(other_s))
+    return Capacity(hop=listener.hop, sizes=tuple(sizes), plan_s=tuple(plan_s), other_s=tuple(other_s))
 
 
 def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float]) -> tuple[list[float], list[float]]:

@@ -254,7 +254,7 @@ class RestMap:
         return np.asarray(self.base + np.einsum("ncj,cj->nc", part, self.gain), np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class IdleStream:
     """The idle motion of one stream.
 
@@ -316,7 +316,9 @@ class IdleMotion:
         sizes, phase = as_cosines(cosine, sine)
         frequency = 2 * math.pi * frequency_hz.reshape(bands * IDLE_LINES, parts)
         rest = RestMap.between(self.held, self.shown)
-        return IdleStream(frequency, sizes, phase, self.loadings.astype(np.float64), rest)
+        return IdleStream(
+            frequency=frequency, size=sizes, phase=phase, loadings=self.loadings.astype(np.float64), rest=rest
+        )
 
     def save(self, file: Path) -> None:
         """Write the tensors to `file`. Raises ModelError if it cannot be written."""

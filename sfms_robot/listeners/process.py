@@ -130,7 +130,12 @@ class ListenerProcess:
             tick_s: of the loop.
         """
         self._latencies = lambda probe: Latencies(
-            probe.horizon, source_latency_s(), probe.step_p50_s, probe.step_p99_s, lead_s, tick_s
+            horizon=probe.horizon,
+            source_s=source_latency_s(),
+            step_p50_s=probe.step_p50_s,
+            step_p99_s=probe.step_p99_s,
+            lead_s=lead_s,
+            tick_s=tick_s,
         )
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
@@ -291,7 +296,15 @@ def main() -> None:
         if use_threads(at_hop(listener, min(choices)), threads()):
             parent.send(("loaded", engine_name(listener), 0.0))
         p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
-        parent.send(("probed", Probe(listener.horizon, listener.hop, tuple(choices), p50_s, p99_s), 0.0))
+        parent.send(
+            (
+                "probed",
+                Probe(
+                    horizon=listener.horizon, hop=listener.hop, hops=tuple(choices), step_p50_s=p50_s, step_p99_s=p99_s
+                ),
+                0.0,
+            )
+        )
     except RobotError as error:
         parent.send(("error", str(error), 0.0))
         return

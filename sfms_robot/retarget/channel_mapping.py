@@ -81,7 +81,7 @@ class _Couplings:
             missing[..., rows] -= (there - now) * weights
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Units:
     """Conversion of angles (..., J) [rad] to joint units: -1 = min, 0 = rest, +1 = max, or rad from rest."""
 
@@ -99,11 +99,11 @@ class Units:
         down = rest - np.array([joint.min_rad for joint in joints])
         in_rad = np.array([joint.unit == "rad" for joint in joints])
         return cls(
-            rest,
-            np.where(in_rad | (up <= 0), 1.0, up),
-            np.where(in_rad | (down <= 0), 1.0, down),
-            -np.where(in_rad, down, down > 0),
-            np.where(in_rad, up, up > 0),
+            rest=rest,
+            up=np.where(in_rad | (up <= 0), 1.0, up),
+            down=np.where(in_rad | (down <= 0), 1.0, down),
+            low=-np.where(in_rad, down, down > 0),
+            high=np.where(in_rad, up, up > 0),
         )
 
     def values(self, angles_rad: Doubles) -> Doubles:
@@ -261,7 +261,7 @@ def _end_slope(dx0: float, dx1: float, rise0: float, rise1: float) -> float:
     return 3.0 * rise0 if np.sign(rise0) != np.sign(rise1) and abs(slope) > 3.0 * abs(rise0) else slope
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Shape:
     """Operations on the values (..., n) of a level's nodes; None for one that no node has, to save time in a tick."""
 
@@ -285,13 +285,13 @@ class _Shape:
         low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]).T
         clamped = bool(np.isfinite(low).any())
         return cls(
-            dead if dead.any() else None,
-            _Curves.of([node.curve for node in nodes], count),
-            gains[:, 1] if gained else None,
-            gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
-            offset if offset.any() else None,
-            low if clamped else None,
-            high if clamped else None,
+            dead_band=dead if dead.any() else None,
+            curves=_Curves.of([node.curve for node in nodes], count),
+            gain_up=gains[:, 1] if gained else None,
+            gain_down=gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
+            offset=offset if offset.any() else None,
+            low=low if clamped else None,
+            high=high if clamped else None,
         )
 
     def __call__(self, values: Doubles) -> Doubles:

@@ -130,7 +130,7 @@ class _Piece:
         return max(part.ramp.over_s for part in (self.shown, self.eyes, self.head))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Asked:
     """Commands since the last tick; the last one of each channel.
 
@@ -146,7 +146,7 @@ class _Asked:
     look_s: float = 0.0
 
 
-_NOTHING: Final = _Asked(np.zeros(MOTION_DIM), np.zeros(MOTION_DIM, bool), np.zeros(MOTION_DIM))
+_NOTHING: Final = _Asked(face=np.zeros(MOTION_DIM), which=np.zeros(MOTION_DIM, bool), seconds=np.zeros(MOTION_DIM))
 
 
 class Puppet:

@@ -97,7 +97,7 @@ class EventCounter:
         return sum(first <= max(0, round(start_s * self._rate_hz)) < last for start_s, _, _ in events)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RunLog:
     """Figures filled by the loop and read at the end; `motion_so_far`, counters and quantiles also by other threads.
 

@@ -237,7 +237,15 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
     if not halted and state.run.name == "halted" and not state.stands:
         halted = state.run.why  # it ends when the head stands, not before
     run = following(
-        state.run, Situation(eased_in, presence.person(now_s), presence.speaking(now_s), lost, halted), now_s
+        state.run,
+        Situation(
+            eased_in=eased_in,
+            person=presence.person(now_s),
+            speaking=presence.speaking(now_s),
+            lost=lost,
+            halted=halted,
+        ),
+        now_s,
     )
     if run.name == "halted" and parts.halt.answer():  # torque went off meanwhile
         released = np.ones_like(released)

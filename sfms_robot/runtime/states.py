@@ -70,7 +70,7 @@ class RunState:
         return RunState("stopped" if error is None else "fault", now_s, () if error is None else (error,), self.doing)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Situation:
     """The facts of an instant.
 

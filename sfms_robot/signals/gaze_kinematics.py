@@ -49,7 +49,7 @@ Pair = tuple[float, float]  # yaw, pitch
 Axis = tuple[float, float, float]  # angle, speed, acceleration
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GazeState:
     """State of eyes and head between two frames. Angles are in space, (yaw, pitch).
 
@@ -82,7 +82,7 @@ class GazeState:
 
 def start(seed: int, wanders: bool = True) -> GazeState:
     """Return the state of a look straight ahead; the head's share of a look is drawn from `seed`."""
-    return GazeState(seed, wanders, float(np.random.default_rng(seed).uniform(*_SHARES)))
+    return GazeState(seed=seed, wanders=wanders, share=float(np.random.default_rng(seed).uniform(*_SHARES)))
 
 
 def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[Floats, Floats, list[GazeState]]:

@@ -19,7 +19,7 @@ STEP: Final = 1e-3  # resolution on disk
 SPLITS: Final = ("train", "validation", "test")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Motions:
     """Primitives at 25 fps, each kind a tuple of arrays; blendshapes are differences from the person's neutral.
 

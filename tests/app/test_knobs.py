@@ -91,7 +91,7 @@ def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
     head, clock, goals = load_head("op3_head"), VirtualClock(), Goals()
     motion = build_motion(head, 100.0)
     off, on = turned(head, ["neck=0"]).now, turned(head).now
-    log = RunLog(motion.retargeter.joints, 0.01, motion.audit)
+    log = RunLog(joints=motion.retargeter.joints, period_s=0.01, audit=motion.audit)
     with launch(emulated(head)["main"], virtual=True) as chain:
         bus = build_bus(head, {"main": chain}, clock)
         bus.connect()

@@ -20,7 +20,9 @@ def dyad(name: str, seed: int) -> clips.Dyad:
     rng = np.random.default_rng(seed)
     motion = (0.2 + 0.1 * np.sin(np.arange(FRAMES)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
     audio = rng.normal(0, 0.05, FRAMES * FRAME_SAMPLES).astype(np.float32)
-    return clips.Dyad(name, audio, motion[::-1].copy(), motion, np.ones(FRAMES, bool))
+    return clips.Dyad(
+        name=name, audio=audio, speaker=motion[::-1].copy(), listener=motion, listening=np.ones(FRAMES, bool)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ from sfms_robot.frames import FRAME_S
 HOPS = range(1, 9)
 seconds = st.floats(0.0, 0.3)
 measured = st.builds(
-    lambda horizon, source, p50, more, lead, tick: Latencies(horizon, source, p50, p50 + more, lead, tick),
+    lambda horizon, source, p50, more, lead, tick: Latencies(horizon=horizon, source_s=source, step_p50_s=p50,
+    step_p99_s=p50 + more, lead_s=lead, tick_s=tick),
     st.integers(1, 16), seconds, seconds, seconds, seconds, st.sampled_from([0.005, 0.01, 0.02, 0.04]),
 )  # fmt: skip
 
@@ -56,20 +57,28 @@ def test_a_hop_that_is_given_stays(latencies, hop):
 
 @pytest.mark.parametrize("source_s, step_s, hop", [(0.0, 0.006, 3), (0.02, 0.006, 2), (0.06, 0.006, 1)])
 def test_a_later_source_asks_for_a_shorter_hop(source_s, step_s, hop):
-    choice = choose_hop(HOPS, Latencies(8, source_s, step_s, step_s, 0.047, 0.01))
+    choice = choose_hop(
+        HOPS, Latencies(horizon=8, source_s=source_s, step_p50_s=step_s, step_p99_s=step_s, lead_s=0.047, tick_s=0.01)
+    )
     assert (choice.hop, choice.given_up) == (hop, None)
 
 
 def test_what_is_given_up_is_said_with_its_figures():
-    slow = choose_hop(HOPS, Latencies(8, 0.15, 0.02, 0.02, 0.06, 0.01))
+    slow = choose_hop(
+        HOPS, Latencies(horizon=8, source_s=0.15, step_p50_s=0.02, step_p99_s=0.02, lead_s=0.06, tick_s=0.01)
+    )
     assert (slow.hop, slow.given_up) == (1, "a sound is answered after 190 ms, p95 208 ms (wanted: 95, 135)")
-    alone = choose_hop([1], Latencies(1, 0.0, 0.006, 0.007, 0.047, 0.01))
+    alone = choose_hop(
+        [1], Latencies(horizon=1, source_s=0.0, step_p50_s=0.006, step_p99_s=0.007, lead_s=0.047, tick_s=0.01)
+    )
     assert alone.given_up == "the longest lead of 47 ms is 47 ms shorter" and alone.budget_ms["lead_cut"] == 47
-    hurried = choose_hop(HOPS, Latencies(8, 0.0, 0.5, 0.6, 0.08, 0.01))
+    hurried = choose_hop(
+        HOPS, Latencies(horizon=8, source_s=0.0, step_p50_s=0.5, step_p99_s=0.6, lead_s=0.08, tick_s=0.01)
+    )
     assert hurried.hop == 8 and "a plan takes 500, p99 600, of a hop's 320 ms" in hurried.given_up
 
 
 def test_a_sound_waits_half_a_hop_then_for_two_ticks():
-    latencies = Latencies(8, 0.012, 0.006, 0.018, 0.0, 0.01)
+    latencies = Latencies(horizon=8, source_s=0.012, step_p50_s=0.006, step_p99_s=0.018, lead_s=0.0, tick_s=0.01)
     assert latencies.p50_s(2) == pytest.approx(0.04 + 0.02 + 0.01)
     assert latencies.p95_s(2) == pytest.approx(0.076 + 0.02 + 0.02)

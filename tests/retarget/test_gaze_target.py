@@ -45,7 +45,7 @@ def at(place_m):
     def watched(t, shown):
         seen_s = math.floor(t / FRAME_S + 1e-6) * FRAME_S
         where = place_m(seen_s) if callable(place_m) else place_m
-        return Watched(seen_s, None if where is None else np.array(where, np.float32))
+        return Watched(seen_s=seen_s, place_m=None if where is None else np.array(where, np.float32))
 
     return watched
 
@@ -123,7 +123,7 @@ def test_the_head_goes_back_slowly_when_the_person_has_gone_looks_around_and_fin
 
 
 def test_nobody_left_is_looked_for():
-    shown = lived(lambda t, shown: Watched(min(t, 1.0)), 60.0, person=Person())[:, 0]
+    shown = lived(lambda t, shown: Watched(seen_s=min(t, 1.0)), 60.0, person=Person())[:, 0]
     assert np.ptp(gaze_deg(shown[:300])[:, 0]) < 1
     assert np.ptp(head_deg(shown[400:])[:, 0]) > 10
 
@@ -142,7 +142,7 @@ def test_a_camera_on_the_head_sees_one_person_while_the_neck_turns():
         if seen_s < 0:
             return Watched()
         pose = shown[round(seen_s / TICK_S)][0, :6].astype(float)
-        return Watched(seen_s, (person_m - pose[3:]) @ rotation(pose[:3]) - mount.at_m)
+        return Watched(seen_s=seen_s, place_m=(person_m - pose[3:]) @ rotation(pose[:3]) - mount.at_m)
 
     gaze = gaze_deg(lived(watched, 4.0, camera=mount)[:, 0])
     assert gaze[-1] == pytest.approx(np.degrees(direction_to(person_m)), abs=0.1)

@@ -45,7 +45,7 @@ def driven(
 ) -> tuple[str, RunLog]:  # fmt: skip
     """Drive a head to the end; `parts` replace those of `build_motion`."""
     motion = build_motion(head, rate_hz)
-    log = log or RunLog(list(head.joints), 1 / rate_hz, motion.audit)
+    log = log or RunLog(joints=list(head.joints), period_s=1 / rate_hz, audit=motion.audit)
     whole = {
         "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,
         "observers": [observer], "leads_s": motion.leads_s, "rest_rad": motion.rest_rad,

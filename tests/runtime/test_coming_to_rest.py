@@ -85,7 +85,7 @@ def ran(
     motion = build_motion(HEAD, RATE_HZ)
     bus = build_bus(HEAD, {"main": chain}, clock)
     bus.connect()
-    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, motion.audit)
+    log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=motion.audit)
     parts: dict[str, Any] = {
         "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Posed(yaw=lambda times_s: 0.3), 0, 0.01),
         "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,

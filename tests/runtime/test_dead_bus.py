@@ -46,7 +46,7 @@ def test_the_bus_that_works_comes_to_rest(dead, alive):
         bus = build_bus(HEAD, chains, clock)
         bus.connect()
         stack.callback(bus.close)
-        log = RunLog(list(HEAD.joints), 1 / RATE_HZ, build_motion(HEAD, RATE_HZ).audit)
+        log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=build_motion(HEAD, RATE_HZ).audit)
         watcher = Unplugger(chains[dead])
         with pytest.raises(BusError, match=dead):
             driven(

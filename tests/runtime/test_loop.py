@@ -76,7 +76,7 @@ def run(
     clock, watcher = VirtualClock(), watcher or Watcher()
     clock.origin_s = ORIGIN_S
     bus = build_bus(HEAD, {"main": chain}, clock)
-    log = RunLog(list(HEAD.joints), 1 / RATE_HZ, build_motion(HEAD, RATE_HZ).audit)
+    log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=build_motion(HEAD, RATE_HZ).audit)
 
     def interrupted() -> bool:
         return interrupt_at is not None and len(watcher.ticks) >= interrupt_at

@@ -71,7 +71,7 @@ class NoAudit:
 
 
 def test_a_log_of_hours_is_as_large_as_one_of_minutes():
-    log = RunLog(["a", "b"], 1 / RATE_HZ, NoAudit())
+    log = RunLog(joints=["a", "b"], period_s=1 / RATE_HZ, audit=NoAudit())
     log.start(np.zeros(2))
     goals, motion = np.zeros(2), np.zeros(MOTION_DIM, np.float32)
 
@@ -99,7 +99,7 @@ def test_a_log_of_hours_is_as_large_as_one_of_minutes():
 
 
 def test_the_share_of_attention_is_of_the_frames_that_tell_it():
-    log = RunLog(["a"], 1 / RATE_HZ, NoAudit())
+    log = RunLog(joints=["a"], period_s=1 / RATE_HZ, audit=NoAudit())
     assert log.attention_report() == {"share": None, "frames": 0}
     for attention in (None, 0.9, 0.6, 0.2, None):
         log.heard(SpeakerFrame(0.04, np.zeros(0, np.float32), attention=attention))

@@ -100,7 +100,15 @@ def _loaded(served: Served) -> Listener:
             raise ConfigError(f"--hop {served.hop}: not a hop of listener {served.listener!r} (valid: {valid})")
         return at_hop(listener, served.hop)
     p50_s, p99_s = plan_times_s(at_hop(listener, min(hops)))
-    return at_hop(listener, choose_hop(hops, Latencies(listener.horizon, 0.0, p50_s, p99_s, LEAD_S, TICK_S)).hop)
+    return at_hop(
+        listener,
+        choose_hop(
+            hops,
+            Latencies(
+                horizon=listener.horizon, source_s=0.0, step_p50_s=p50_s, step_p99_s=p99_s, lead_s=LEAD_S, tick_s=TICK_S
+            ),
+        ).hop,
+    )
 
 
 def _serve(server: StreamServer, inbox: queue.SimpleQueue[Any], say: Say) -> None:

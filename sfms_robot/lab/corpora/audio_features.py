@@ -25,7 +25,7 @@ from sfms_robot.signals.mfcc import DIM as MFCC_DIM
 from sfms_robot.signals.mfcc import mfcc78
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Feature:
     """A feature computed from sound, frame by frame.
 
@@ -43,7 +43,7 @@ class Feature:
     compute: Callable[[Floats], Floats]
 
 
-MFCC78: Final = Feature("mfcc", "1", MFCC_DIM, FRAME_HZ, mfcc78)
+MFCC78: Final = Feature(name="mfcc", version="1", dim=MFCC_DIM, fps=FRAME_HZ, compute=mfcc78)
 
 
 def wav2vec2_feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "cpu", hop_frames: int = 1) -> Feature:
@@ -57,7 +57,9 @@ def wav2vec2_feature(folder: Path | str, fps: float = FRAME_HZ, device: str = "c
             with file.open("rb") as stream:
                 digest.update(hashlib.file_digest(stream, "sha256").digest())
     version = f"1 hop {hop_frames} {digest.hexdigest()[:16]}"
-    return Feature("wav2vec2", version, model.dim, fps, partial(model.of_recording, fps=fps))
+    return Feature(
+        name="wav2vec2", version=version, dim=model.dim, fps=fps, compute=partial(model.of_recording, fps=fps)
+    )
 
 
 def cached(samples: Floats, feature: Feature, folder: Path) -> Floats:

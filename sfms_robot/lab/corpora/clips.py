@@ -41,7 +41,7 @@ _EVENT: Final = np.dtype(
 _Number = TypeVar("_Number", bound=np.generic)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dyad:
     """N frames of a speaker and of the listener who answered. Sound is `audio`, or `mel`, or missing.
 
@@ -180,20 +180,22 @@ def read(file: Path) -> Dyad:
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             return Dyad(
-                file.stem,
-                _voice(arrays, "audio"),
-                arrays["speaker"].astype(np.float32),
-                arrays["listener"].astype(np.float32),
-                arrays["listening"].astype(bool),
-                str(arrays["space"]) if "space" in arrays else "arkit58",
-                float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
-                arrays["mel"].astype(np.float32) if "mel" in arrays else None,
-                {key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
-                _voice(arrays, "agent_audio"),
-                arrays["states"].astype(np.int8) if "states" in arrays else None,
-                _events(arrays["events"]) if "events" in arrays else None,
-                arrays["head_of_gaze_rad"].astype(np.float32) if "head_of_gaze_rad" in arrays else None,
-                arrays["attention"].astype(np.float32) if "attention" in arrays else None,
+                name=file.stem,
+                audio=_voice(arrays, "audio"),
+                speaker=arrays["speaker"].astype(np.float32),
+                listener=arrays["listener"].astype(np.float32),
+                listening=arrays["listening"].astype(bool),
+                space=str(arrays["space"]) if "space" in arrays else "arkit58",
+                fps=float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
+                mel=arrays["mel"].astype(np.float32) if "mel" in arrays else None,
+                features={key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
+                agent_audio=_voice(arrays, "agent_audio"),
+                states=arrays["states"].astype(np.int8) if "states" in arrays else None,
+                events=_events(arrays["events"]) if "events" in arrays else None,
+                head_of_gaze_rad=arrays["head_of_gaze_rad"].astype(np.float32)
+                if "head_of_gaze_rad" in arrays
+                else None,
+                attention=arrays["attention"].astype(np.float32) if "attention" in arrays else None,
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error

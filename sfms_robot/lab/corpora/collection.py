@@ -53,7 +53,7 @@ class ClipError(ConfigError):
         return cls(Problem(kind, str(where), str(detail).splitlines()[0] if str(detail) else type(detail).__name__))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Clip:
     """One listener's clip: its name, frames, and how to read it.
 
@@ -71,7 +71,7 @@ class Clip:
     features: Mapping[str, Callable[[], Floats]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dataset(Sequence[Dyad]):
     """Dyads of one split, read when asked for.
 
@@ -189,7 +189,7 @@ def guarded(where: str, read: Callable[[], _T]) -> _T:
         raise ClipError.of("unreadable", where, error) from error
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """Layout of one family of data sets on disk.
 

@@ -26,7 +26,7 @@ _UNITS: Final = slice(3, 3 + len(FAU_VALUE))  # of seamless27
 _UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Residual:
     """Loss by conversion over all clips so far, of listeners' motion, frame by frame.
 

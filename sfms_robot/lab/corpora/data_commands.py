@@ -62,7 +62,11 @@ def _split(
         dataset = scanned(layout, place, split, order, progress)
     except ConfigError as error:
         broken = Problem("unreadable", str(place), str(error))
-        return _report(Dataset(layout.name, split, layout.space, layout.fps, (), (broken,)), _Tally(), {})
+        return _report(
+            Dataset(layout=layout.name, split=split, space=layout.space, fps=layout.fps, clips=(), problems=(broken,)),
+            _Tally(),
+            {},
+        )
     task = progress.add_task(split, total=len(dataset))
     tally = _Tally()
 
@@ -115,7 +119,7 @@ def _features(dataset: Dataset, task: Any, advance: Callable[[Any], None]) -> tu
     return dict(counts), partly
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Tally:
     """Figures of the clips read so far; channels are summed up in float64."""
 

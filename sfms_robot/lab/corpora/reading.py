@@ -194,7 +194,9 @@ def dyad(
     if audio is not None and own is not None:
         voices = [speaks(voice, frames, fps) for voice in (audio, own)]
         listening = np.asarray(listening_mask(voices[0], fps, voices[1]), bool)
-    return Dyad(name, audio, speaker, listener, listening, space, fps, mel)
+    return Dyad(
+        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel
+    )
 
 
 def filed_dyad(

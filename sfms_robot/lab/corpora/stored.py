@@ -56,11 +56,13 @@ def scan(place: Path, split: str, order: Order | None) -> Dataset:
             raise ClipError.of("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {first[0][0]}")
         shipped = [key for key in shapes if key.startswith(_FEATURE)]
         features = {key.removeprefix(_FEATURE): partial(_feature, file, key) for key in shipped}
-        return Clip(name, shapes["listening"][0], row, partial(read, file), features)
+        return Clip(name=name, frames=shapes["listening"][0], row=row, read=partial(read, file), features=features)
 
     clips, problems = collect([(row, file.stem) for row, file in enumerate(files)], clip)
     space, fps = first[0] if first else ("arkit58", float(FRAME_HZ))
-    return Dataset("composed", split, space, fps, clips, problems, licence=_licence(place))
+    return Dataset(
+        layout="composed", split=split, space=space, fps=fps, clips=clips, problems=problems, licence=_licence(place)
+    )
 
 
 def _licence(place: Path) -> str | None:
@@ -87,6 +89,6 @@ def _feature(file: Path, key: str) -> Floats:
 
 
 LAYOUT: Final = Layout(
-    "composed", "dyads of sfms-robot: {train,validation,test}/NAME.npz", "arkit58", float(FRAME_HZ), None,
-    root, splits, scan,
+    name="composed", about="dyads of sfms-robot: {train,validation,test}/NAME.npz", space="arkit58",
+    fps=float(FRAME_HZ), order=None, root=root, splits=splits, scan=scan,
 )  # fmt: skip

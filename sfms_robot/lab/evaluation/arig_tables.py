@@ -185,7 +185,7 @@ def _ablated(number: int, data: Path, options: AblationOptions) -> dict[str, Pat
     if options.models is None:
         raise ConfigError(f"--table arig-{number}: needs --models DIR, where its listeners are trained and kept")
     file = options.training or training_file("arig")
-    base = train_settings(TrainOptions(file, data, options.models, steps=options.steps))
+    base = train_settings(TrainOptions(file=file, data=data, out=options.models, steps=options.steps))
     if not isinstance(base, config.ArigTraining):
         raise ConfigError(f"{file}: listener.kind is not arig")
     folders = {}
@@ -200,7 +200,7 @@ def _ablated(number: int, data: Path, options: AblationOptions) -> dict[str, Pat
             settings = parse_training(raw, file)
             assert isinstance(settings, config.ArigTraining)
             begun = checkpoint_file(out, "arig").is_file()
-            with run_of(TrainOptions(file, data, out, resume=begun, tensorboard=False)) as run:
+            with run_of(TrainOptions(file=file, data=data, out=out, resume=begun, tensorboard=False)) as run:
                 train_arig(settings, data, out, run)
     return folders
 
@@ -223,7 +223,7 @@ def as_written(
     def options(job: str) -> TrainOptions:
         begun = checkpoint_file(out, job).is_file()
         return TrainOptions(
-            training_file(kind), data, out, resume=begun, steps=steps, tensorboard=False,
+            file=training_file(kind), data=data, out=out, resume=begun, steps=steps, tensorboard=False,
             order=order if kind == "sfms" else None,
         )  # fmt: skip
 

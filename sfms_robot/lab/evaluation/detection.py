@@ -242,7 +242,7 @@ def busy_minute(rng: np.random.Generator) -> Score:
 
     looks = [(start, end, str(rng.choice(["down", "away", "side A", "screen"]))) for start, end in spans(5, 0.5, 3)]
     return Score(
-        60 * FRAME_HZ,
+        frames=60 * FRAME_HZ,
         nods=spans(5, 0.3, 2),
         shakes=spans(60, 0.5, 1.5),
         tilts=spans(40, 0.5, 2),

@@ -141,7 +141,7 @@ def listener_meeting(
     rng: np.random.Generator,
 ) -> ListenerMeeting:
     """Compose the annotated time: one voice and face for all others, one voice for the listener."""
-    whole = Stretch(person, 0.0, FRAME_S * int(person.until_s * FRAME_HZ))
+    whole = Stretch(person=person, start_s=0.0, end_s=FRAME_S * int(person.until_s * FRAME_HZ))
     voice = cast(voices, rng)
     own, said = own_voice(voices, voice, rng), None
     if own is not None:

@@ -106,7 +106,7 @@ def _unwatched(report: object) -> None:
 
 
 def _train(task: _TrainingTask, watch: Watch) -> None:
-    run = Run(task.resume, device_of(task.device), watch)
+    run = Run(resume=task.resume, device=device_of(task.device), watch=watch)
     train(task.name, task.recipe, task.takes, task.out, run, task.watched)
 
 

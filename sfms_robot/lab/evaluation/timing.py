@@ -245,7 +245,7 @@ def table_rates(people: Sequence[MeetingPerson]) -> Doubles:
     """Return nods per minute (CELLS,) over the whole annotated time of all people."""
     parts = []
     for person in people:
-        whole = Stretch(person, 0.0, person.until_s)
+        whole = Stretch(person=person, start_s=0.0, end_s=person.until_s)
         others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
         listening = phrase_timing.listening_mask(others, FRAME_HZ, own) & ~unseen
         parts.append(cell_counts(cells(phase.times(others)), frames_before(person.nods[:, 0], len(others)), listening))

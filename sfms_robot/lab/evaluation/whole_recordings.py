@@ -198,7 +198,7 @@ def _swings_in(values: Doubles) -> Doubles:
 
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
     """Return the scene that `sense` sees in a recording; `heard_in` makes its rows of that."""
-    memory = SenseMemory(addressed)
+    memory = SenseMemory(addressed=addressed)
     speaks, looks = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan)
     nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
     first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then

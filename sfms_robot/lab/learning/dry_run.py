@@ -111,7 +111,15 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
         motion, face = (rng.normal(rest, 0.05, (frames, len(rest))).astype(np.float32) for _ in range(2))
         voice, own = (rng.normal(0, 0.05, samples_of(frames, FRAME_HZ)).astype(np.float32) for _ in range(2))
         sizes = {"wav2vec2": 768, "agent_wav2vec2": 768, "mfcc78": 78}
-        made = Dyad(f"made up {index}", voice, face, motion, np.ones(frames, bool), name, agent_audio=own)
+        made = Dyad(
+            name=f"made up {index}",
+            audio=voice,
+            speaker=face,
+            listener=motion,
+            listening=np.ones(frames, bool),
+            space=name,
+            agent_audio=own,
+        )
         events = tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS))
         found.append(
             replace(

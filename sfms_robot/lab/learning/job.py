@@ -49,7 +49,7 @@ from sfms_robot.lab.learning.staged_frames import Scratch
 LossOf = Callable[[int, torch.Generator, int], Tensor]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Job:
     """One phase of training; see the module's text.
 
@@ -75,7 +75,7 @@ class Job:
         return next(self.model.parameters()).device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Position:
     """Where a run stands after `step` steps. `loss` is smoothed; `worse` counts looks since the best held-out loss."""
 
@@ -88,7 +88,7 @@ class Position:
     finished: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """Report to a watcher after every step. `position.held_out` is new when `looked`."""
 
@@ -106,7 +106,7 @@ def unwatched(report: Report) -> None:
     """Shows nothing to anybody."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Run:
     """Settings of running a job that do not change its weights.
 
@@ -130,7 +130,7 @@ class Run:
         return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainingOutcome:
     """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
     holds.

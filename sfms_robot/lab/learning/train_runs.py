@@ -31,7 +31,7 @@ from sfms_robot.listeners import checkpoint
 DEVICES = ("auto", "cpu", "cuda")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """Options of the command line. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
 
@@ -146,7 +146,14 @@ def run_of(options: TrainOptions) -> Iterator[Run]:
             watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
         if group.first:
             watches.append(stack.enter_context(progress_bar()))
-        yield Run(options.resume, device, together(watches), group, options.accumulate, options.scratch)
+        yield Run(
+            resume=options.resume,
+            device=device,
+            watch=together(watches),
+            group=group,
+            accumulate=options.accumulate,
+            scratch=options.scratch,
+        )
 
 
 def _timed(figures: dict[str, Any], began_s: float) -> dict[str, Any]:

@@ -88,7 +88,18 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             now_s = clock()
             frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
             before_s = now_s
-            run.watch(Report(job.name, job.phase.steps, position, loss, norm, rate, frames_per_s, looked))
+            run.watch(
+                Report(
+                    name=job.name,
+                    steps=job.phase.steps,
+                    position=position,
+                    loss=loss,
+                    gradient_norm=norm,
+                    learning_rate=rate,
+                    frames_per_s=frames_per_s,
+                    looked=looked,
+                )
+            )
             interrupted = interrupted or (group.size == 1 and pressed())
             if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
                 resume.save(file, job, position, generator, best)
@@ -100,13 +111,18 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
                 )
     if best is not None:
         job.model.load_state_dict(best)
+    return _outcome(job, position, best is not None, began_at if run.resume else None)
+
+
+def _outcome(job: Job, position: Position, restored: bool, resumed_at: int | None) -> TrainingOutcome:
+    """Return the result of a run; `restored`: the model holds the weights of its best held-out loss."""
     return TrainingOutcome(
         loss=math.nan if position.loss is None else position.loss,
         held_out=position.best,
         steps=position.step,
-        best_step=position.best_step if best is not None else position.step,
+        best_step=position.best_step if restored else position.step,
         stopped="steps" if position.step == job.phase.steps else "patience",
-        resumed_at=began_at if run.resume else None,
+        resumed_at=resumed_at,
     )
 
 

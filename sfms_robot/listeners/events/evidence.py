@@ -70,7 +70,7 @@ MINE: Final = 0
 NOBODY: Final = -1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Instant:
     """One frame of a conversation of P people, oneself the first.
 
@@ -86,7 +86,7 @@ class Instant:
     smiles: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Hearing:
     """The memory of a stream of the others.
 
@@ -118,7 +118,7 @@ class Hearing:
 
 def hearing(people: int = 2) -> Hearing:
     """Return the memory at the beginning of a conversation of so many, oneself among them."""
-    return Hearing(0, SpeechPhase(), (SpeechPhase(),) * people, (-math.inf,) * people)
+    return Hearing(frame=0, voices=SpeechPhase(), each=(SpeechPhase(),) * people, spoke=(-math.inf,) * people)
 
 
 def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
@@ -142,10 +142,10 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
     if any(look == 1 for look in counts):
         looked = now if before.looked is None else before.looked
     after = Hearing(
-        now + 1, voices, each, spoke, holder, held, looked,
-        now if instant.laughs else before.laughed,
-        now if instant.nods else before.nodded,
-        now if instant.smiles else before.smiled,
+        frame=now + 1, voices=voices, each=each, spoke=spoke, holder=holder, held=held, looked=looked,
+        laughed=now if instant.laughs else before.laughed,
+        nodded=now if instant.nods else before.nodded,
+        smiled=now if instant.smiles else before.smiled,
     )  # fmt: skip
     phrase_s, silence_s, last_s = voices.times_s
     another = holder > MINE
@@ -251,7 +251,7 @@ class Signs:
     mouth_moves: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FaceState:
     """The memory of a face.
 
@@ -340,7 +340,7 @@ LOST_FRAMES: Final = 25  # after so many without a face the look is unknown
 _KEPT: Final = math.exp(-FRAME_S / LOOK_S)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SenseMemory:
     """The memory of the person.
 
@@ -384,7 +384,13 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
     looked, watching = looks_at_head(speaker, memory)
     talks = signs.mouth_moves if deaf else ear.active
     nods = signs.nods and not talks and not memory.hearing.voices.speech
-    instant = Instant((sounds(speaker.agent_audio), talks), (math.nan, looked), signs.laughs, nods, signs.smiles)
+    instant = Instant(
+        speaks=(sounds(speaker.agent_audio), talks),
+        looks=(math.nan, looked),
+        laughs=signs.laughs,
+        nods=nods,
+        smiles=signs.smiles,
+    )
     heard, remembered = hear(instant, memory.hearing)
     frame = round(speaker.time_s / FRAME_S) - 1
     return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, face=face, hearing=remembered)

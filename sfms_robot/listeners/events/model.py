@@ -131,7 +131,7 @@ def load_tables(file: Path | None = None) -> EventTables:
     return load(EventTables, data_dir("sim") / "listeners" / FILE if file is None else file)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _CurveKnots:
     """All knots of all curves of all kinds, one after the other (K,), and numbers as curves of one knot.
 
@@ -198,8 +198,8 @@ def _flat(hazards: Mapping[str, Hazard]) -> _CurveKnots:
             rows += _curve(AT[name], weight)
     column, weights, left, left_slope, right, right_slope, number = np.array(rows, np.float64).T
     return _CurveKnots(
-        column.astype(np.int64), weights, left, left_slope, right, right_slope, number.astype(bool),
-        np.array(first), np.array(kind),
+        column=column.astype(np.int64), weight=weights, left=left, left_slope=left_slope, right=right,
+        right_slope=right_slope, number=number.astype(bool), first=np.array(first), kind=np.array(kind),
     )  # fmt: skip
 
 
@@ -295,7 +295,7 @@ class EventModel:
     def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
         """Return the memory of a new stream."""
         asked = calmness or Calmness()
-        return EventMemory(SenseMemory(asked.addressed), DecideMemory(seed, asked))
+        return EventMemory(SenseMemory(addressed=asked.addressed), DecideMemory(seed, asked))
 
     def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
         """Return the memory with other rates from now on."""

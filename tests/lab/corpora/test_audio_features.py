@@ -13,7 +13,7 @@ def counting(calls: list[int], version: str = "1") -> Feature:
         calls.append(len(samples))
         return samples[: len(samples) // 640 * 640].reshape(-1, 640)[:, :3]
 
-    return Feature("three", version, 3, 25, compute)
+    return Feature(name="three", version=version, dim=3, fps=25, compute=compute)
 
 
 def test_same_sound_is_computed_once_and_read_back_exactly(tmp_path):

@@ -31,7 +31,7 @@ UNTIL_S = 240.0
 
 
 def score(seconds, **events):
-    return Score(int(seconds * FRAME_HZ), **events)
+    return Score(frames=int(seconds * FRAME_HZ), **events)
 
 
 def busy(seconds=60.0):
@@ -129,7 +129,9 @@ def test_everything_is_used_once_where_enough_is_asked_for(tables):
 
 
 def test_those_who_are_spoken_to_are_drawn_more_often(tables):
-    found = [composed.Stretch(None, 0.0, 40.0, addressed=share) for share in np.repeat([0.0, 1.0], 100)]
+    found = [
+        composed.Stretch(person=None, start_s=0.0, end_s=40.0, addressed=share) for share in np.repeat([0.0, 1.0], 100)
+    ]
     drawn = composed.choose(found, 40.0, np.random.default_rng(0))
     assert np.mean([one.addressed for one in drawn]) > 0.65
 
@@ -224,7 +226,7 @@ def test_attention_is_what_was_annotated_and_unknown_where_nobody_is_seen(tables
         unseen = np.isnan(dyad.speaker).any(axis=1)
         assert np.isnan(dyad.attention[unseen]).all()
         if agent == "B":
-            stretch = composed.Stretch(people[meeting, "B"], 24.0, 48.0)
+            stretch = composed.Stretch(person=people[meeting, "B"], start_s=24.0, end_s=48.0)
             told = composed.attention_of(stretch)
             assert (told[1 * 25 : 5 * 25] == 1).all() and (told[7 * 25 : 11 * 25] == 0).all()
 
@@ -232,14 +234,14 @@ def test_attention_is_what_was_annotated_and_unknown_where_nobody_is_seen(tables
 def test_attention_is_unknown_where_nobody_annotated_gaze(tables):
     (folder_person, *_) = [person for person in ami.read_people(tables) if person.agent == "B"]
     blind = replace(folder_person, gaze_known=frozenset(), looked_at=())
-    assert np.isnan(composed.attention_of(composed.Stretch(blind, 20.0, 50.0))).all()
+    assert np.isnan(composed.attention_of(composed.Stretch(person=blind, start_s=20.0, end_s=50.0))).all()
 
 
 def test_the_speaker_smiles_where_people_laughed_and_nods_where_they_nodded(tables, katie, motions):
     (person, *_) = [person for person in ami.read_people(tables) if person.agent == "B"]
     smiles, nods = 0, 0
     for seed in range(12):
-        stretch = composed.Stretch(person, 50.0, 80.0)
+        stretch = composed.Stretch(person=person, start_s=50.0, end_s=80.0)
         _, face = composed.speaker_of(stretch, katie, motions["train"], np.random.default_rng(seed))
         if np.isnan(face).any():
             continue

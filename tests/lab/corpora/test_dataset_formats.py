@@ -35,7 +35,10 @@ def composed(root: Path) -> Path:
 def plain(name: str, frames: int = 60, **more) -> Dyad:
     motion = write.RNG.uniform(0, 0.5, (frames, 58)).astype(np.float32)
     audio = write.RNG.normal(0, 0.1, frames * 640).astype(np.float32).clip(-1, 1)
-    return replace(Dyad(name, audio, motion, motion[::-1].copy(), np.ones(frames, bool)), **more)
+    return replace(
+        Dyad(name=name, audio=audio, speaker=motion, listener=motion[::-1].copy(), listening=np.ones(frames, bool)),
+        **more,
+    )
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {

@@ -20,7 +20,18 @@ RNG = np.random.default_rng(0)
 def dyad(frames: int = 20, space: str = "arkit58", fps: float = 25.0, **more) -> Dyad:
     motion = RNG.uniform(0, 0.5, (frames, WIDTHS[space])).astype(np.float32)
     audio = RNG.uniform(-0.5, 0.5, samples_of(frames, fps)).astype(np.float32)
-    return replace(Dyad("a", audio, motion, motion[::-1].copy(), np.ones(frames, bool), space, fps), **more)
+    return replace(
+        Dyad(
+            name="a",
+            audio=audio,
+            speaker=motion,
+            listener=motion[::-1].copy(),
+            listening=np.ones(frames, bool),
+            space=space,
+            fps=fps,
+        ),
+        **more,
+    )
 
 
 @pytest.mark.parametrize("space", WIDTHS)
@@ -107,9 +118,11 @@ def lazy(*dyads: Dyad | Exception) -> tuple[Dataset, list[int]]:
                 raise one
             return one
 
-        return Clip(f"clip{index}", 20, index, reader)
+        return Clip(name=f"clip{index}", frames=20, row=index, read=reader)
 
-    return Dataset("l2l", "train", "arkit58", 25.0, tuple(clip(i, one) for i, one in enumerate(dyads))), read
+    return Dataset(
+        layout="l2l", split="train", space="arkit58", fps=25.0, clips=tuple(clip(i, one) for i, one in enumerate(dyads))
+    ), read
 
 
 def test_nothing_is_read_before_it_is_asked_for():

@@ -28,8 +28,8 @@ def dyad(frames: int, fps: float, space: str = "arkit58", mel: bool = False) -> 
     if mel:
         rows = np.repeat(np.where(ends_s < ends_s[-1] / 2, -5.0, -20.0), 4)[:, None] * np.ones(128)
     return Dyad(
-        "one", None if mel else audio, motion.copy(), motion, ends_s < 1.0, space, fps,
-        None if rows is None else rows.astype(np.float32),
+        name="one", audio=None if mel else audio, speaker=motion.copy(), listener=motion, listening=ends_s < 1.0,
+        space=space, fps=fps, mel=None if rows is None else rows.astype(np.float32),
     )  # fmt: skip
 
 

@@ -21,7 +21,8 @@ def person():
     a = [(start, start + 3.0, "A") for start in starts]
     c = [(start + 1.0, start + 1.5, "C") for start in starts[::4]]
     return MeetingPerson(
-        "M1a", "B", "MEE1", 120.0, nods=np.stack([starts + 3.2, starts + 4.0], axis=1), shakes=NONE, tilts=NONE,
+        meeting="M1a", agent="B", participant="MEE1", until_s=120.0, nods=np.stack([starts + 3.2, starts + 4.0],
+        axis=1), shakes=NONE, tilts=NONE,
         unseen=np.array([[100.0, 110.0]]), gaze=((2.0, 40.0, "A"), (40.0, 50.0, "table"), (50.0, 120.0, "A")),
         laughs=np.array([[50.0, 51.0]]), talk=np.array([[80.0, 82.0]]), backchannels=NONE,
         others=phrases((start, end) for start, end, _ in (*a, *c)), floor=tuple(sorted(a + c)), others_laughs=NONE,

@@ -42,7 +42,7 @@ def dyad(frames: int = 60) -> Dyad:
     audio[20 * FRAME_SAMPLES : 35 * FRAME_SAMPLES] = 0  # a pause
     speaker = rng.uniform(0, 0.3, (frames, 58)).astype(np.float32)
     speaker[7:12] = np.nan
-    return Dyad("a", audio, speaker, motion, np.ones(frames, bool))
+    return Dyad(name="a", audio=audio, speaker=speaker, listener=motion, listening=np.ones(frames, bool))
 
 
 def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:

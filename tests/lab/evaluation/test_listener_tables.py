@@ -57,7 +57,9 @@ def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> 
         audio, rows = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32), None
     else:  # as L2L comes: mel rows and no waveform
         audio, rows = None, rng.normal(-5, 1, (4 * frames, 128)).astype(np.float32)
-    return Dyad(name, audio, speaker, motion, np.ones(frames, bool), space, mel=rows)
+    return Dyad(
+        name=name, audio=audio, speaker=speaker, listener=motion, listening=np.ones(frames, bool), space=space, mel=rows
+    )
 
 
 @pytest.mark.parametrize("changes", [{}, {"hop": 1}, {"phase": False, "sequential": False}, {"audio": "mfcc78"}])
@@ -134,9 +136,11 @@ def test_clips_are_cut_one_behind_the_other():
 
 def test_some_dyads_are_spread_over_all():
     one = dyad("one", 60)
-    clips = tuple(Clip(str(row), 60, row, lambda row=row: replace(one, name=str(row))) for row in range(10))
-    clips = (*clips[:3], Clip("broken", 60, 3, lambda: open("gone")), *clips[4:])
-    whole = Dataset("composed", "train", "arkit58", 25.0, clips)
+    clips = tuple(
+        Clip(name=str(row), frames=60, row=row, read=lambda row=row: replace(one, name=str(row))) for row in range(10)
+    )
+    clips = (*clips[:3], Clip(name="broken", frames=60, row=3, read=lambda: open("gone")), *clips[4:])
+    whole = Dataset(layout="composed", split="train", space="arkit58", fps=25.0, clips=clips)
     assert [each.name for each in spread_clips(whole, 4)] == ["0", "2", "5", "7"]
     assert [each.name for each in spread_clips(whole, None)] == [*"012456789"], "what cannot be read is left out"
     with pytest.raises(ConfigError, match="none of 1 clips can be read"):

@@ -72,7 +72,10 @@ def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
     draw, frames = np.random.default_rng(0), 60
     speaker, listener = draw.uniform(0, 0.4, (2, frames, 58)).astype(np.float32)
     audio = draw.normal(0, 0.1, frames * 640).astype(np.float32).clip(-1, 1)
-    clips.save(tmp_path / "data" / "test", [Dyad("one", audio, speaker, listener, np.ones(frames, bool))])
+    clips.save(
+        tmp_path / "data" / "test",
+        [Dyad(name="one", audio=audio, speaker=speaker, listener=listener, listening=np.ones(frames, bool))],
+    )
     options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5)
     made = prepare(options)
     shown = {

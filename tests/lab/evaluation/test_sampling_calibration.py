@@ -29,7 +29,7 @@ def dyad(frames: int = 200, nods: int = 4) -> Dyad:
         at = 15 + nod * 47
         motion[at : at + 26, CHANNEL_INDEX["pitch"]] = 0.1 * (0.5 - 0.5 * np.cos(np.linspace(0, 4 * np.pi, 26)))
     audio = np.random.default_rng(0).normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    return Dyad("a", audio, motion * 0, motion, np.ones(frames, bool))
+    return Dyad(name="a", audio=audio, speaker=motion * 0, listener=motion, listening=np.ones(frames, bool))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,9 @@ def nodding(sizes_rad) -> Dyad:
         nods.append(ListenerEvent("nod", at * 0.04, 1.6, float(size), swings=2))
     frames = len(motion)
     audio = np.random.default_rng(0).normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    return Dyad("a", audio, motion * 0, motion, np.ones(frames, bool), events=tuple(nods))
+    return Dyad(
+        name="a", audio=audio, speaker=motion * 0, listener=motion, listening=np.ones(frames, bool), events=tuple(nods)
+    )
 
 
 def told_settings(**changes) -> config.Sfms:
@@ -102,7 +104,14 @@ def smiling(count: int) -> Dyad:
         smiles.append(event)
     frames = len(motion)
     silence = np.zeros(frames * FRAME_SAMPLES, np.float32)
-    return Dyad("a", silence, motion * 0, motion, np.ones(frames, bool), events=tuple(smiles))
+    return Dyad(
+        name="a",
+        audio=silence,
+        speaker=motion * 0,
+        listener=motion,
+        listening=np.ones(frames, bool),
+        events=tuple(smiles),
+    )
 
 
 def test_the_course_of_smiles_is_found_at_every_size():

@@ -73,7 +73,15 @@ def dyad(name: str = "a", frames: int = 500, seed: int = 0) -> Dyad:
         events.append(event)
     audio = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
     listening = np.ones(frames, bool)
-    return Dyad(name, audio, motion * 0, motion, listening, events=tuple(events), head_of_gaze_rad=head)
+    return Dyad(
+        name=name,
+        audio=audio,
+        speaker=motion * 0,
+        listener=motion,
+        listening=listening,
+        events=tuple(events),
+        head_of_gaze_rad=head,
+    )
 
 
 def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them():

@@ -59,7 +59,7 @@ def dyad(name: str, frames: int = 300, seed: int = 0) -> Dyad:
     speaker = motion[::-1].copy()
     speaker[frames // 2 :] = np.nan
     audio = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    return Dyad(name, audio, speaker, motion, np.ones(frames, bool))
+    return Dyad(name=name, audio=audio, speaker=speaker, listener=motion, listening=np.ones(frames, bool))
 
 
 @pytest.fixture(scope="module")

@@ -48,8 +48,8 @@ def streamed(one):
     state, rows = hearing(one.speaks.shape[1]), []
     for index in range(len(one.speaks)):
         instant = Instant(
-            tuple(one.speaks[index].tolist()), tuple(one.looks[index].tolist()),
-            bool(one.laughs[index]), bool(one.nods[index]), bool(one.smiles[index]),
+            speaks=tuple(one.speaks[index].tolist()), looks=tuple(one.looks[index].tolist()),
+            laughs=bool(one.laughs[index]), nods=bool(one.nods[index]), smiles=bool(one.smiles[index]),
         )  # fmt: skip
         row, state = hear(instant, state)
         rows.append(row)
@@ -71,8 +71,8 @@ def test_what_comes_later_changes_nothing_before(seed, at):
 
 def test_a_step_leaves_what_it_was_given():
     state = hearing()
-    first, _ = hear(Instant((False, True), (math.nan, 1.0)), state)
-    again, _ = hear(Instant((False, True), (math.nan, 1.0)), state)
+    first, _ = hear(Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
+    again, _ = hear(Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
     assert state == hearing()
     np.testing.assert_array_equal(first, again)
 

@@ -30,7 +30,9 @@ def dyad(frames: int = 60, events=(NOD, SMILE)) -> Dyad:
     rng = np.random.default_rng(0)
     audio = rng.normal(0, 0.1, frames * FRAME_SAMPLES).astype(np.float32)
     faces = rng.uniform(0, 0.3, (2, frames, 58)).astype(np.float32)
-    return Dyad("a", audio, faces[0], faces[1], np.ones(frames, bool), events=events)
+    return Dyad(
+        name="a", audio=audio, speaker=faces[0], listener=faces[1], listening=np.ones(frames, bool), events=events
+    )
 
 
 @pytest.mark.parametrize("hop", [1, 2, 4, 8])

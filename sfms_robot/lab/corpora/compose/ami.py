@@ -34,7 +34,7 @@ _Rows = dict[str, list[str]]
 _Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MeetingPerson:
     """One participant of one meeting, as a listener to all the others.
 
@@ -99,10 +99,10 @@ def read_people(folder: Path) -> list[MeetingPerson]:
         key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
         people.append(
             MeetingPerson(
-                meeting,
-                agent,
-                participant,
-                float(until),
+                meeting=meeting,
+                agent=agent,
+                participant=participant,
+                until_s=float(until),
                 nods=_pick(gestures[key], NODS),
                 shakes=_pick(gestures[key], ("discord_signal shake", "negative_signal shake")),
                 tilts=_pick(gestures[key], ("other_comm_head ",)),

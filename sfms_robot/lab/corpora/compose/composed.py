@@ -73,7 +73,7 @@ _WEIGHTS: Final = (
 _FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stretch:
     """A piece of a meeting in which a person mostly listens.
 
@@ -108,7 +108,7 @@ class Stretch:
         return f"{self.person.meeting}_{self.person.agent}_{int(self.start_s):04d}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Material:
     """Recordings and annotations that the dyads of one split are made of."""
 
@@ -124,7 +124,12 @@ def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Spli
     people = split_series(read_people(ami))
     spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), read_motions(motions)
     dwell = learn_dwell(people["train"])
-    return {split: Material(people[split], spoken[split], laughter[split], moves[split], dwell) for split in SPLITS}
+    return {
+        split: Material(
+            people=people[split], voices=spoken[split], laughter=laughter[split], motions=moves[split], dwell=dwell
+        )
+        for split in SPLITS
+    }
 
 
 def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[Split, list[Dyad]]:
@@ -253,7 +258,7 @@ def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: 
         at = float(rng.uniform(0, LENGTH_S[0]))
         while at + LENGTH_S[1] < person.until_s:
             length = FRAME_S * round(float(rng.uniform(*LENGTH_S)) * FRAME_HZ)
-            piece = Stretch(person, at, at + length)
+            piece = Stretch(person=person, start_s=at, end_s=at + length)
             at += length
             own, others = (active(spans, piece) for spans in (person.talk, person.others))
             listening = listening_mask(others, FRAME_HZ, own)
@@ -306,7 +311,7 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     others, own = active(person.others, stretch), active(person.talk, stretch)
     said, mouth = _own_words(stretch, own_voice(material.voices, voice, rng), rng.spawn(1)[0])
     score = Score(
-        frames,
+        frames=frames,
         nods=within(person.nods, stretch),
         shakes=within(person.shakes, stretch),
         tilts=within(person.tilts, stretch),
@@ -331,11 +336,11 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     acted = act(score, material.motions, rng)
     faced = np.isfinite(face).all(axis=1)
     return Dyad(
-        stretch.name,
-        audio,
-        face,
-        acted.motion,
-        listening_mask(others, FRAME_HZ, own),
+        name=stretch.name,
+        audio=audio,
+        speaker=face,
+        listener=acted.motion,
+        listening=listening_mask(others, FRAME_HZ, own),
         agent_audio=said,
         states=labels.label(feedback),
         events=acted.events,

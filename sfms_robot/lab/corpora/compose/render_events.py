@@ -61,7 +61,7 @@ def _spans() -> Doubles:
     return _nothing(0, 2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Score:
     """Events within `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
 

@@ -54,7 +54,7 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.ra
     said = voice.recording[first * FRAME_SAMPLES : (first + frames) * FRAME_SAMPLES]
     active = voice_activity(said)
     score = Score(
-        frames,
+        frames=frames,
         talk=np.array(runs(active), np.float64).reshape(-1, 2) * FRAME_S,
         gaze=dwell.looks(frames * FRAME_S, rng),
         ends=phrase_ends(active, FRAME_HZ),
@@ -64,11 +64,11 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.ra
     silent = np.zeros(frames, bool)
     heard = np.zeros(len(said), np.float32) if rng.random() < _QUIET else room(len(said), voice, rng)
     return Dyad(
-        name,
-        heard,
-        np.full((frames, MOTION_DIM), np.nan, np.float32),
-        acted.motion,
-        silent,
+        name=name,
+        audio=heard,
+        speaker=np.full((frames, MOTION_DIM), np.nan, np.float32),
+        listener=acted.motion,
+        listening=silent,
         agent_audio=sent(said, rng),
         states=labels.label(labels.of_activity(active, silent)),
         events=acted.events,

@@ -38,7 +38,7 @@ _FADE: Final = AUDIO_HZ // 50
 _LEVEL: Final = 0.06  # RMS of speech
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VoiceClip:
     """One person's speech without its pauses.
 
@@ -146,7 +146,15 @@ def read_voice(file: Path) -> VoiceClip:
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
     loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
     whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
-    return VoiceClip(name, joined, origin, ends, _mouth(file), _pause_spectrum(audio, active), whole)
+    return VoiceClip(
+        name=name,
+        audio=joined,
+        origin=origin,
+        ends=ends,
+        mouth=_mouth(file),
+        noise=_pause_spectrum(audio, active),
+        recording=whole,
+    )
 
 
 def _levelled(speech: Floats) -> Floats:

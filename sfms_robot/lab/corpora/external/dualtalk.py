@@ -140,14 +140,24 @@ def _scanned(layout: str, split: str, voices: Path, folder: Path, kind: Faces) -
         frames = frames_of(name, *(kind.frames(file) for file in faces if file.is_file()))
         if sounds and not sounds[0].is_file():
             raise ClipError.of("missing sound", sounds[0], "no such file")
-        return Clip(name, frames, row, partial(_read, name, faces, sounds, frames, kind))
+        return Clip(name=name, frames=frames, row=row, read=partial(_read, name, faces, sounds, frames, kind))
 
     faced = [f"{chat}_{person}" for chat in chats for person in PEOPLE]
     if split in (DEMO, "."):  # one face a clip: the other direction is not missing, nobody made it
         faced = [stem for stem in faced if (folder / f"{stem}{kind.ending}").is_file()]
     clips, problems = collect(list(enumerate(faced)), clip)
     notes = () if voiced else (f"{voices}: no .wav files: these clips have no sound",)
-    return Dataset(layout, split, kind.space, FPS, clips, tuple(dict.fromkeys(problems)), notes, (), LICENCE)
+    return Dataset(
+        layout=layout,
+        split=split,
+        space=kind.space,
+        fps=FPS,
+        clips=clips,
+        problems=tuple(dict.fromkeys(problems)),
+        notes=notes,
+        features=(),
+        licence=LICENCE,
+    )
 
 
 def _read(name: str, faces: Sequence[Path], sounds: Sequence[Path], frames: int, kind: Faces) -> Dyad:
@@ -158,10 +168,11 @@ def _read(name: str, faces: Sequence[Path], sounds: Sequence[Path], frames: int,
 
 
 LAYOUT: Final = Layout(
-    "dualtalk", "DualTalk: {train,test,ood,demo}/<id>_speaker{1,2}.{wav,npz}", "deca56", FPS, None, root, splits, scan,
-    held_out=0.1,
+    name="dualtalk", about="DualTalk: {train,test,ood,demo}/<id>_speaker{1,2}.{wav,npz}", space="deca56", fps=FPS,
+    order=None, root=root, splits=splits, scan=scan, held_out=0.1,
 )  # fmt: skip
 ARKIT_LAYOUT: Final = Layout(
-    "dualtalk_arkit", "DualTalk in ARKit's shapes: ARKit_npy/{train,test,ood}/<id>_speaker{1,2}.npy beside its .wav",
-    "arkit58", FPS, None, arkit_root, arkit_splits, arkit_scan, held_out=0.1,
+    name="dualtalk_arkit",
+    about="DualTalk in ARKit's shapes: ARKit_npy/{train,test,ood}/<id>_speaker{1,2}.npy beside its .wav",
+    space="arkit58", fps=FPS, order=None, root=arkit_root, splits=arkit_splits, scan=arkit_scan, held_out=0.1,
 )  # fmt: skip

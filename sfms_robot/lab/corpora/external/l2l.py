@@ -68,7 +68,15 @@ def scan(place: Path, split: str, order: Order | None) -> Dataset:
                 clips += _direction(subject.name, folder, order == "pose-first", len(clips), notes)
             except ClipError as error:
                 problems.append(error.problem)
-    return Dataset("l2l", split, "deca56", FPS, tuple(clips), tuple(problems), tuple(notes))
+    return Dataset(
+        layout="l2l",
+        split=split,
+        space="deca56",
+        fps=FPS,
+        clips=tuple(clips),
+        problems=tuple(problems),
+        notes=tuple(notes),
+    )
 
 
 def _direction(subject: str, folder: Path, pose_first: bool, row: int, notes: list[str]) -> list[Clip]:
@@ -96,10 +104,11 @@ def _direction(subject: str, folder: Path, pose_first: bool, row: int, notes: li
         decibels = bool(count) and float(np.nanmin(npy(sound)[:: max(1, count // 32)])) < 0
     return [
         Clip(
-            f"{subject}_{folder.name}_p{host}_{index:05d}",
-            frames,
-            row + index,
-            partial(_read, f"{subject}_{folder.name}_p{host}_{index:05d}", speaker, listener, sound, index, pose_first,
+            name=f"{subject}_{folder.name}_p{host}_{index:05d}",
+            frames=frames,
+            row=row + index,
+            read=partial(_read, f"{subject}_{folder.name}_p{host}_{index:05d}", speaker, listener, sound, index,
+            pose_first,
                     decibels),
         )
         for index in range(count)
@@ -135,8 +144,8 @@ def smoothed(clip: Dyad) -> Dyad:
 
 
 LAYOUT: Final = Layout(
-    "l2l", "Learning2Listen: {subject}/{train,test}/p{0,1}_*_clean_deca.npy", "deca56", FPS, "exp-first",
-    root, splits, scan, held_out=0.3,
+    name="l2l", about="Learning2Listen: {subject}/{train,test}/p{0,1}_*_clean_deca.npy", space="deca56", fps=FPS,
+    order="exp-first", root=root, splits=splits, scan=scan, held_out=0.3,
 )  # fmt: skip
 
 
@@ -195,7 +204,9 @@ def lm_scan(place: Path, split: str, order: Order | None) -> Dataset:
                 clips.append(_clip(name, len(clips) + len(problems), segment))
             except ClipError as error:
                 problems.append(error.problem)
-    return Dataset("lm_listener", split, "deca56", FPS, tuple(clips), tuple(problems))
+    return Dataset(
+        layout="lm_listener", split=split, space="deca56", fps=FPS, clips=tuple(clips), problems=tuple(problems)
+    )
 
 
 def _clip(name: str, row: int, segment: Any) -> Clip:
@@ -210,7 +221,13 @@ def _clip(name: str, row: int, segment: Any) -> Clip:
     if "hubert_feat" in segment:
         rows = guarded(name, lambda: np.asarray(numbers(segment, "hubert_feat"), np.float32))
         features["hubert"] = partial(track, f"{name} hubert_feat", rows, frames, rows.shape[-1])
-    return Clip(name, frames, row, partial(_lm_read, name, frames, faces[SPEAKER], faces[LISTENER]), features)
+    return Clip(
+        name=name,
+        frames=frames,
+        row=row,
+        read=partial(_lm_read, name, frames, faces[SPEAKER], faces[LISTENER]),
+        features=features,
+    )
 
 
 def _face(segment: Mapping[str, Any], who: str) -> Floats:
@@ -231,6 +248,6 @@ def _lm_read(name: str, frames: int, speaker: Floats, listener: Floats) -> Dyad:
 
 
 LM_LISTENER_LAYOUT: Final = Layout(
-    "lm_listener", "lm-listener: {subject}/segments_{train,val,test}.pth", "deca56", FPS, None,
-    lm_root, lm_splits, lm_scan, features=("hubert",),
+    name="lm_listener", about="lm-listener: {subject}/segments_{train,val,test}.pth", space="deca56", fps=FPS,
+    order=None, root=lm_root, splits=lm_splits, scan=lm_scan, features=("hubert",),
 )  # fmt: skip

@@ -67,18 +67,26 @@ def scan(place: Path, split: str, order: Order | None) -> Dataset:
             "speaker_attributes": partial(attributes, folder, speaker, frames),
         }
         return Clip(
-            name,
-            frames,
-            row,
-            partial(filed_dyad, name, files, voices, frames, "faceverse58", FPS, order == "pose-first"),
-            features,
+            name=name,
+            frames=frames,
+            row=row,
+            read=partial(filed_dyad, name, files, voices, frames, "faceverse58", FPS, order == "pose-first"),
+            features=features,
         )
 
     clips, problems = collect([(row, listener) for row, (_, listener) in enumerate(pairs)], clip)
     notes = [] if heard else [f"{folder / SOUNDS}: no such folder: these clips have no sound"]
     if not (folder / EMOTIONS).is_dir():
         notes.append(f"{folder / EMOTIONS}: no such folder: no attributes, which the REACT metrics are defined on")
-    return Dataset("react", split, "faceverse58", FPS, clips, _once(problems), tuple(notes))
+    return Dataset(
+        layout="react",
+        split=split,
+        space="faceverse58",
+        fps=FPS,
+        clips=clips,
+        problems=_once(problems),
+        notes=tuple(notes),
+    )
 
 
 def _pairs(file: Path) -> list[tuple[str, str]]:
@@ -135,8 +143,8 @@ def centred(mean: Floats, clip: Dyad) -> Dyad:
 
 
 LAYOUT: Final = Layout(
-    "react", "REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", "faceverse58", FPS, "exp-first",
-    root, splits, scan, features=("attributes", "speaker_attributes"),
+    name="react", about="REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", space="faceverse58", fps=FPS,
+    order="exp-first", root=root, splits=splits, scan=scan, features=("attributes", "speaker_attributes"),
 )  # fmt: skip
 
 
@@ -184,16 +192,24 @@ def react2025_scan(place: Path, split: str, order: Order | None) -> Dataset:
             for feature, (kind, role, width) in FEATURES.items()
         }
         return Clip(
-            name,
-            frames,
-            row,
-            partial(filed_dyad, name, files, voices, frames, "faceverse58", REACT2025_FPS, order == "pose-first"),
-            features,
+            name=name,
+            frames=frames,
+            row=row,
+            read=partial(filed_dyad, name, files, voices, frames, "faceverse58", REACT2025_FPS, order == "pose-first"),
+            features=features,
         )
 
     clips, problems = collect(list(enumerate(names)), clip)
     notes = () if heard else (f"{folder / 'audio'}: no such folder: these clips have no sound",)
-    return Dataset("react2025", split, "faceverse58", REACT2025_FPS, clips, problems, notes)
+    return Dataset(
+        layout="react2025",
+        split=split,
+        space="faceverse58",
+        fps=REACT2025_FPS,
+        clips=clips,
+        problems=problems,
+        notes=notes,
+    )
 
 
 def _feature(file: Path, frames: int, width: int) -> Floats:
@@ -207,7 +223,7 @@ def _feature(file: Path, frames: int, width: int) -> Floats:
 
 
 REACT2025_LAYOUT: Final = Layout(
-    "react2025", "REACT 2025/26: {train,val,test}/coefficients/{speaker,listener}/session{n}/NAME.npy",
-    "faceverse58", REACT2025_FPS, "exp-first",
-    react2025_root, react2025_splits, react2025_scan, features=tuple(FEATURES),
+    name="react2025", about="REACT 2025/26: {train,val,test}/coefficients/{speaker,listener}/session{n}/NAME.npy",
+    space="faceverse58", fps=REACT2025_FPS, order="exp-first",
+    root=react2025_root, splits=react2025_splits, scan=react2025_scan, features=tuple(FEATURES),
 )  # fmt: skip

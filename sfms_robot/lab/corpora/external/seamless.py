@@ -103,7 +103,17 @@ def scan(place: Path, split: str, order: Order | None) -> Dataset:
             seen.late += error.problem.kind in ("time stamps", "lengths differ")
             problems.append(error.problem)
     found = _found(split, files, len(interactions), seen)
-    return Dataset(NAME, split, SPACE, FPS, tuple(clips), tuple(problems), (*found, proof.told()), (), LICENCE)
+    return Dataset(
+        layout=NAME,
+        split=split,
+        space=SPACE,
+        fps=FPS,
+        clips=tuple(clips),
+        problems=tuple(problems),
+        notes=(*found, proof.told()),
+        features=(),
+        licence=LICENCE,
+    )
 
 
 @dataclass
@@ -175,7 +185,7 @@ def _clips(pair: tuple[SeamlessPerson, SeamlessPerson], mirrored: bool, row: int
         for first, end in stretches(listener.valid[:frames]):
             name = f"{listener.name}_f{first:05d}"
             read = partial(_read, name, speaker, listener, first, end - first, mirrored)
-            found.append(Clip(name, end - first, row + len(found), read))
+            found.append(Clip(name=name, frames=end - first, row=row + len(found), read=read))
     return found
 
 
@@ -199,7 +209,16 @@ def _read(
             detail = f"the voice comes {late_s:+.2f} s beside {VAD} of {person.name}"
             raise ClipError.of("time stamps", person.wav, detail)
     listening = np.asarray(listening_mask(speaks[0], FPS, speaks[1]), bool)
-    return Dyad(name, voices[0], faces[0], faces[1], listening, SPACE, FPS, agent_audio=voices[1])
+    return Dyad(
+        name=name,
+        audio=voices[0],
+        speaker=faces[0],
+        listener=faces[1],
+        listening=listening,
+        space=SPACE,
+        fps=FPS,
+        agent_audio=voices[1],
+    )
 
 
 # --- which way numbers point ------------------------------------------------------------------------------------
@@ -310,7 +329,7 @@ _LAGS_S: Final = 2.0  # looked for
 _LAG_GAIN: Final = 0.15  # by which another lag has to agree better
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeamlessPerson:
     """One person's part of an interaction, from headers and flags.
 
@@ -348,7 +367,9 @@ def person_of(name: str, files: Mapping[str, Path]) -> SeamlessPerson:
             raise ClipError.of(kind, somewhere.with_suffix(ending), "no such file")
     prefix = prefix_of(files[".npz"])
     valid = guarded(str(files[".npz"]), lambda: _flags(files[".npz"], prefix))
-    person = SeamlessPerson(name, files[".npz"], files[".wav"], prefix, valid, _speech(files[".json"]))
+    person = SeamlessPerson(
+        name=name, npz=files[".npz"], wav=files[".wav"], prefix=prefix, valid=valid, speech_s=_speech(files[".json"])
+    )
     sound_s = guarded(str(person.wav), lambda: _sound_s(person.wav))
     if abs(sound_s - person.seconds) > SLACK_S:
         detail = f"{sound_s:.2f} s of sound for {person.seconds:.2f} s of face"
@@ -469,6 +490,7 @@ def correlations_of(file: Path) -> dict[str, float] | None:
 
 
 LAYOUT: Final = Layout(
-    NAME, "Seamless Interaction: {improvised,naturalistic}/{train,dev,test}/BATCH/ARCHIVE/V_S_I_P.{wav,json,npz}",
-    SPACE, FPS, None, root, splits, scan,
+    name=NAME,
+    about="Seamless Interaction: {improvised,naturalistic}/{train,dev,test}/BATCH/ARCHIVE/V_S_I_P.{wav,json,npz}",
+    space=SPACE, fps=FPS, order=None, root=root, splits=splits, scan=scan,
 )  # fmt: skip

@@ -81,14 +81,16 @@ def dim_scan(place: Path, split: str, order: Order | None) -> Dataset:
         faces = [_shape(file, arrays, f"video_{role}", WIDTHS["deca56"]) for role in ROLES]
         frames = frames_of(name, *faces)
         read = partial(_dim_read, name, file, frames, order != "exp-first")
-        return Clip(name, frames, row, read, {"hubert": partial(_hubert, file, frames)})
+        return Clip(name=name, frames=frames, row=row, read=read, features={"hubert": partial(_hubert, file, frames)})
 
     clips, problems = collect(list(enumerate(ids)), clip)
     unlisted = sorted({file.stem for file in place.glob("*.pkl")} - set(table))
     notes = [f"{len(unlisted)} files are not in {LIST}: {', '.join(unlisted[:3])}"] if unlisted else []
     if not any((base / LIST).is_file() for base in (place, place.parent)):
         notes.append(f"{place}: no {LIST} there or above: all clips count as train")
-    return Dataset("dim", split, "deca56", FPS, clips, problems, tuple(notes))
+    return Dataset(
+        layout="dim", split=split, space="deca56", fps=FPS, clips=clips, problems=problems, notes=tuple(notes)
+    )
 
 
 def _shape(file: Path, arrays: Any, key: str, width: int) -> tuple[int, ...]:
@@ -115,8 +117,8 @@ def _hubert(file: Path, frames: int) -> Floats:
 
 
 DIM: Final = Layout(
-    "dim", f"DIM's ViCo: vico_processed_30fps/<id>.pkl and {LIST}", "deca56", FPS, "pose-first",
-    dim_root, dim_splits, dim_scan, held_out=0.1, features=("hubert",),
+    name="dim", about=f"DIM's ViCo: vico_processed_30fps/<id>.pkl and {LIST}", space="deca56", fps=FPS,
+    order="pose-first", root=dim_root, splits=dim_splits, scan=dim_scan, held_out=0.1, features=("hubert",),
 )  # fmt: skip
 
 
@@ -158,11 +160,11 @@ def vico_scan(place: Path, split: str, order: Order | None) -> Dataset:
                 raise ClipError.of("missing half", file, "no such file")
         frames = frames_of(name, *(_shape(file, torch_load(file), "angle.exp.trans", width) for file in files))
         features = {"mfcc45": partial(_mfcc45, sounds / f"{name}.npy", frames)}
-        return Clip(name, frames, row, partial(_vico_read, name, files, frames), features)
+        return Clip(name=name, frames=frames, row=row, read=partial(_vico_read, name, files, frames), features=features)
 
     ids = [name for name, theirs in _uuids(place).items() if theirs == split]
     clips, problems = collect(list(enumerate(ids)), clip)
-    return Dataset("vico", split, "deep3d73", FPS, clips, problems)
+    return Dataset(layout="vico", split=split, space="deep3d73", fps=FPS, clips=clips, problems=problems)
 
 
 def _vico_read(name: str, files: list[Path], frames: int) -> Dyad:
@@ -180,6 +182,6 @@ def _mfcc45(file: Path, frames: int) -> Floats:
 
 
 VICO: Final = Layout(
-    "vico", "ViCo challenge baseline: features/{audio_feats,video_feats}", "deep3d73", FPS, None,
-    vico_root, vico_splits, vico_scan, held_out=0.1, features=("mfcc45",),
+    name="vico", about="ViCo challenge baseline: features/{audio_feats,video_feats}", space="deep3d73", fps=FPS,
+    order=None, root=vico_root, splits=vico_splits, scan=vico_scan, held_out=0.1, features=("mfcc45",),
 )  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from sfms_robot.listeners.events.model import STEP_S, EventModel, HazardBank
 STRETCH: Final = 400  # steps looked at together
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Nodding:
     """Counts over the listening time of several people; pairs are (nods, minutes).
 
@@ -105,11 +105,11 @@ def count(one: EventStudent, onsets_s: Doubles) -> Nodding:
     ends = phrase_ends(one.others, FRAME_HZ)
     listened_s = np.cumsum(listening) * STEP_S
     return Nodding(
-        _pair(listening, steps),
-        _pair(spoken_to & looked, steps),
-        _pair(spoken_to & ~looked, steps),
-        phrase_end_counts(onsets_s, ends, one.listening, FRAME_HZ),
-        np.diff(np.sort(listened_s[steps])),
+        listening=_pair(listening, steps),
+        addressed=_pair(spoken_to & looked, steps),
+        bystander=_pair(spoken_to & ~looked, steps),
+        phrase_end=phrase_end_counts(onsets_s, ends, one.listening, FRAME_HZ),
+        intervals_s=np.diff(np.sort(listened_s[steps])),
     )
 
 
@@ -118,15 +118,18 @@ def _pair(mask: Bools, steps: Ints) -> tuple[float, float]:
 
 
 def total(parts: Sequence[Nodding]) -> Nodding:
-    """The sum over people."""
+    """Return the sum over people."""
 
-    def add(name: str) -> tuple[float, ...]:
+    def add(name: str) -> Any:
         return tuple(np.sum([getattr(part, name) for part in parts], axis=0).tolist())
 
     return Nodding(
-        add("listening"), add("addressed"), add("bystander"), add("phrase_end"),  # type: ignore[arg-type]
-        np.concatenate([part.intervals_s for part in parts]),
-    )  # fmt: skip
+        listening=add("listening"),
+        addressed=add("addressed"),
+        bystander=add("bystander"),
+        phrase_end=add("phrase_end"),
+        intervals_s=np.concatenate([part.intervals_s for part in parts]),
+    )
 
 
 def figures(found: Nodding) -> dict[str, float]:

@@ -91,7 +91,7 @@ GROUPS: Final[Mapping[str, Groups]] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EventStudent:
     """Training rows of one person in one meeting: M steps of 80 ms.
 
@@ -124,11 +124,11 @@ def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     if looks is not None:
         lessons["gaze_shift"] = _looking(looks)
     return EventStudent(
-        person,
-        _as_steps_begin(evidence),
-        meeting.listening,
-        np.asarray(meeting.speaks[:, 1:].any(axis=1)),
-        lessons,
+        person=person,
+        evidence=_as_steps_begin(evidence),
+        listening=meeting.listening,
+        others=np.asarray(meeting.speaks[:, 1:].any(axis=1)),
+        lessons=lessons,
     )
 
 

@@ -132,7 +132,7 @@ def per_minute(lessons: Mapping[str, Lesson]) -> float:
 # What `listeners.events.evidence` makes its numbers of, from annotations where a head has a microphone and a camera.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MeetingEvidence:
     """N frames of a meeting; the people are the participant, then the others by letter.
 
@@ -157,7 +157,7 @@ class MeetingEvidence:
 
 def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
     """Of the whole time in which his head was annotated."""
-    whole = Stretch(person, 0.0, int(person.until_s * FRAME_HZ) / FRAME_HZ)
+    whole = Stretch(person=person, start_s=0.0, end_s=int(person.until_s * FRAME_HZ) / FRAME_HZ)
     others = sorted(set(person.words) - {person.agent})
     speaks = [active(person.words.get(agent, np.zeros((0, 2))), whole) for agent in (person.agent, *others)]
     looks = np.full((whole.frames, len(others) + 1), np.nan)
@@ -166,13 +166,13 @@ def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
             looks[:, column] = active(_of(person.looked_at, agent), whole)
     own, talk = active(person.talk, whole), active(person.others, whole)
     return MeetingEvidence(
-        (person.agent, *others),
-        np.stack(speaks, axis=1),
-        looks,
-        active(person.others_laughs, whole),
-        _beginnings((start for start, _, _ in person.others_nods), whole.frames),
-        listening_mask(talk, FRAME_HZ, own) & ~active(person.unseen, whole),
-        {
+        agents=(person.agent, *others),
+        speaks=np.stack(speaks, axis=1),
+        looks=looks,
+        laughs=active(person.others_laughs, whole),
+        nods=_beginnings((start for start, _, _ in person.others_nods), whole.frames),
+        listening=listening_mask(talk, FRAME_HZ, own) & ~active(person.unseen, whole),
+        spans_s={
             "nod": person.nods,
             "shake": person.shakes,
             "tilt": person.tilts,

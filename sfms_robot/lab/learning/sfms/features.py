@@ -41,7 +41,7 @@ FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
 LEAST_SPEED = 0.05  # deviations a frame
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmsFrames:
     """N frames of dyads.
 

@@ -107,8 +107,7 @@ def listener_job(
             chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
         gain = None
         if listener.audio == "mel":  # microphones differ
-            gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
-            gain = gain.to(device)
+            gain = ((torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB).to(device)
         seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)

@@ -33,7 +33,7 @@ def person(nods=NONE, other=None, **more):
         "backchannels": NONE, "others_laughs": NONE, "asked": np.zeros(0),
     } | more  # fmt: skip
     return MeetingPerson(
-        "M1a", "A", "one", UNTIL_S, nods=nods, others=talk,
+        meeting="M1a", agent="A", participant="one", until_s=UNTIL_S, nods=nods, others=talk,
         floor=tuple((a, b, "B") for a, b in talk), words={"A": NONE, "B": other}, **given,
     )  # fmt: skip
 
