@@ -9,17 +9,19 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import TypeAdapter
 
-from sfms_robot.config import Expression, Head, Joint, LimitClass, Region, load, parse
+from sfms_robot.config import Arig, Expression, Head, Joint, LimitClass, Region, Sfms, load, parse
 from sfms_robot.config.base import read
 from sfms_robot.config.check import check_head
 from sfms_robot.config.head import Gaze, Idle
 from sfms_robot.config.joint import Coupling, Fold
+from sfms_robot.config.training import ArigTraining, Training
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS
 
-SCHEMA = data_dir("configs") / "heads" / "head.schema.json"
+CONFIGS = data_dir("configs")
 GUIDE = (Path(__file__).parents[2] / "docs" / "heads.md").read_text(encoding="utf-8")
 
 
@@ -66,7 +68,7 @@ def test_the_first_head_of_the_guide_is_about_twenty_lines():
     assert len(re.findall(r"```yaml\n(.*?)```", GUIDE, re.S)[0].splitlines()) <= 22
 
 
-def schema():
+def head_schema():
     """Return the JSON schema of a head's file, with bare names of expressions and joints that inherit keys."""
     whole = Head.model_json_schema()
     parts = whole["$defs"]
@@ -76,12 +78,31 @@ def schema():
     parts["Node"]["properties"]["channel"]["anyOf"][0] = {"enum": list(CHANNELS)}
     parts["Fold"]["properties"]["channel"] = {"enum": list(CHANNELS), "title": "Channel"}
     parts["Joint"]["required"] = ["id"]  # joint_defaults or mirror_of may give the others
-    return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}, indent=1) + "\n"
+    return whole
 
 
-def test_the_schema_for_editors_is_in_step():
-    shipped = SCHEMA.read_text(encoding="utf-8")
-    assert shipped == schema(), "python tests/config/test_head_language.py --write"
+def schemas():
+    """Return the JSON schemas for editors, by file: each names the kinds that its files may hold."""
+    found = {
+        "heads/head.schema.json": head_schema(),
+        "listeners/listener.schema.json": TypeAdapter(Sfms | Arig).json_schema(),
+        "training/training.schema.json": TypeAdapter(Training | ArigTraining).json_schema(),
+    }
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return {file: json.dumps(draft | schema, indent=1) + "\n" for file, schema in found.items()}
+
+
+def test_the_schemas_for_editors_are_in_step():
+    shipped = {file: (CONFIGS / file).read_text(encoding="utf-8") for file in schemas()}
+    assert shipped == schemas(), "python tests/config/test_head_language.py --write"
+
+
+@pytest.mark.parametrize("pattern", ["heads/*/head.yaml", "listeners/*/config.yaml", "training/*.yaml"])
+def test_every_shipped_file_names_its_schema_in_the_first_line(pattern):
+    for file in CONFIGS.glob(pattern):
+        line = file.read_text(encoding="utf-8").splitlines()[0]
+        named = line.removeprefix("# yaml-language-server: $schema=")
+        assert named != line and (file.parent / named).is_file(), file
 
 
 WRONG = {
@@ -207,4 +228,5 @@ def test_a_file_of_the_wrong_shape_is_told_and_never_raised(raw, tmp_path):
 
 
 if __name__ == "__main__" and "--write" in sys.argv:
-    SCHEMA.write_text(schema(), encoding="utf-8")
+    for name, text in schemas().items():
+        (CONFIGS / name).write_text(text, encoding="utf-8")
