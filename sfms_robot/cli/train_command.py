@@ -265,7 +265,23 @@ def convert(
     from sfms_robot.lab.corpora.data_commands import convert_data
 
     converted = convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order)
-    show(converted, json)
+    show(converted, json, _print_conversion)
+
+
+def _print_conversion(report: Mapping[str, Any]) -> None:
+    """Print the splits that were written, the clips left out of them, and the loss."""
+    say(f"{report['layout']}: {report['folder']} -> {report['out']}")
+    if report["licence"]:
+        say(f"licence: {report['licence']}")
+    print_rows([{key: split[key] for key in ("split", "clips", "minutes")} for split in report["splits"]])
+    for split in report["splits"]:
+        for each in split["left_out"]:
+            say(f"{split['split']}: {each['count']} left out, {each['kind']}: {each['first']}")
+    for key, meaning in report["residual_names"].items():
+        if report["residual"][key] is not None:
+            say(f"{meaning}: {cell(report['residual'][key])}")
+    for note in dict.fromkeys([*report["notes"], *(note for split in report["splits"] for note in split["notes"])]):
+        say(note, "dim")
 
 
 def _print_data(report: Mapping[str, Any], channels: bool) -> None:

@@ -16,7 +16,7 @@ from sfms_robot.lab import bench
 from sfms_robot.lab.bench import BENCHES, Bench, measure_all, run_bench
 from sfms_robot.lab.bench.measure import BenchResult, environment, row, write_page
 from sfms_robot.lab.bench.operation_count import BoardCore, OperationCount
-from sfms_robot.lab.learning.dry_run import dry_run
+from sfms_robot.lab.learning import dry_run
 
 
 def quiet(line: str) -> None:
