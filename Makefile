@@ -1,4 +1,4 @@
-# Two commands matter: `make run` (an emulated head listens, and two pictures show it) and `make test`. Both make .venv first if it is missing.
+# `make run`: an emulated head listens, shown on a page. `make test`: the tests. Both make .venv first if it is missing.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
