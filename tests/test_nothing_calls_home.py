@@ -152,13 +152,13 @@ def watched(request, tmp_path):
     """Both watchers, for what is quick."""
     if not request.param.usable():
         pytest.skip("strace may not be used here")
-    return Watched(seen_s=request.param(tmp_path), place_m=tmp_path)
+    return Watched(request.param(tmp_path), tmp_path)
 
 
 @pytest.fixture
 def best(tmp_path):
     """The one that sees most, for what takes its time."""
-    return Watched(seen_s=(Strace if Strace.usable() else Hook)(tmp_path), place_m=tmp_path)
+    return Watched((Strace if Strace.usable() else Hook)(tmp_path), tmp_path)
 
 
 def python(code):

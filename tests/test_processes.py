@@ -248,7 +248,7 @@ PHASES = [(name, phase) for name, limits in LIMITS.items() for phase in limits.s
 @pytest.mark.parametrize(("name", "phase"), PHASES)
 def test_a_child_without_a_sign_of_life_is_killed_and_started_again_after_the_limit_of_its_phase(name, phase):
     limits = LIMITS[name]
-    watched = Watched(seen_s=limits, place_m=phase)
+    watched = Watched(limits, phase)
     restarted_s = watched.until(lambda child: child.restarts)
     assert restarted_s == pytest.approx(limits.silent_s[phase] + limits.pause_s, abs=0.25)
     assert [child.killed for child in watched.children] == [True, False]
@@ -260,7 +260,7 @@ def test_a_child_without_a_sign_of_life_is_killed_and_started_again_after_the_li
 @pytest.mark.parametrize(("name", "phase"), [("listener", "starting"), ("listener", "loading"), ("page", "running")])
 def test_a_child_that_hangs_is_named_once_and_once_when_it_answers_again(name, phase, caplog):
     caplog.set_level(logging.INFO)
-    watched = Watched(seen_s=LIMITS[name], place_m=phase)
+    watched = Watched(LIMITS[name], phase)
     hung_s = watched.until(lambda child: child.hung)
     assert hung_s == pytest.approx(LIMITS[name].hung_s, abs=0.126) and watched.supervised.away
     watched.supervised.check(watched.now_s + 0.125, False)
@@ -274,11 +274,9 @@ def test_a_child_that_hangs_is_named_once_and_once_when_it_answers_again(name, p
 
 def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
     limits = LIMITS["listener"]
-    assert Watched(seen_s=limits, place_m="loading").until(lambda child: child.restarts, alive=True) == pytest.approx(
-        60.0, abs=0.25
-    )
-    assert Watched(seen_s=limits, place_m="running").until(lambda child: child.restarts, alive=True) is None
-    waiting = Watched(seen_s=limits, place_m="loading")
+    assert Watched(limits, "loading").until(lambda child: child.restarts, alive=True) == pytest.approx(60.0, abs=0.25)
+    assert Watched(limits, "running").until(lambda child: child.restarts, alive=True) is None
+    waiting = Watched(limits, "loading")
     for _ in range(1000):  # for its parent
         waiting.supervised.phase_s = 0.0
         waiting.supervised.check(waiting.now_s + 0.125, True)
@@ -288,7 +286,7 @@ def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
 
 def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_row_are_logged_once(caplog):
     limits = LIMITS["source"]
-    watched, paused_s = Watched(seen_s=limits), []
+    watched, paused_s = Watched(limits), []
     for _ in range(2000):  # days without a camera
         watched.supervised.fail("gone")
         paused_s.append(watched.until(lambda child: child.phase == "starting"))
@@ -301,7 +299,7 @@ def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_ro
 
 
 def test_a_process_that_cannot_be_started_counts_as_another_failure():
-    watched = Watched(seen_s=LIMITS["source"])
+    watched = Watched(LIMITS["source"])
     watched.refusals = 2
     watched.supervised.fail("gone")
     assert watched.until(lambda child: child.phase == "starting") == 0.5 + 1.0 + 2.0
@@ -310,7 +308,7 @@ def test_a_process_that_cannot_be_started_counts_as_another_failure():
 
 @given(st.lists(st.integers(0, 30), max_size=60))
 def test_at_most_five_restarts_happen_in_a_minute_and_the_next_failure_is_the_last(gaps_s):
-    watched, failed_s = Watched(seen_s=LIMITS["listener"]), []
+    watched, failed_s = Watched(LIMITS["listener"]), []
     for gap_s in gaps_s:
         watched.now_s += gap_s
         watched.supervised.phase_s = 0.0
@@ -324,7 +322,7 @@ def test_at_most_five_restarts_happen_in_a_minute_and_the_next_failure_is_the_la
 
 
 def test_a_page_is_not_started_again_and_a_break_of_the_run_itself_is_no_silence(caplog):
-    watched = Watched(seen_s=LIMITS["page"], place_m="running")
+    watched = Watched(LIMITS["page"], "running")
     watched.supervised.check(3600.0, False)
     watched.supervised.check(0.0, False)  # another run begins
     assert not watched.supervised.hung and not caplog.records

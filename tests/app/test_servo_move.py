@@ -51,7 +51,7 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
         table = seen.registers()
         speed, torque = table.role("moving_speed"), seen.named("torque_enable")
         before = seen.read(speed)
-        wire.clock = watched = Watched(seen_s=wire, place_m=chain)
+        wire.clock = watched = Watched(wire, chain)
         result = move(seen, None, str(by))
         assert abs(result["reached"] - (table.center_ticks + by)) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)
@@ -110,7 +110,7 @@ def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, cap
         seen = wire.find(1)
         speed, torque = table.role("moving_speed"), seen.named("torque_enable")
         before = seen.read(speed)
-        wire.clock = watched = Watched(seen_s=wire, place_m=chain)
+        wire.clock = watched = Watched(wire, chain)
         result = move(seen, str(table.center_ticks), None)
         assert abs(result["reached"] - table.center_ticks) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)

@@ -53,7 +53,7 @@ def log(tmp_path):
 
 def test_a_file_halts_a_run_until_a_signal_lets_it_go_on(log, tmp_path):
     switch = tmp_path / "halt"
-    with Watched(seen_s=log, place_m="--halt-on", attention=switch) as running:
+    with Watched(log, "--halt-on", switch) as running:
         running.until_state("listening")
         switch.touch()
         running.until_state("halted")
@@ -71,7 +71,7 @@ def test_a_file_halts_a_run_until_a_signal_lets_it_go_on(log, tmp_path):
 
 
 def test_a_signal_halts_a_run_and_another_lets_it_go_on(log):
-    with Watched(seen_s=log) as running:
+    with Watched(log) as running:
         running.until_state("listening")
         running.signal(signal.SIGUSR1)
         running.until_state("halted")
@@ -82,7 +82,7 @@ def test_a_signal_halts_a_run_and_another_lets_it_go_on(log):
 
 
 def test_a_listener_that_is_killed_is_missed_and_comes_back(log):
-    with Watched(seen_s=log) as running:
+    with Watched(log) as running:
         running.until_state("listening")
         os.kill(running.listener(), signal.SIGKILL)
         running.until_state("degraded")

@@ -93,15 +93,14 @@ def test_base_installation_drives_a_head(bare, how):
 NEEDS = {
     "run --engine torch --fast --duration 1": "torch",
     "export sfms-small": "torch",
-    "train tokenizer --data {tmp} --out {tmp}/out": "torch",
-    "train listener --data {tmp} --out {tmp}/out": "torch",
-    "train arig --data {tmp} --out {tmp}/out": "torch",
+    "train tokenizer --config configs/training/sfms-small.yaml --data {tmp} --out {tmp}/out": "torch",
+    "train listener --config configs/training/sfms-small.yaml --data {tmp} --out {tmp}/out": "torch",
     "bench train": "torch",
     "bench listener": "torch",
     "replay {tmp}/run --plot {tmp}/run.png": "matplotlib",
     "replay {tmp}/run --sheet {tmp}/head.png": "vtkmodules",
     "head show face28 --urdf {tmp}/head.png": "vtkmodules",
-    "run --listener zenoh/arig-small --fast --duration 1": "zenoh",
+    "run --listener zenoh/arig-small --duration 1": "zenoh",
     "run --face webcam --fast --duration 1": "mediapipe",
 }
 
@@ -138,4 +137,5 @@ def test_what_needs_an_extra_names_it_in_one_line(bare, folder, words, package):
 @pytest.mark.parametrize("words", COMMANDS)
 def test_every_other_command_starts(bare, folder, words):
     done = start(bare, words.format(tmp=folder))
-    assert "Traceback" not in done.stderr and "not installed" not in done.stderr
+    refusals = [line for line in done.stderr.splitlines() if "not installed" in line and not line.startswith("WARNING")]
+    assert "Traceback" not in done.stderr and not refusals

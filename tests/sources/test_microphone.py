@@ -60,7 +60,7 @@ def hear():
     def opened(audio="mic", **how):
         source = open_source(audio, "none", **how)
         sources.append(source)
-        return Hearing(frame=source, voices=source._voice)
+        return Hearing(source, source._voice)
 
     yield opened
     for source in sources:
@@ -203,7 +203,7 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
 
 def test_a_loudspeaker_is_heard_without_a_microphone_too(sound_server):
     with closing(open_source("none", "none", agent_audio="device:person.monitor", duration_s=60.0)) as source:
-        hearing = Hearing(frame=source, voices=source._agent._recorder)
+        hearing = Hearing(source, source._agent._recorder)
         hearing.until(lambda: sum(frame.agent_audio is not None for frame in hearing.frames) >= 5)
         assert not any(len(frame.audio) for frame in hearing.frames)
 

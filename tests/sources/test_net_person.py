@@ -371,7 +371,7 @@ def test_a_reader_who_does_not_read_gets_the_newest_and_holds_nobody_up(run):
 
 @pytest.mark.parametrize("host", ["0.0.0.0"])
 def test_beyond_loopback_a_token_is_needed_and_is_new_at_every_start(host, caplog):
-    with closing(Run(resume=host)) as run, closing(Run(resume=host)) as other:
+    with closing(Run(host)) as run, closing(Run(host)) as other:
         assert run.person.token != other.person.token
         assert f"token {run.person.token}" in caplog.records[0].message
         for token in ("", "wrong", other.person.token):

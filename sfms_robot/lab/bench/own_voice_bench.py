@@ -292,7 +292,7 @@ def _responses(room: str) -> tuple[Doubles, Doubles, Doubles]:
         import pyroomacoustics
     size, decay_s = _ROOMS[room]
     absorption, order = pyroomacoustics.inverse_sabine(decay_s, size)
-    material = pyroomacoustics.Material(people=absorption)
+    material = pyroomacoustics.Material(absorption)
     shoebox = pyroomacoustics.ShoeBox(size, fs=AUDIO_HZ, materials=material, max_order=min(order, _ORDER))
     microphone = np.array([0.45 * size[0], 0.4 * size[1], 1.2])
     for place in (_PERSON_M, _LOUDSPEAKER_M, _MOTORS_M):
