@@ -384,5 +384,5 @@ def open_webcam(argument: str) -> Webcam:
     source = str(Path(place).absolute()) if place and not place.isdigit() else place or "0"
     worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
-    opened = worker.messages(0.0)[0]
+    opened = worker.messages(time.monotonic())[0]
     return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, WebcamOpened) else None)

@@ -134,8 +134,8 @@ def test_an_unplugged_microphone_is_lost_and_comes_back(hear, sound_server, capl
     assert [frame.time_s for frame in hearing.frames] == pytest.approx(FRAME_S * np.arange(1, len(hearing.frames) + 1))
     assert [record.getMessage() for record in caplog.records] == [
         "microphone: person.monitor",
-        "microphone: person.monitor gives no more sound; it is tried again until it is back",
-        "microphone is back",
+        "microphone: person.monitor gives no more sound; restarting",
+        "microphone: running again",
     ]
 
 

@@ -409,7 +409,7 @@ def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
         until(lambda _: not source.missing)
         until(lambda new: any(frame.agent_audio.any() for frame in new))
     told = [record.getMessage() for record in caplog.records]
-    assert told[0].startswith("loudspeaker: person, ") and told[-1] == "loudspeaker is back"
+    assert told[0].startswith("loudspeaker: person, ") and told[-1] == "loudspeaker: running again"
 
 
 def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_server):
