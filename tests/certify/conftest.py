@@ -23,7 +23,7 @@ def plugged_in():
 def again():
     """Ask until the answer is good: a servo needs time to move or start, and a busy computer may be late."""
 
-    def ask(call, good, tries=3000):
+    def ask(call, good, tries=100_000):
         for _ in range(tries):
             answer = call()
             if good(answer):
