@@ -11,29 +11,29 @@ style bends the response without moving its ends, so that small motions come out
 The drives of all joints are one forest, compiled into a few array operations. It is cut into levels, deepest first: all
 leaves are one gather from the motion, and every level above is one `reduceat` per kind of group over its children, then
 dead band, curve, gain, offset and clamp. So the cost does not depend on the form of the file, only a little on the
-depth of the deepest expression; groups of one and sums inside sums are merged first.
+depth of the deepest expression.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.config import Coupling, Expression, Head
+from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 
 Indices = NDArray[np.intp]
-Tree = tuple[int, Expression]  # joint, node
+Step = Callable[[Doubles], object]  # changes its argument in place
 
 STILL = Expression(channel=CHANNELS[0], gain=0.0)
 _REDUCE = {"sum": np.add, "mean": np.add, "max": np.maximum, "min": np.minimum, "product": np.multiply}
-_PRODUCT_LIMIT = 1e6  # what keeps products of products finite, whatever the motion
+_PRODUCT_LIMIT = 1e6  # keeps products of products finite, whatever the motion
 
 
 @dataclass(frozen=True)
@@ -46,39 +46,6 @@ class Knobs:
     @cached_property
     def neutral(self) -> bool:
         return bool((self.intensity == 1).all() and (self.style == 1).all())
-
-
-@dataclass(frozen=True)
-class _Couplings:
-    """C sums of joints that may not fall below a bound: weights (C, J), at_least (C,).
-
-    `turns`: the joints that give way first, second, ...: couplings, and of each the joint and its weight.
-    """
-
-    weights: Doubles
-    at_least: Doubles
-    turns: tuple[tuple[Indices, Indices, Doubles], ...]
-
-    @classmethod
-    def of(cls, couplings: Sequence[Coupling], joints: Sequence[str]) -> _Couplings:
-        weights = np.array([[coupling.keep.get(name, 0.0) for name in joints] for coupling in couplings])
-        turns = []
-        for turn in range(max(len(coupling.moving) for coupling in couplings)):
-            rows = np.array([row for row, c in enumerate(couplings) if len(c.moving) > turn], dtype=np.intp)
-            columns = np.array([joints.index(couplings[row].moving[turn]) for row in rows], dtype=np.intp)
-            turns.append((rows, columns, weights[rows, columns]))
-        return cls(weights, np.array([coupling.at_least for coupling in couplings]), tuple(turns))
-
-    def apply(self, values: Doubles, low: Doubles, high: Doubles) -> None:
-        """Change values (..., J) inside low..high (J,) until the sums are met, as far as the ranges allow."""
-        missing = np.maximum(self.at_least - values @ self.weights.T, 0.0)
-        if not np.count_nonzero(missing):
-            return
-        for rows, columns, weights in self.turns:
-            now = values[..., columns]
-            there = np.minimum(np.maximum(now + missing[..., rows] / weights, low[columns]), high[columns])
-            values[..., columns] = there
-            missing[..., rows] -= (there - now) * weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +100,11 @@ class ChannelMapping:
         self._high_rad = np.array([joint.max_rad for joint in head.joints.values()])
 
         trees = drives(head)
-        self._program = Program.of(list(trees.values()))
-        self._couplings = _Couplings.of(head.couplings, self.joints) if head.couplings else None
+        self._program = Program(list(trees.values()))
+        # Couplings: C sums of joints that may not fall below a bound, and the joints that give way, the first first.
+        self._keep = np.array([[each.keep.get(name, 0.0) for name in self.joints] for each in head.couplings])
+        self._at_least = np.array([each.at_least for each in head.couplings])
+        self._moving = [[self.joints.index(name) for name in each.moving] for each in head.couplings]
         followed = set[str]().union(*(tree.channels() for tree in trees.values() if tree))
         self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if name not in followed)
         self.dead_joints: Sequence[str] = tuple(name for name, tree in trees.items() if tree is None)
@@ -171,12 +141,25 @@ class ChannelMapping:
         knobs = knobs or self._knobs
         if not knobs.neutral:
             values = self._inside(self._turned(values, knobs))
-        if self._couplings is not None:
-            self._couplings.apply(values, self._units.low, self._units.high)
+        if self._moving:
+            self._couple(values)
         angles = self._units.angles(values)
         np.maximum(angles, self._low_rad, out=angles)
         np.minimum(angles, self._high_rad, out=angles)
         return angles
+
+    def _couple(self, values: Doubles) -> None:
+        """Change values (..., J) in place until the coupled sums are met, as far as the ranges allow."""
+        missing = np.maximum(self._at_least - values @ self._keep.T, 0.0)
+        if not np.count_nonzero(missing):
+            return
+        for row, columns in enumerate(self._moving):
+            for column in columns:
+                weight, now = self._keep[row, column], values[..., column]
+                low, high = self._units.low[column], self._units.high[column]
+                there = np.minimum(np.maximum(now + missing[..., row] / weight, low), high)
+                missing[..., row] -= (there - now) * weight
+                values[..., column] = there
 
     def _inside(self, values: Doubles) -> Doubles:
         np.maximum(values, self._units.low, out=values)
@@ -193,223 +176,108 @@ class ChannelMapping:
 
 
 @dataclass(frozen=True)
-class _Curves:
-    """Monotone cubics of the nodes `where`: C of them with at most K points, evaluated together.
+class _Level:
+    """Nodes at one depth, evaluated together from the values one level deeper.
 
-    `breaks` (C, K) is filled up with inf; `pieces` (C, K+1, 4) are coefficients about `origins` (C, K+1), highest
-    power first, the outermost two constant.
+    Attributes:
+        starts: where the children of each node begin; they lie side by side.
+        groups: each way to combine children, and the nodes (n,) of that kind.
+        steps: what follows, in place on the values (..., n); an operation that no node has is left out.
     """
 
-    where: Indices
-    breaks: Doubles
-    origins: Doubles
-    pieces: Doubles
-
-    @classmethod
-    def of(cls, curves: Sequence[tuple[tuple[float, float], ...] | None], scale: Doubles) -> _Curves | None:
-        """Return the curves of n nodes; `scale` (n,): a curve's x is in units of its node's value divided by this."""
-        where = [i for i, curve in enumerate(curves) if curve is not None]
-        if not where:
-            return None
-        longest = max(len(curve) for curve in curves if curve is not None)
-        breaks = np.full((len(where), longest), np.inf)
-        origins = np.zeros((len(where), longest + 1))
-        pieces = np.zeros((len(where), longest + 1, 4))
-        for row, i in enumerate(where):
-            points = np.array(curves[i], dtype=np.float64)
-            x, y = points[:, 0] * scale[i], points[:, 1]
-            breaks[row, : len(x)] = x
-            origins[row, 1 : len(x)] = x[:-1]
-            pieces[row, 0, 3], pieces[row, len(x), 3] = y[0], y[-1]
-            with np.errstate(over="ignore"):  # slopes too small for a float are 0
-                pieces[row, 1 : len(x)] = _monotone_cubics(x, y)
-        return cls(np.array(where, dtype=np.intp), breaks, origins, pieces)
-
-    def into(self, values: Doubles) -> None:
-        """Replace the nodes' values (..., n) by those of their curves."""
-        x = values[..., self.where]
-        piece = (x[..., None] >= self.breaks).sum(axis=-1)
-        rows = np.arange(len(self.where))
-        c = self.pieces[rows, piece]
-        flat = (piece == 0) | np.isinf(self.breaks[rows, np.minimum(piece, self.breaks.shape[1] - 1)])
-        t = np.where(flat, 0.0, x - self.origins[rows, piece])  # outside, x may be too large to be cubed
-        t[piece == self.breaks.shape[1]] = 0.0
-        values[..., self.where] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
-
-
-def _monotone_cubics(x: Doubles, y: Doubles) -> Doubles:
-    """Return cubics between K points (Fritsch, Butland 1984) without overshoot: (K-1, 4), highest power first."""
-    dx = np.diff(x)
-    rise = np.diff(y) / dx
-    slopes = np.full(len(x), rise[0])
-    if len(x) > 2:
-        w1, w2 = 2 * dx[1:] + dx[:-1], dx[1:] + 2 * dx[:-1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inner = 1.0 / ((w1 / rise[:-1] + w2 / rise[1:]) / (w1 + w2))
-        slopes[1:-1] = np.where(rise[:-1] * rise[1:] > 0, inner, 0.0)
-        slopes[0] = _end_slope(dx[0], dx[1], rise[0], rise[1])
-        slopes[-1] = _end_slope(dx[-1], dx[-2], rise[-1], rise[-2])
-    bend = (slopes[:-1] + slopes[1:] - 2 * rise) / dx
-    return np.stack([bend / dx, (rise - slopes[:-1]) / dx - bend, slopes[:-1], y[:-1]], axis=1)
-
-
-def _end_slope(dx0: float, dx1: float, rise0: float, rise1: float) -> float:
-    """Return the slope at an end by three points, limited against overshoot."""
-    slope = ((2 * dx0 + dx1) * rise0 - dx0 * rise1) / (dx0 + dx1)
-    if np.sign(slope) != np.sign(rise0):
-        return 0.0
-    return 3.0 * rise0 if np.sign(rise0) != np.sign(rise1) and abs(slope) > 3.0 * abs(rise0) else slope
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Shape:
-    """Operations on the values (..., n) of a level's nodes; None for one that no node has, to save time in a tick."""
-
-    dead_band: Doubles | None
-    curves: _Curves | None
-    gain_up: Doubles | None
-    gain_down: Doubles | None
-    offset: Doubles | None
-    low: Doubles | None
-    high: Doubles | None
-
-    @classmethod
-    def of(cls, nodes: Sequence[Expression]) -> _Shape:
-        count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum, until it is scaled
-        dead = np.array([node.dead_band for node in nodes]) * count
-        gains = np.array([node.gains for node in nodes])
-        gains /= np.where([node.curve is None for node in nodes], count, 1.0)[:, None]
-        gained = bool((gains != 1).any())
-        offset = np.array([node.offset for node in nodes])
-        limit = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
-        low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]).T
-        clamped = bool(np.isfinite(low).any())
-        return cls(
-            dead_band=dead if dead.any() else None,
-            curves=_Curves.of([node.curve for node in nodes], count),
-            gain_up=gains[:, 1] if gained else None,
-            gain_down=gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
-            offset=offset if offset.any() else None,
-            low=low if clamped else None,
-            high=high if clamped else None,
-        )
-
-    def __call__(self, values: Doubles) -> Doubles:
-        """Apply the operations in place, and return `values`."""
-        if self.dead_band is not None:
-            values -= np.minimum(np.maximum(values, -self.dead_band), self.dead_band)
-        if self.curves is not None:
-            self.curves.into(values)
-        if self.gain_up is not None:
-            values *= self.gain_up if self.gain_down is None else np.where(values > 0, self.gain_up, self.gain_down)
-        if self.offset is not None:
-            values += self.offset
-        if self.low is not None and self.high is not None:
-            np.maximum(values, self.low, out=values)
-            np.minimum(values, self.high, out=values)
-        return values
-
-
-@dataclass(frozen=True)
-class _Level:
-    """Nodes whose children lie side by side one level below, from `starts` on; `kinds`: groups and masks of nodes."""
-
     starts: Indices
-    kinds: tuple[tuple[np.ufunc, NDArray[np.bool_]], ...]
-    shape: _Shape
+    groups: Sequence[tuple[np.ufunc, NDArray[np.bool_]]]
+    steps: Sequence[Step]
 
     def __call__(self, below: Doubles) -> Doubles:
-        (first, _), *others = self.kinds
+        (first, _), *others = self.groups
         values: Doubles = first.reduceat(below, self.starts, axis=-1)
         for combine, mask in others:
             np.copyto(values, combine.reduceat(below, self.starts, axis=-1), where=mask)
-        return self.shape(values)
+        for step in self.steps:
+            step(values)
+        return values
 
 
-@dataclass(frozen=True)
 class Program:
-    """The compiled drives of J joints: motion -> values in joint units.
+    """The compiled drives of J joints: motion -> values in joint units. A drive that is None gives 0."""
 
-    Attributes:
-        columns: the channel of each leaf.
-        cells: the same in a flattened (J, 58), in the row of the leaf's joint.
-    """
-
-    columns: Indices
-    cells: Indices
-    leaves: _Shape
-    levels: tuple[_Level, ...]
-
-    @classmethod
-    def of(cls, trees: Sequence[Expression | None]) -> Program:
-        """Compile plain expressions, without shared ones; None gives 0."""
-        forest: list[Tree] = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
-        levels: list[_Level] = []
-        for _ in range(max(_depth(tree) for _, tree in forest)):
-            level, forest = _level(forest)
-            levels.insert(0, level)
-        nodes = [leaf for _, leaf in forest]
-        rows = np.array([row for row, _ in forest], dtype=np.intp)
-        columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for leaf in nodes], dtype=np.intp)
-        return cls(columns, rows * MOTION_DIM + columns, _Shape.of(nodes), tuple(levels))
+    def __init__(self, trees: Sequence[Expression | None]) -> None:
+        forest = [(row, tree or STILL) for row, tree in enumerate(trees)]  # joint, node
+        self._levels: list[_Level] = []
+        while any(node.parts for _, node in forest):
+            # A leaf above the deepest level becomes a sum of one.
+            nodes = [node if node.parts else Expression.model_construct(sum=(node,)) for _, node in forest]
+            ways = [_REDUCE[node.group or "sum"] for node in nodes]
+            groups = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
+            starts = np.cumsum([0, *(len(node.parts) for node in nodes[:-1])])
+            self._levels.insert(0, _Level(starts, groups, _steps(nodes)))
+            forest = [(row, part) for (row, _), node in zip(forest, nodes, strict=True) for part in node.parts]
+        self._steps = _steps([leaf for _, leaf in forest])
+        # The channel of each leaf, and its place in a flattened (J, 58), in the row of its joint.
+        self._columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for _, leaf in forest], dtype=np.intp)
+        self._cells = np.array([row for row, _ in forest], dtype=np.intp) * MOTION_DIM + self._columns
 
     def __call__(self, motion: Floats) -> Doubles:
         """Return values (J,) or (..., J) of motion (58,) or (..., J, 58), row j for joint j."""
         flat = motion.reshape(*motion.shape[:-2], -1)
-        values = self.leaves(flat.take(self.columns if motion.ndim == 1 else self.cells, axis=-1).astype(np.float64))
-        for level in self.levels:
+        values = flat.take(self._columns if motion.ndim == 1 else self._cells, axis=-1).astype(np.float64)
+        for step in self._steps:
+            step(values)
+        for level in self._levels:
             values = level(values)
         return values
 
 
-def _depth(node: Expression) -> int:
-    return 1 + max((_depth(part) for part in node.parts), default=-1)
+def _steps(nodes: Sequence[Expression]) -> list[Step]:
+    """Return the operations that turn what n nodes combine, or read, into their values (..., n)."""
+    steps: list[Step] = []
+    # A mean is a sum until it is scaled, by its gain or before its curve.
+    count = np.array([float(len(node.mean or (1,))) for node in nodes])
+    dead = np.array([node.dead_band for node in nodes]) * count
+    if dead.any():
+        steps.append(lambda values: np.subtract(values, np.minimum(np.maximum(values, -dead), dead), out=values))
+    curves = {i: np.array(node.curve) for i, node in enumerate(nodes) if node.curve is not None}
+    if curves:
+        steps.append(_Curves({i: points * [count[i], 1.0] for i, points in curves.items()}))
+        count[list(curves)] = 1.0
+    down, up = np.array([node.gains for node in nodes]).T / count
+    if (down != up).any():
+        steps.append(lambda values: np.multiply(values, np.where(values > 0, up, down), out=values))
+    elif (up != 1).any():
+        steps.append(lambda values: np.multiply(values, up, out=values))
+    offset = np.array([node.offset for node in nodes])
+    if offset.any():
+        steps.append(lambda values: np.add(values, offset, out=values))
+    limits = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
+    low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limits, strict=True)]).T
+    if np.isfinite(low).any():
+        steps.append(lambda values: np.minimum(np.maximum(values, low, out=values), high, out=values))
+    return steps
 
 
-def _level(forest: list[Tree]) -> tuple[_Level, list[Tree]]:
-    """Return one level and the forest of its children. A leaf above the deepest level becomes a sum of one."""
-    nodes = [(row, node if node.parts else Expression.model_construct(sum=(node,))) for row, node in forest]
-    groups = [[(row, part) for part in node.parts] for row, node in nodes]
-    starts = np.cumsum([0, *(len(group) for group in groups[:-1])])
-    ways = [_REDUCE[node.group or "sum"] for _, node in nodes]
-    needed = [way for way, group in zip(ways, groups, strict=True) if len(group) > 1] or [np.add]
-    ways = [way if way in needed else needed[0] for way in ways]  # a group of one is the same in every way
-    kinds = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
-    level = _Level(starts, tuple(kinds), _Shape.of([node for _, node in nodes]))
-    return level, [part for group in groups for part in group]
+class _Curves:
+    """Monotone cubics (PCHIP) of C nodes, evaluated together; beyond its points a curve keeps its end values."""
 
+    def __init__(self, curves: Mapping[int, Doubles]) -> None:
+        """Take the points (K, 2) of each curve, by the column of its node. K differs: places left over are inf or 0."""
+        from scipy.interpolate import PchipInterpolator  # only heads with curves load scipy
 
-def merged(node: Expression) -> Expression:
-    """Return the same function with fewer levels."""
-    if node.group is None:
-        return node
-    parts = [merged(part) for part in node.parts]
-    if node.sum is not None:
-        parts = [term for part in parts for term in (_terms(part) or (part,))]
-    node = node.model_copy(update={node.group: tuple(parts)})
-    inner = parts[0]
-    linear = not node.dead_band and node.curve is None and node.gains[0] == node.gains[1]
-    if len(parts) > 1 or not linear or (node.clamp and inner.clamp):
-        return node
-    scaled = _scaled(inner, node.gains[0], node.offset)
-    return scaled.model_copy(update={"clamp": node.clamp}) if node.clamp else scaled
+        self._columns = np.array(list(curves), dtype=np.intp)
+        self._rows = np.arange(len(curves))
+        self._ends = np.array([(x[0], x[-1]) for x, _ in (points.T for points in curves.values())])
+        pieces = max(len(points) for points in curves.values()) - 1
+        self._breaks = np.full((len(curves), pieces), np.inf)  # ends of the pieces but the last
+        self._begins = np.zeros((len(curves), pieces))
+        self._cubics = np.zeros((len(curves), pieces, 4))  # about the beginning of the piece, highest power first
+        for row, (x, y) in enumerate(points.T for points in curves.values()):
+            self._breaks[row, : len(x) - 2], self._begins[row, : len(x) - 1] = x[1:-1], x[:-1]
+            with np.errstate(over="ignore"):  # slopes too small for a float are 0
+                self._cubics[row, : len(x) - 1] = PchipInterpolator(x, y).c.T
 
-
-def _terms(part: Expression) -> tuple[Expression, ...]:
-    """Return the terms of a sum that a sum around it can take over; none where it cannot."""
-    plain = not part.dead_band and part.curve is None and part.clamp is None and part.gains[0] == part.gains[1]
-    if part.sum is None or not plain:
-        return ()
-    gain = part.gains[0]
-    return tuple(_scaled(term, gain, part.offset if i == 0 else 0.0) for i, term in enumerate(part.sum))
-
-
-def _scaled(node: Expression, gain: float, offset: float) -> Expression:
-    """Return gain x node + offset as one node."""
-    down, up = node.gains
-    clamp = None
-    if node.clamp is not None:
-        low, high = sorted(gain * end + offset for end in node.clamp)
-        clamp = (low, high)
-    change = {"gain_up": gain * up, "gain_down": gain * down, "offset": gain * node.offset + offset, "clamp": clamp}
-    return node.model_copy(update=change)
+    def __call__(self, values: Doubles) -> None:
+        x = np.clip(values[..., self._columns], self._ends[:, 0], self._ends[:, 1])
+        piece = (x[..., None] >= self._breaks).sum(axis=-1)
+        c = self._cubics[self._rows, piece]
+        t = x - self._begins[self._rows, piece]
+        values[..., self._columns] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
