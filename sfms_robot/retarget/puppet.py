@@ -14,10 +14,10 @@ different leads, and no instant that was already played is changed.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import Lock
 from typing import Final
 
 import numpy as np
@@ -42,58 +42,51 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ramp:
-    """Weights (C,) over time: from `start` up to 1 in `rise_s`, and down to 0 in `fall_s` from `until_s` (C,)."""
+class Request:
+    """Requested values of C channels and their weights; all arrays are (C,).
 
+    Attributes:
+        rise_s, fall_s: of a weight, from `start` at `began_s` up to 1, and down to 0 from `until_s` on.
+        change_s: from the values `before`, which hold until `since_s`, to `after`: by a smooth step, or straight.
+    """
+
+    rise_s: float
+    fall_s: float
+    change_s: float
+    smooth: bool
     start: Doubles
     began_s: Doubles
     until_s: Doubles
-    rise_s: float
-    fall_s: float
+    before: Doubles
+    after: Doubles
+    since_s: float = 0.0
 
     @classmethod
-    def zero(cls, size: int, rise_s: float, fall_s: float) -> Ramp:
-        never = np.full(size, _NEVER_S)
-        return cls(start=np.zeros(size), began_s=never, until_s=never, rise_s=rise_s, fall_s=fall_s)
-
-    def at(self, times_s: Doubles) -> Doubles:
-        """Return the weights (N, C) at (N,) instants."""
-        times = times_s[:, None]
-        risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
-        weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
-        return weight
-
-    def hold(self, which: Bools, now_s: float, seconds: Doubles | float) -> Ramp:
-        """Return the ramp on which `which` (C,) bool rise from their present weights and stay for `seconds`."""
-        falling = which & (self.until_s <= now_s)
-        start = np.where(falling, self.at(np.array([now_s]))[0], self.start)
-        began = np.where(falling, now_s, self.began_s)
-        until = np.where(which, now_s + self.rise_s + seconds, self.until_s)
-        return replace(self, start=start, began_s=began, until_s=until)
+    def none(cls, size: int, rise_s: float, fall_s: float, change_s: float, smooth: bool = True) -> Request:
+        zero, never = np.zeros(size), np.full(size, _NEVER_S)
+        return cls(
+            rise_s=rise_s,
+            fall_s=fall_s,
+            change_s=change_s,
+            smooth=smooth,
+            start=zero,
+            began_s=never,
+            until_s=never,
+            before=zero,
+            after=zero,
+        )
 
     @property
     def over_s(self) -> float:
         """Time from which all weights are 0."""
         return float(self.until_s.max()) + self.fall_s
 
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """Requested values (C,): `before` until `since_s`, then to `after` in `change_s`, by a smooth step or straight."""
-
-    ramp: Ramp
-    before: Doubles
-    after: Doubles
-    since_s: float
-    change_s: float
-    smooth: bool
-
-    @classmethod
-    def none(cls, size: int, ramp_s: tuple[float, float], change_s: float, smooth: bool) -> Request:
-        still = np.zeros(size)
-        return cls(
-            ramp=Ramp.zero(size, *ramp_s), before=still, after=still, since_s=0.0, change_s=change_s, smooth=smooth
-        )
+    def weights(self, times_s: Doubles) -> Doubles:
+        """Return the weights (N, C) at (N,) instants."""
+        times = times_s[:, None]
+        risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
+        weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
+        return weight
 
     def values(self, times_s: Doubles) -> Doubles:
         """Return the values (N, C) at (N,) instants."""
@@ -102,14 +95,17 @@ class Request:
         value: Doubles = self.before + share[:, None] * (self.after - self.before)
         return value
 
-    def then(self, values: Doubles, which: Bools, seconds: Doubles | float, now_s: float) -> Request:
-        """Return the same with `which` (C,) of `values` (C,) requested from now on, for `seconds`."""
+    def then(self, values: Doubles, which: Bools, seconds: float, now_s: float) -> Request:
+        """Return the request with `which` (C,) of `values` (C,) from now on: risen, they stay for `seconds`."""
         here = np.array([now_s])
-        value, up = self.values(here)[0], self.ramp.at(here)[0] > 0
+        weight, value = self.weights(here)[0], self.values(here)[0]
+        falling = which & (self.until_s <= now_s)
         return replace(
             self,
-            ramp=self.ramp.hold(which, now_s, seconds),
-            before=np.where(which & ~up, values, value),
+            start=np.where(falling, weight, self.start),
+            began_s=np.where(falling, now_s, self.began_s),
+            until_s=np.where(which, now_s + self.rise_s + seconds, self.until_s),
+            before=np.where(which & (weight <= 0), values, value),
             after=np.where(which, values, self.after),
             since_s=now_s,
         )
@@ -127,26 +123,7 @@ class _Piece:
     @cached_property
     def over_s(self) -> float:
         """Time from which the face is the listener's; used at every tick."""
-        return max(part.ramp.over_s for part in (self.shown, self.eyes, self.head))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Asked:
-    """Commands since the last tick; the last one of each channel.
-
-    Attributes:
-        face, which, seconds: (58,) of `show`; `which` is bool.
-        direction_rad, look_s: of `look_at`; None without one.
-    """
-
-    face: Doubles
-    which: Bools
-    seconds: Doubles
-    direction_rad: Doubles | None = None
-    look_s: float = 0.0
-
-
-_NOTHING: Final = _Asked(face=np.zeros(MOTION_DIM), which=np.zeros(MOTION_DIM, bool), seconds=np.zeros(MOTION_DIM))
+        return max(part.over_s for part in (self.shown, self.eyes, self.head))
 
 
 class Puppet:
@@ -164,11 +141,10 @@ class Puppet:
         stiff = ["yaw" in blind, "pitch" in blind]
         self._head_share = np.where(stiff, 0.0, np.where(eyeless, 1.0, HEAD_SHARE))
         self._gain = np.where(stiff, 0.0, gaze.neck_gain)
-        self._asked = _NOTHING
-        self._lock = Lock()
-        shown = Request.none(MOTION_DIM, (RISE_S, FALL_S), CHANGE_S, smooth=False)
-        eyes = Request.none(2, (EYES_S, FALL_S), EYES_S, smooth=True)
-        head = Request.none(2, (HEAD_S, HEAD_S), HEAD_S, smooth=True)
+        # Commands since the last tick: a face (58,), its channels, seconds; or a direction (2,), None, seconds.
+        self._asked: deque[tuple[Doubles, Bools | None, float]] = deque()
+        shown = Request.none(MOTION_DIM, RISE_S, FALL_S, CHANGE_S, smooth=False)
+        eyes, head = Request.none(2, EYES_S, FALL_S, EYES_S), Request.none(2, HEAD_S, HEAD_S, HEAD_S)
         self._pieces = [_Piece(_NEVER_S, shown, eyes, head)]
 
     def show(self, face: Floats | Mapping[str, float], seconds: float) -> None:
@@ -177,16 +153,7 @@ class Puppet:
         Raises InputError for an unknown channel, a value that is not finite, a blendshape outside 0..1, a pose beyond
         pi or 1 m, and `seconds` that is not a positive number.
         """
-        values, which = _channels(face)
-        checked_s = _checked_seconds(seconds)
-        with self._lock:
-            before = self._asked
-            self._asked = replace(
-                before,
-                face=np.where(which, values, before.face),
-                which=which | before.which,
-                seconds=np.where(which, checked_s, before.seconds),
-            )
+        self._asked.append((*_channels(face), _checked_seconds(seconds)))
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float) -> None:
         """Look at a point in metres from the middle of the head: x forward, y to its left, z up. Never blocks.
@@ -196,10 +163,7 @@ class Puppet:
         point = np.array([x_m, y_m, z_m], np.float64)
         if not np.isfinite(point).all() or math.hypot(*point) < 0.01:
             raise InputError(f"look_at({x_m:g}, {y_m:g}, {z_m:g}) is not a point in front of a head, in metres")
-        direction_rad = direction_to(point)
-        checked_s = _checked_seconds(seconds)
-        with self._lock:
-            self._asked = replace(self._asked, direction_rad=direction_rad, look_s=checked_s)
+        self._asked.append((direction_to(point), None, _checked_seconds(seconds)))
 
     def overlay(self, motion: Floats, times_s: Doubles) -> Floats:
         """Return motion (N, 58) at (N,) instants with the commands. Never changes its input."""
@@ -218,26 +182,25 @@ class Puppet:
 
     def _take(self, earliest_s: float, latest_s: float) -> None:
         """Begin commands at the latest instant of this tick, and drop pieces that no later instant needs."""
-        with self._lock:
-            asked, self._asked = self._asked, _NOTHING
-        if asked is not _NOTHING:
+        if self._asked:
             now = self._pieces[-1]
-            since_s = max(latest_s, now.since_s)
-            shown = now.shown.then(asked.face, asked.which, asked.seconds, since_s)
-            eyes, head = now.eyes, now.head
-            if asked.direction_rad is not None:
-                both = np.ones(2, bool)
-                eyes, head = (each.then(asked.direction_rad, both, asked.look_s, since_s) for each in (eyes, head))
+            since_s, shown, eyes, head = max(latest_s, now.since_s), now.shown, now.eyes, now.head
+            while self._asked:
+                values, which, seconds = self._asked.popleft()
+                if which is not None:
+                    shown = shown.then(values, which, seconds, since_s)
+                else:
+                    eyes, head = (each.then(values, np.ones(2, bool), seconds, since_s) for each in (eyes, head))
             self._pieces.append(_Piece(since_s, shown, eyes, head))
         while len(self._pieces) > 1 and self._pieces[1].since_s <= earliest_s:
             self._pieces.pop(0)
 
     def _laid_over(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
         shown = piece.shown
-        weight = shown.ramp.at(times_s)
+        weight = shown.weights(times_s)
         out = np.where(weight > 0, motion + weight * (shown.values(times_s) - motion), motion)
         out = out.astype(np.float32)
-        looking = np.flatnonzero((piece.eyes.ramp.at(times_s) + piece.head.ramp.at(times_s)).any(axis=1))
+        looking = np.flatnonzero((piece.eyes.weights(times_s) + piece.head.weights(times_s)).any(axis=1))
         if len(looking):
             out[looking] = self._looking(piece, out[looking], times_s[looking])
         return out
@@ -245,11 +208,11 @@ class Puppet:
     def _looking(self, piece: _Piece, motion: Floats, times_s: Doubles) -> Floats:
         """Turn head and eyes of `motion` (N, 58), in place."""
         turned = piece.head.values(times_s) * self._head_share
-        motion[:, YAW_PITCH] += (piece.head.ramp.at(times_s) * (turned - motion[:, YAW_PITCH])).astype(np.float32)
+        motion[:, YAW_PITCH] += (piece.head.weights(times_s) * (turned - motion[:, YAW_PITCH])).astype(np.float32)
         wanted = piece.eyes.values(times_s) - self._gain * motion[:, YAW_PITCH]
         both = directions(motion, self._full_rad)  # (N, eye, axis)
         middle = both.mean(axis=1)
-        turn(motion, both + (piece.eyes.ramp.at(times_s) * (wanted - middle))[:, None], self._full_rad)
+        turn(motion, both + (piece.eyes.weights(times_s) * (wanted - middle))[:, None], self._full_rad)
         return motion
 
 

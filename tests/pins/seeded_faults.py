@@ -124,7 +124,7 @@ FAULTS = (
     Fault("runtime/halt.py", "return not path.parent.is_dir()", "return False", LOOP),
     Fault("runtime/loop.py", "if state.run.since_s == now_s and released.any():", "if False:", LOOP),
     Fault("runtime/loop.py", "if not parts.halt.causes:", "if True:", LOOP),
-    Fault("runtime/states.py", "    if now.halted:", "    if False:", LOOP),
+    Fault("runtime/states.py", "        elif halted:", "        elif False:", LOOP),
     # decoders
     Fault("sources/live_link.py", "if data[0] != VERSION:", "if data[0] > VERSION:", SOURCES),
     Fault("sources/live_link.py", "return motion_of(packet.values)", "return packet.values[:58]", SOURCES),

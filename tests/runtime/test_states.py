@@ -1,7 +1,6 @@
 """States of a run, and the presence of a person."""
 
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,64 +9,51 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, SpeakerFrame
-from sfms_robot.runtime.states import ARROWS, GONE_S, TURN_GAP_S, Presence, RunState, Situation, following
+from sfms_robot.runtime.states import ARROWS, GONE_S, TURN_GAP_S, Presence, RunState
 
 SITUATION = {
-    "starting": Situation(eased_in=False),
-    "idle": Situation(),
-    "listening": Situation(person=True),
-    "speaking": Situation(person=True, speaking=True),
-    "degraded": Situation(person=True, lost=("voice",)),
-    "halted": Situation(halted=("key",)),
-    "stopping": Situation(ending=True),
+    "starting": {"eased_in": False},
+    "idle": {},
+    "listening": {"person": True},
+    "speaking": {"person": True, "speaking": True},
+    "degraded": {"person": True, "lost": ("voice",)},
+    "halted": {"halted": ("key",)},
+    "stopping": {"ending": True},
 }
-situations = st.builds(
-    Situation,
-    eased_in=st.booleans(),
-    person=st.booleans(),
-    speaking=st.booleans(),
-    lost=st.sampled_from([(), ("voice",), ("listener", "yaw")]),
-    halted=st.sampled_from([(), ("key",), ("key", "page")]),
-    ending=st.booleans(),
-)
+situations = st.fixed_dictionaries({
+    **dict.fromkeys(("eased_in", "person", "speaking", "ending"), st.booleans()),
+    "lost": st.sampled_from([(), ("voice",), ("listener", "yaw")]),
+    "halted": st.sampled_from([(), ("key",), ("key", "page")]),
+})  # fmt: skip
 
 
 @pytest.mark.parametrize(("before", "after"), sorted(ARROWS))
 def test_every_arrow_is_taken_by_what_causes_it(before: str, after: str) -> None:
-    state = following(RunState(), SITUATION[before], 1.0)
+    state = RunState().then(1.0, **SITUATION[before])
     assert state.name == before
     if after in ("stopped", "fault"):
         ended = state.ended(2.0, "the supply is gone" if after == "fault" else None)
     else:
-        ended = following(state, SITUATION[after], 2.0)
+        ended = state.then(2.0, **SITUATION[after])
     assert ended.name == after and ended.since_s == 2.0
 
 
-@given(st.lists(situations, min_size=2, max_size=30))
-def test_no_arrow_is_taken_that_the_table_does_not_have(path: list[Situation]) -> None:
+@given(st.lists(situations, min_size=1, max_size=30), st.booleans())
+def test_only_arrows_of_the_table_are_taken_and_a_state_says_why(path, failed) -> None:
+    """A halt comes before everything but the end; lost parts are named; the end is final."""
     state = RunState()
-    for now_s, situation in enumerate(path, 1):
-        after = following(state, situation, float(now_s))
-        assert after.name == state.name or (state.name, after.name) in ARROWS
-        assert (after.since_s == now_s) == (after.name != state.name)
-        state = after
-
-
-@given(st.lists(situations, min_size=1, max_size=10), st.booleans())
-def test_what_is_said_is_so(path: list[Situation], failed: bool) -> None:
-    """A halt goes before everything but the end; what is lost is named; the end is final."""
-    state = RunState()
-    for now_s, situation in enumerate(path, 1):
-        state = following(state, situation, float(now_s))
-        if situation.halted and state.name != "stopping":
-            assert (state.name, state.why) == ("halted", situation.halted)
+    for now_s, facts in enumerate(path, 1):
+        before, state = state, state.then(float(now_s), **facts)
+        assert state.name == before.name or (before.name, state.name) in ARROWS
+        assert state.since_s == (before.since_s if state.name == before.name else now_s)
+        if facts["halted"] and state.name != "stopping":
+            assert (state.name, state.why) == ("halted", facts["halted"])
         if state.name == "degraded":
-            assert state.why == situation.lost != ()
+            assert state.why == facts["lost"] != ()
         if state.name in ("listening", "speaking", "idle"):
-            assert not situation.lost and state.doing == state.name
-    over = following(state, Situation(ending=True), 99.0).ended(100.0, "gone" if failed else None)
-    assert over.name == ("fault" if failed else "stopped")
-    assert following(over, Situation(person=True), 101.0) == over
+            assert not facts["lost"] and state.doing == state.name
+    over = state.then(99.0, ending=True).ended(100.0, "gone" if failed else None)
+    assert over.name == ("fault" if failed else "stopped") and over.then(101.0, person=True) == over
 
 
 def test_the_page_on_safety_has_every_arrow_with_its_cause_and_its_longest_time() -> None:
@@ -83,14 +69,6 @@ def test_the_page_on_safety_has_every_arrow_with_its_cause_and_its_longest_time(
             assert cells[1] and cells[2], line
             told |= {(a, b) for a in befores for b in afters if a != b and {a, b} <= names}
     assert told == ARROWS
-
-
-def test_states_follow_one_another_in_time() -> None:
-    state, seen = RunState(), []
-    for now_s, name in enumerate(("starting", "idle", "listening", "degraded", "speaking", "halted", "starting"), 1):
-        state = following(state, SITUATION[name], float(now_s))
-        seen.append(state.since_s)
-    assert all(a <= b for a, b in pairwise(seen))
 
 
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
@@ -122,30 +100,18 @@ class Room:
             self.presence = self.presence.after(SpeakerFrame(self.now_s, heard, face, says))  # type: ignore[arg-type]
 
 
-def test_a_voice_is_somebody_within_two_frames_and_hum_is_nobody() -> None:
+def test_a_voice_or_a_face_is_a_person_until_both_are_gone_for_a_while() -> None:
     room = Room()
-    room.goes_on(5.0)
-    assert not room.presence.person(room.now_s)
-    room.goes_on(2 * FRAME_S, voice)
-    assert room.presence.person(room.now_s)
-
-
-def test_a_face_alone_is_somebody_and_a_sound_card_that_gives_nothing_is_nobody() -> None:
-    room = Room()
-    room.goes_on(1.0, NONE)
-    assert not room.presence.person(room.now_s)
-    room.goes_on(FRAME_S, NONE, FACE)
-    assert room.presence.person(room.now_s)
-
-
-def test_who_is_neither_seen_nor_heard_is_gone_after_a_while_and_not_before() -> None:
-    room = Room()
-    room.goes_on(3.0)
-    room.goes_on(2.0, voice)
-    room.goes_on(GONE_S - 0.2)
-    assert room.presence.person(room.now_s)
-    room.goes_on(0.4)
-    assert not room.presence.person(room.now_s)
+    for seconds, audio, face, person in (
+        (5.0, hum, None, False),
+        (2 * FRAME_S, voice, None, True),
+        (GONE_S - 0.2, hum, None, True),
+        (0.4, hum, None, False),
+        (1.0, NONE, None, False),  # a sound card that gives nothing
+        (FRAME_S, NONE, FACE, True),
+    ):
+        room.goes_on(seconds, audio, face and FaceFrame(room.now_s + FRAME_S, face.pose, face.blendshapes))
+        assert room.presence.person(room.now_s) == person
 
 
 def test_pauses_between_its_words_and_what_the_person_says_do_not_end_its_turn() -> None:
@@ -165,13 +131,6 @@ def test_a_face_that_is_lost_leaves_the_person_where_they_were_seen() -> None:
     assert (seen.watched.seen_s, seen.watched.attention) == (0.9, 0.5) and seen.watched.place_m is place_m
     assert seen.after(SpeakerFrame(1.04, NONE)).watched == seen.watched
     assert seen.after(SpeakerFrame(1.04, NONE, face)).watched.place_m is None
-
-
-def test_the_robot_talks_while_its_own_voice_is_loud() -> None:
-    presence = Presence.start()
-    for time_s, said in ((0.04, None), (0.08, voice()), (0.12, SILENCE), (0.16, NONE)):
-        presence = presence.after(SpeakerFrame(time_s, NONE, agent_audio=said))
-    assert presence.watched.said_s == 0.08 and presence.watched.seen_s is None
 
 
 def test_what_does_not_come_any_more_is_not_answered_after_half_a_second() -> None:
