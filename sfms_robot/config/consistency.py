@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, Final
 
 from sfms_robot.config.joint import Expression, Joint
@@ -73,23 +74,30 @@ def _drives(head: Any) -> Iterator[str]:
     for name, joint in _sound(head.joints):
         yield from _unknown(joint.drive, f"joints.{name}.drive", head.expressions)
         yield from _mirror(name, joint, head.joints)
-    circles = list(_circles(head.expressions))
-    yield from circles
-    if circles:
-        return
-    sizes: dict[str, int] = {}
+    uses = {name: [used for used in _uses(node) if used in head.expressions] for name, node in head.expressions.items()}
+    sizes: dict[str | None, int] = {}
 
     def size(node: Expression | None) -> int:
-        if node is None:
-            return 0
-        if node.use is not None and node.use not in sizes:
-            sizes[node.use] = size(head.expressions.get(node.use))
-        return 1 + (sizes[node.use] if node.use is not None else sum(size(part) for part in node.parts))
+        return 0 if node is None else 1 + sizes.get(node.use, 0) + sum(size(part) for part in node.parts)
 
+    try:
+        for name in TopologicalSorter(uses).static_order():
+            sizes[name] = size(head.expressions[name])
+    except CycleError as error:
+        circle = error.args[1][::-1]
+        yield f"expressions.{circle[0]} uses itself: {' -> '.join(circle)}"
+        return
     for name, joint in _sound(head.joints):
         if (count := size(joint.drive)) > MOST_NODES:
             counted = "shared expressions counted where they are used"
             yield f"joints.{name}.drive has {count} nodes, {counted}; at most {MOST_NODES}"
+
+
+def _uses(node: Expression | None) -> set[str]:
+    """Return the shared expressions that are named in a node."""
+    if node is None:
+        return set()
+    return ({node.use} if node.use else set[str]()).union(*map(_uses, node.parts))
 
 
 def _unknown(node: Expression | None, where: str, expressions: Mapping[str, Any]) -> Iterator[str]:
@@ -118,28 +126,6 @@ def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint | None]) -> Iter
 
 def _not_a_joint(name: str, joints: Mapping[str, Any]) -> str:
     return f"{name!r} is not a joint of this head ({', '.join(joints)})"
-
-
-def _circles(expressions: Mapping[str, Expression | None]) -> Iterator[str]:
-    done: set[str] = set()
-
-    def names(node: Expression | None) -> set[str]:
-        """Return the shared expressions named below a node."""
-        if node is None:
-            return set()
-        return ({node.use} if node.use else set[str]()).union(*(names(part) for part in node.parts))
-
-    def visit(name: str, path: tuple[str, ...]) -> Iterator[str]:
-        if name in path:
-            circle = (*path[path.index(name) :], name)
-            yield f"expressions.{name} uses itself: {' -> '.join(circle)}"
-        elif name not in done:
-            for used in sorted(names(expressions.get(name))):
-                yield from visit(used, (*path, name))
-            done.add(name)
-
-    for name in expressions:
-        yield from visit(name, ())
 
 
 def _parts(head: Any) -> Iterator[str]:

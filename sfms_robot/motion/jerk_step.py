@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
-HAS_RUCKIG: Final = find_spec("ruckig") is not None
 _HALVINGS: Final = 16
 # Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
 SLACK: Final = 1e-9
@@ -61,13 +60,12 @@ class Stop(NamedTuple):
 
     def after(self, time_s: float) -> State:
         """Return way, speed and acceleration, with their signs, `time_s` into the stop; inf for its end."""
-        p, v, a, left = 0.0, self.speed, self.acceleration, time_s
+        state, left = (0.0, self.speed, self.acceleration), time_s
         for jerk, lasts in zip((-self.jerk, 0.0, self.jerk), self.times_s, strict=True):
             t = min(lasts, left)
             left -= t
-            p += t * (v + t * (a / 2 + t * jerk / 6))
-            v += t * (a + t * jerk / 2)
-            a += t * jerk
+            state = _moved(state, jerk, t)
+        p, v, a = state
         if left > 0:  # at the end speed and acceleration are 0 but for rounding
             return self.s * p, 0.0, 0.0
         return self.s * p, self.s * v, self.s * a
@@ -84,6 +82,12 @@ class Stop(NamedTuple):
             t = (a - math.sqrt(max(a * a + 2 * jerk * v, 0.0))) / jerk
             turn = self.s * t * (v + t * (a / 2 - t * jerk / 6))
         return min(end, turn, 0.0), max(end, turn, 0.0)
+
+
+def _moved(state: tuple[float, float, float], jerk: float, t: float) -> tuple[float, float, float]:
+    """Return position, speed and acceleration after `t` seconds of constant jerk."""
+    p, v, a = state
+    return p + t * (v + t * (a / 2 + t * jerk / 6)), v + t * (a + t * jerk / 2), a + t * jerk
 
 
 def lawful(state: State, low: float, high: float, bound: Bound) -> bool:
@@ -114,21 +118,6 @@ def moves_in(state: State, way: float, bound: Bound) -> bool:
     return way * speed >= 0 and way * (speed + 0.5 * acceleration * abs(acceleration) / bound.jerk) >= -_STANDS_RAD_S
 
 
-class Chase(Protocol):
-    """A way to a reference, for joints that share one tick."""
-
-    def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
-        """Return the state one tick after `before` on the way to `target`, both lawful; None without a lawful one."""
-
-
-ChaseFactory = Callable[[Sequence[Bound], float], Chase]
-
-
-def build_chase(bounds: Sequence[Bound], dt_s: float) -> Chase:
-    """Return the fastest way available for joints within `bounds` at ticks of `dt_s`."""
-    return TimeOptimalChase(bounds, dt_s) if HAS_RUCKIG else StopChase(bounds, dt_s)
-
-
 class TimeOptimalChase:
     """Chase by the first tick of ruckig's fastest way."""
 
@@ -145,6 +134,7 @@ class TimeOptimalChase:
         return given
 
     def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
+        """Return the state one tick after `before` on the way to `target`, both lawful; None without a lawful one."""
         given = self._inputs[joint]
         given.current_position, given.current_velocity, given.current_acceleration = ([x] for x in before)
         given.target_position, given.target_velocity, given.target_acceleration = ([x] for x in target)
@@ -192,16 +182,13 @@ class StopChase:
         position, speed, acceleration = before
         way, *rates = Stop.of(speed, acceleration, bound).after(self._dt_s)
         rising = min(max((bound.acceleration - s * acceleration) / bound.jerk, 0.0), self._dt_s)
-        pushed = [*before]
-        for jerk, lasts in ((s * bound.jerk, rising), (0.0, self._dt_s - rising)):
-            p, v, a = pushed
-            pushed = [
-                p + lasts * (v + lasts * (a / 2 + lasts * jerk / 6)),
-                v + lasts * (a + lasts * jerk / 2),
-                a + lasts * jerk,
-            ]
-        return (position + way, *rates), pushed
+        rising_to = _moved((position, speed, acceleration), s * bound.jerk, rising)
+        return (position + way, *rates), _moved(rising_to, 0.0, self._dt_s - rising)
 
 
 def _stops_at(state: State, bound: Bound) -> float:
     return state[0] + Stop.of(state[1], state[2], bound).after(math.inf)[0]
+
+
+Chase = TimeOptimalChase | StopChase
+FASTEST: Final[type[Chase]] = TimeOptimalChase if find_spec("ruckig") else StopChase

@@ -16,7 +16,7 @@ show it. The joints that they do not settle are looked at one by one.
 A joint that is found outside its own range starts there, and the range in force (`sfms_robot.ranges`) reaches out to
 it. There the law also says that the stop of a joint never turns back: it moves in or stands still, and its braking
 curve inherits that. Where the reference does not bring it in, `Recovery` does, so that it is inside its own range
-after `latest_in_s` for any reference, and stays.
+after a bounded time for any reference (docs/safety.md), and stays.
 
 Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
 the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
@@ -34,7 +34,7 @@ import numpy as np
 
 from sfms_robot.config import Head
 from sfms_robot.frames import Doubles
-from sfms_robot.motion.jerk_step import SLACK, Bound, ChaseFactory, State, Stop, build_chase, lawful, moves_in
+from sfms_robot.motion.jerk_step import FASTEST, SLACK, Bound, Chase, State, Stop, lawful, moves_in
 from sfms_robot.ranges import Bools, Range
 from sfms_robot.signals.minimum_jerk import minimum_jerk
 
@@ -172,7 +172,7 @@ class _Bounds:
 class JerkLimiter:
     """Limiter of joints that share one tick of `dt_s`. `chase`: the fastest available by default."""
 
-    def __init__(self, limits: JointLimits, dt_s: float, chase: ChaseFactory = build_chase) -> None:
+    def __init__(self, limits: JointLimits, dt_s: float, chase: type[Chase] = FASTEST) -> None:
         self._speed = limits.speed * _HEADROOM
         self._acceleration = limits.acceleration * _HEADROOM
         self._jerk = limits.jerk * _HEADROOM
@@ -198,17 +198,6 @@ class JerkLimiter:
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
         return self._found(replace(state, motion=motion), joints)
-
-    def latest_in_s(self, angles_rad: Doubles) -> Doubles:
-        """Return the time [s] (J,) after which joints found at `angles_rad` (J,) are in range for any reference.
-
-        The duration of the curve; then, from standing still at its end, the time to come to a stop wherever the joint
-        is by then, and to come in from there as fast as the limits allow.
-        """
-        out_rad = np.abs(angles_rad - self._own.nearest(angles_rad))
-        ramp = self._speed / self._acceleration + self._acceleration / self._jerk
-        latest = curve_s(out_rad, self._speed, self._acceleration, self._jerk) + out_rad / self._speed + 2 * ramp
-        return np.where(out_rad == 0, 0.0, latest)
 
     def _found(self, state: LimiterState, joints: Bools) -> LimiterState:
         angles_rad = state.motion[0]

@@ -103,7 +103,7 @@ class Serial:
         missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation)
         missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
         exact = np.asarray(missing_rad <= EXACT_RAD)
-        shown[..., :3] = np.where(exact[..., None], poses[..., :3], rotations.euler(rotation, _POSE_ORDER)[..., ::-1])
+        shown[..., :3] = np.where(exact[..., None], poses[..., :3], rotations.angles_of(rotation))
         reached = np.asarray(exact & (missing_m <= EXACT_M))
         return Solved(angles_rad=joints, reached=reached, residual_rad=missing_rad, residual_m=missing_m, shown=shown)
 
@@ -123,7 +123,7 @@ class Serial:
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         """Return the poses (..., 6) of joint angles (..., J); a search begins at `start` (..., 6)."""
         out = np.zeros((*angles_rad.shape[:-1], 6))
-        out[..., :3] = rotations.euler(self._rotation(angles_rad), _POSE_ORDER)[..., ::-1]
+        out[..., :3] = rotations.angles_of(self._rotation(angles_rad))
         return out
 
     def _axis_angles(self, poses: Doubles) -> Doubles:

@@ -183,7 +183,7 @@ class Platform:
                 break
             rotation[kept], place[kept] = turned[better], moved[better]
             error[kept], toward[kept] = new_error[better], new_toward[better]
-        return np.concatenate([rotations.euler(rotation, (2, 1, 0))[:, ::-1], place], axis=-1), _size(error)
+        return np.concatenate([rotations.angles_of(rotation), place], axis=-1), _size(error)
 
 
 def _size(error: Doubles) -> Doubles:

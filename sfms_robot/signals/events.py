@@ -5,7 +5,7 @@ Pure functions on arrays sampled at `rate_hz` (25 in this project). An event is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -132,7 +132,7 @@ def find_peaks(values: Doubles, prominence: float, distance: int = 1) -> tuple[I
     """
     peaks = _maxima(values)
     peaks = peaks[_far_apart(peaks, values[peaks], distance)]
-    prominences = _prominences(values, peaks)
+    prominences = np.array([_prominence(values, peak) for peak in peaks.tolist()])
     keep = prominences >= prominence
     return peaks[keep], prominences[keep]
 
@@ -201,27 +201,10 @@ def _far_apart(peaks: Indices, heights: Doubles, distance: int) -> NDArray[np.bo
     return keep
 
 
-def _prominences(values: Doubles, peaks: Indices) -> Doubles:
-    """Return the depth that separates each peak from the next higher one, on the side where it is smaller.
-
-    Only turning points are walked: a tick of the loop may wait for it.
-    """
-    turns = np.unique(np.r_[0, _maxima(values), _maxima(-values), len(values) - 1])
-    levels = values[turns].tolist()
-    before, after = _lowest_since_higher(levels), _lowest_since_higher(levels[::-1])[::-1]
-    at = np.searchsorted(turns, peaks)
-    prominences: Doubles = values[peaks] - np.maximum(np.array(before)[at], np.array(after)[at])
-    return prominences
-
-
-def _lowest_since_higher(levels: Sequence[float]) -> list[float]:
-    """Return for each level the lowest one since a higher one came, its own included."""
-    lowest: list[float] = []
-    falling: list[tuple[float, float]] = []  # levels that are still in sight, each with its lowest
-    for level in levels:
-        low = level
-        while falling and falling[-1][0] <= level:
-            low = min(low, falling.pop()[1])
-        falling.append((level, low))
-        lowest.append(low)
-    return lowest
+def _prominence(values: Doubles, peak: int) -> float:
+    """Return the depth that separates a peak from the next higher sample, on the side where it is smaller."""
+    higher = np.flatnonzero(values > values[peak])
+    side = int(np.searchsorted(higher, peak))
+    first = higher[side - 1] + 1 if side else 0
+    end = higher[side] if side < len(higher) else len(values)
+    return float(values[peak] - max(values[first : peak + 1].min(), values[peak:end].min()))

@@ -65,6 +65,11 @@ def euler(matrix: Doubles, axes: tuple[int, int, int]) -> Doubles:
     return np.stack([first, middle, last], axis=-1)
 
 
+def angles_of(matrix: Doubles) -> Doubles:
+    """Return roll, pitch, yaw (..., 3) of rotations (..., 3, 3); the roll is 0 where the pitch is a quarter turn."""
+    return euler(matrix, (2, 1, 0))[..., ::-1]
+
+
 def twist(matrix: Doubles, axis: int) -> Doubles:
     """Return the angle (...) of the turn about `axis` alone that is nearest to `matrix`."""
     first, second = (axis + 1) % 3, (axis + 2) % 3

@@ -21,9 +21,8 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, JAW_FULL_OPEN_RAD, MOTION_DIM, ORDERS, POSE, SHAPES, Doubles, Floats, reorder
+from sfms_robot.signals.rotations import angles_of
 from sfms_robot.signals.rotations import rotation as rotation_of
-
-LOCKED: Final = 1e-7  # cosine of an angle about y from which x and z cannot be told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,20 +207,6 @@ def _rotations(space: Space, values: Doubles) -> Doubles:
 
     turns: Doubles = Rotation.from_rotvec(values).as_matrix()
     return turns
-
-
-def angles_of(turns: Doubles) -> Doubles:
-    """Return the angles (N, 3) about the fixed axes x, y, z of rotations Rz Ry Rx (N, 3, 3), y within a quarter turn.
-
-    Where y is a whole quarter turn, x and z are one turn, and all of it is given to x.
-    """
-    level = np.hypot(turns[:, 0, 0], turns[:, 1, 0])
-    y = np.arctan2(-turns[:, 2, 0], level)
-    x = np.arctan2(turns[:, 2, 1], turns[:, 2, 2])
-    z = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
-    upright = level < LOCKED
-    x = np.where(upright, np.arctan2(-turns[:, 1, 2], turns[:, 1, 1]), x)
-    return np.stack([x, y, np.where(upright, 0.0, z)], axis=1)
 
 
 # --- FLAME's expression as ARKit blendshapes, with a matrix that the user brings --------------------------------------

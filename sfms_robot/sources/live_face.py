@@ -36,8 +36,7 @@ from sfms_robot.frames import (
     Floats,
     Sighting,
 )
-from sfms_robot.signals.rotations import rotation
-from sfms_robot.signals.spaces import angles_of
+from sfms_robot.signals.rotations import angles_of, rotation
 
 logger = logging.getLogger(__name__)
 
@@ -213,7 +212,7 @@ def _relative(motion: Floats, rest: Floats) -> Floats:
     out = np.zeros(MOTION_DIM, dtype=np.float32)
     both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
     at_rest, now = rotation(both[:, :3])
-    out[POSE][:3] = angles_of((at_rest.T @ now)[None])[0]
+    out[POSE][:3] = angles_of(at_rest.T @ now)
     out[POSE][3:] = at_rest.T @ (both[1, 3:] - both[0, 3:])
     level = rest[SHAPES]
     out[SHAPES] = np.clip((motion[SHAPES] - level) / (1.0 - level), 0.0, 1.0)

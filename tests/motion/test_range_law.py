@@ -11,7 +11,7 @@ from sfms_robot.config.head import held_back
 from sfms_robot.data import head_names
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
-from sfms_robot.motion.limits import JerkLimiter, JointLimits
+from sfms_robot.motion.limits import JerkLimiter, JointLimits, curve_s
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
 from sfms_robot.servo.bus import Goals
 from sfms_robot.servo.policy import BusServo
@@ -31,6 +31,18 @@ def sliver(head: Head) -> Head:
 
 
 SIZES = [lambda head: head, held_back, sliver]
+
+
+def latest_in_s(limits: JointLimits, angles) -> np.ndarray:
+    """Seconds (J,) after which joints found at `angles` are in range for any reference.
+
+    The duration of the curve; then, from standing still at its end, the time to come to a stop wherever the joint is
+    by then, and to come in from there as fast as the limits allow.
+    """
+    out_rad = np.abs(angles - limits.range.nearest(angles))
+    rates = limits.speed, limits.acceleration, limits.jerk
+    ramp_s = limits.speed / limits.acceleration + limits.acceleration / limits.jerk
+    return np.where(out_rad == 0, 0.0, 1e-6 + curve_s(out_rad, *rates) + out_rad / limits.speed + 2 * ramp_s)
 
 
 class Law:
@@ -53,7 +65,7 @@ class Law:
     def start(self, angles) -> None:
         self.state, self.audited = self.limiter.start(angles), self.audit.start(angles)
         self.found, self.last = angles.copy(), angles.copy()
-        self.due_s = self.limiter.latest_in_s(angles)
+        self.due_s = latest_in_s(self.limits, angles)
         for index, angle in enumerate(angles):
             self.goals.hold(index, angle)
 
@@ -64,7 +76,7 @@ class Law:
         for index in np.flatnonzero(joints):
             self.goals.hold(index, angles[index])
         self.last = angles
-        self.due_s = np.where(joints, self.limiter.latest_in_s(angles), self.due_s)
+        self.due_s = np.where(joints, latest_in_s(self.limits, angles), self.due_s)
 
     def tick(self, reference, sent) -> np.ndarray:
         goals, self.state = self.limiter.step(reference, self.state)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.signals import rotations
@@ -23,6 +24,14 @@ def test_pose_columns_are_those_of_the_frames_and_rotate_as_the_frames_say():
     by_hand = rotations.about(2, yaw) @ rotations.about(1, pitch) @ rotations.about(0, roll)
     assert POSE_CHANNELS == ("roll", "pitch", "yaw", "x", "y", "z")
     assert rotations.rotation(np.array([roll, pitch, yaw])) == pytest.approx(by_hand, abs=1e-15)
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-1.57, 1.57), st.floats(-np.pi, np.pi))
+def test_rotations_and_angles_are_those_of_scipy(roll, pitch, yaw):
+    turn = Rotation.from_euler("xyz", [roll, pitch, yaw])
+    assert rotations.rotation(np.array([roll, pitch, yaw])) == pytest.approx(turn.as_matrix(), abs=1e-12)
+    away = rotations.angles_of(turn.as_matrix()) - turn.as_euler("xyz")
+    assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).max() < 1e-9
 
 
 def test_plus_is_right_ear_down_nose_down_and_turn_to_the_left():

@@ -2,18 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, SHAPES
-from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import (
     JAW_FULL_OPEN_RAD,
     SPACES,
     FlameMatrix,
-    angles_of,
     bounded_least_squares,
     decode,
     encode,
@@ -36,31 +31,6 @@ def faces(count=40):
 def test_axes_are_a_rotation(space):
     axes = np.array(space.axes)
     assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
-
-
-ANGLE = st.floats(-np.pi, np.pi)
-
-
-@given(st.lists(st.tuples(ANGLE, ANGLE, ANGLE), min_size=1, max_size=5))
-def test_rotations_are_those_of_scipy(angles):
-    turns = rotation(np.array(angles))
-    assert turns == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix(), abs=1e-12)
-    assert rotation(angles_of(turns)) == pytest.approx(turns, abs=1e-7)
-
-
-@given(ANGLE, st.floats(-1.57, 1.57), ANGLE)
-def test_angles_are_those_of_scipy(x, y, z):
-    turn = Rotation.from_euler("xyz", [[x, y, z]])
-    away = angles_of(turn.as_matrix()) - turn.as_euler("xyz")
-    assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).max() < 1e-9
-
-
-@pytest.mark.parametrize("quarter", [-np.pi / 2, np.pi / 2])
-def test_a_quarter_turn_about_y_leaves_one_angle_for_two(quarter):
-    turn = rotation(np.array([[0.5, quarter, 0.2]]))
-    found = angles_of(turn)
-    assert found[0, 2] == 0
-    assert rotation(found) == pytest.approx(turn, abs=1e-12)
 
 
 def test_faceverse_and_back_is_the_same_face():
