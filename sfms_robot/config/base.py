@@ -13,17 +13,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Final, Self, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, InputError
 
 DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
-UNKNOWN_KEY: Final = "unknown_key"  # type of that problem, its key in the context
 _LEADING_ZERO: Final = "!leading-zero"
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -38,18 +37,34 @@ class Model(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _known_keys(cls, value: Any) -> Any:
+    def _known_keys(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Report unknown keys with the known ones, and then the other problems of the section."""
+        found = []
         for key, given in value.items() if isinstance(value, dict) else ():
             if key not in cls.model_fields:
-                context = {"key": key, "choices": ", ".join(cls.model_fields), "shown": repr(key)}
-                raise PydanticCustomError(UNKNOWN_KEY, "{shown} is not a known key ({choices})", context)
+                found.append(f"{key!r} is not a known key ({', '.join(cls.model_fields)})")
             # Python takes true for 1: `id: true` would be servo 1.
-            if isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
-                context = {"key": key, "shown": str(given).lower()}
-                raise PydanticCustomError("bool", "{key} = {shown} is neither a number nor a name", context)
-        return value
+            elif isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
+                found.append(f"{key} = {str(given).lower()} is neither a number nor a name")
+        if not found:
+            return handler(value)
+        details = [_detail(text) for text in found]
+        try:
+            handler({key: value[key] for key in cls.model_fields if key in value})
+        except ValidationError as error:
+            details += [_detail(each["msg"], each["loc"], each["input"]) for each in error.errors()]
+        raise ValidationError.from_exception_data(cls.__name__, details)
+
+
+def all_of(problems: Iterable[str]) -> ValidationError:
+    """Return the error of a model with several problems, for a validator to raise."""
+    return ValidationError.from_exception_data("", [_detail(text) for text in problems])
+
+
+def _detail(text: str, where: tuple[int | str, ...] = (), value: Any = ()) -> InitErrorDetails:
+    return InitErrorDetails(type=PydanticCustomError("problem", "{text}", {"text": text}), loc=where, input=value)
 
 
 def _takes_bool(annotation: Any) -> bool:
@@ -74,9 +89,9 @@ def parse(model: type[M], raw: object, file: Path | str) -> M:
         raise ConfigError(f"{file}: {one_line(problems[0])}{more}") from error
 
 
-def one_line(problem: ErrorDetails, where: str = "") -> str:
-    """Return key, value and problem in one line; `where` is put before the key."""
-    key = ".".join(filter(None, (where, *(str(part) for part in problem["loc"]))))
+def one_line(problem: ErrorDetails) -> str:
+    """Return key, value and problem in one line."""
+    key = ".".join(map(str, problem["loc"]))
     text = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "model_type":  # pydantic names the class
         text = "is no mapping (key: value)"

@@ -1,53 +1,26 @@
-"""All problems of a head's file at once, where `load_head` stops at the first.
+"""All problems of a head's file at once, where `load_head` names the first one.
 
-Each part of the file is parsed on its own, so that a mistake in one joint does not hide those of another; then the
-sound parts are checked against each other, and against the names of the others. The registers that a file may write
-into a servo, or expect to find stored there, are judged by its firmware map.
+Keys and values that are wrong by themselves come first; contradictions between the parts are looked for once there are
+none. The registers that a file may write into a servo, or expect to find stored there, are judged by its firmware map.
 """
 
 from __future__ import annotations
 
-import copy
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from types import SimpleNamespace
-from typing import Annotated, Any, Final
+from collections.abc import Iterator, Mapping
+from typing import Final
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import ValidationError
 
-from sfms_robot.config.base import UNKNOWN_KEY, Name, one_line, read
-from sfms_robot.config.consistency import problems
+from sfms_robot.config.base import one_line
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map
-from sfms_robot.config.head import Head, RobotDescription, expanded, load_head
-from sfms_robot.config.joint import BusConfig, Coupling, Expression, Fold, Joint, LimitClass, Region, Safety
-from sfms_robot.config.kinematics import Kinematics
+from sfms_robot.config.head import Head, load_head
+from sfms_robot.config.joint import Safety
 from sfms_robot.config.overlay import load_overlay
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
-_TABLES: Final[Mapping[str, Any]] = {
-    "buses": BusConfig,
-    "limits": LimitClass,
-    "joints": Joint,
-    "expressions": Expression,
-    "regions": Region,
-}
-_LISTS: Final[Mapping[str, Any]] = {"couplings": Coupling, "folds": Fold}
 _HARMLESS: Final = re.compile(r"(\w+_)?gain|profile_\w+|acceleration|punch|led|c?cw_compliance_(margin|slope)")
-
-
-class _Rest(Head):
-    """A head without checks of the parts above, of which only the names are used."""
-
-    buses: Annotated[dict[Name, Any], Field(min_length=1)]
-    limits: dict[Name, Any]
-    joints: Annotated[dict[Name, Any], Field(min_length=1)]
-    expressions: dict[Name, Any] = Field(default_factory=dict)
-    regions: dict[Name, Any] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _consistent(self) -> _Rest:
-        return self
 
 
 def check_head(name: str) -> list[str]:
@@ -57,79 +30,26 @@ def check_head(name: str) -> list[str]:
     """
     file = find("heads", name, "head.yaml") / "head.yaml"
     try:
-        found = [f"{file}: {line}" for line in _problems(read(file))]
-        if not found:
-            load_overlay(load_head(name))
+        head = load_head(name)
+        if not (found := list(_servos(head))):
+            load_overlay(head)
     except ConfigError as error:
-        return [str(error)]
-    return list(dict.fromkeys(found))
+        if not isinstance(error.__cause__, ValidationError):
+            return [str(error)]
+        found = [one_line(problem) for problem in error.__cause__.errors()]
+    return [f"{file}: {line}" for line in dict.fromkeys(found)]
 
 
-def _problems(raw: Any) -> list[str]:
-    if not isinstance(raw, dict):
-        return [f"a head is a table of {', '.join(Head.model_fields)}"]
-    try:
-        full = expanded(raw)
-    except ValueError as error:
-        return [str(error)]
-    found: list[str] = []
-    parts: dict[str, Any] = {}
-    names: dict[str, Any] = {}
-    for key, model in {**_TABLES, **_LISTS}.items():
-        given: Any = full.get(key, [] if key in _LISTS else {})
-        parts[key] = {}
-        if isinstance(given, list if key in _LISTS else dict):
-            entries: Iterable[Any] = given.items() if isinstance(given, dict) else enumerate(given)
-            parts[key] = {name: _parsed(model, value, f"{key}.{name}", found) for name, value in entries}
-            names |= {key: () if key in _LISTS else dict.fromkeys(raw[key])} if key in raw else {}
-    parts |= {key: list(parts[key].values()) for key in _LISTS}
-    parts["urdf"] = _parsed(RobotDescription | None, full.get("urdf"), "urdf", found)
-    parts["kinematics"] = _parsed(Kinematics | None, full.get("kinematics"), "kinematics", found)
-    _parsed(_Rest, {**raw, **names, "kinematics": None, "urdf": None}, "", found)
-    return found + [*_servos(parts["joints"], full.get("safety", {})), *problems(SimpleNamespace(**parts))]
-
-
-def _servos(joints: dict[str, Joint | None], safety: Any) -> Iterator[str]:
+def _servos(head: Head) -> Iterator[str]:
     """Yield the servos without a firmware map, and the registers that a run must not write."""
-    shared = _parsed(Safety, safety, "safety", [])  # its own problems are reported with the rest of the head
-    for name, joint in joints.items():
-        if joint is None:
-            continue
+    for name, joint in head.joints.items():
         try:
             table = load_firmware_map(joint.model)
         except ConfigError as error:
             yield f"joints.{name}.model: {error}"
             continue
-        rules = (shared or Safety()).merged(joint.safety)
-        for key, value, problem, choices in register_problems(rules, table):
+        for key, value, problem, choices in register_problems(head.safety_of(name), table):
             yield f"joints.{name}.safety.{key} = {value} {problem} ({', '.join(choices)})"
-
-
-def _parsed(model: Any, value: Any, where: str, found: list[str]) -> Any:
-    """Return `value` as `model`, or None with its problems added to `found`.
-
-    An unknown key, or a wrong drive, keeps the part around it from being checked any further. So it is reported and
-    removed, and the rest is checked again.
-    """
-    value, sound = copy.deepcopy(value), True
-    while True:
-        try:
-            parsed = TypeAdapter(model).validate_python(value)
-            return parsed if sound else None
-        except ValidationError as error:
-            unknown = [problem for problem in error.errors() if problem["type"] == UNKNOWN_KEY]
-            reported = unknown or error.errors()
-            found += [one_line(problem, where) for problem in reported]
-            drive = model is Joint and all("drive" in problem["loc"][:1] for problem in reported)
-            if not (unknown or drive):
-                return None
-            sound = False
-            for *steps, last in {(*p["loc"], p["ctx"]["key"]) if unknown else ("drive",) for p in reported}:
-                place = value
-                for step in steps:  # one that only names a choice of models, such as a kind, is passed over
-                    if isinstance(place, list) or step in place:
-                        place = place[step]
-                del place[last]
 
 
 def is_harmless(table: FirmwareMap, name: str) -> bool:

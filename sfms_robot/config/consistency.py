@@ -4,33 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from sfms_robot.config.joint import Expression, Joint
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.config.wire_time import BITS, FRAMINGS
 from sfms_robot.frames import CHANNEL_INDEX
 
+if TYPE_CHECKING:
+    from sfms_robot.config.head import Head
+
 MOST_NODES: Final = 2000
 HIGHEST_RATE_HZ: Final = 1000.0
 
 
-def problems(head: Any) -> list[str]:
-    """Return every contradiction between the parts of a head.
-
-    `head` has the attributes of `config.Head`; a part that is wrong in itself is None there, and is passed over.
-    """
+def problems(head: Head) -> list[str]:
+    """Return every contradiction between the parts of a head."""
     return [*_wiring(head), *_rates(head), *_drives(head), *_parts(head), *_neck(head), *_description(head)]
 
 
-def _sound(parts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    return ((name, part) for name, part in parts.items() if part is not None)
-
-
-def _wiring(head: Any) -> Iterator[str]:
+def _wiring(head: Head) -> Iterator[str]:
     """Yield the joints that are on no bus, of no limit class, or on another's id."""
     seen: dict[tuple[str, int], str] = {}
-    for name, joint in _sound(head.joints):
+    for name, joint in head.joints.items():
         if joint.bus not in head.buses:
             yield f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(head.buses)})"
         if joint.limits not in head.limits:
@@ -51,10 +47,10 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
     return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (BITS * framing.goals(joints)))))
 
 
-def _rates(head: Any) -> Iterator[str]:
+def _rates(head: Head) -> Iterator[str]:
     """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
-    for name, bus in _sound(head.buses):
-        count = sum(joint.bus == name for _, joint in _sound(head.joints))
+    for name, bus in head.buses.items():
+        count = sum(joint.bus == name for joint in head.joints.values())
         framing = FRAMINGS.get(bus.family)  # None for a family of another package
         longest = framing.longest if framing else 0  # 0: a board, which has no packet of all goals
         most = (longest - framing.write) // (framing.write_each + framing.goal) if framing and longest else count
@@ -65,85 +61,69 @@ def _rates(head: Any) -> Iterator[str]:
             yield f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}"
 
 
-def _drives(head: Any) -> Iterator[str]:
+def _drives(head: Head) -> Iterator[str]:
     """Yield unknown names, wrong mirrors, circles, and drives that are too large."""
-    for name, expression in head.expressions.items():
+    for name in head.expressions:
         if name in CHANNEL_INDEX:
             yield f"expressions.{name} has the name of a channel"
-        yield from _unknown(expression, f"expressions.{name}", head.expressions)
-    for name, joint in _sound(head.joints):
-        yield from _unknown(joint.drive, f"joints.{name}.drive", head.expressions)
-        yield from _mirror(name, joint, head.joints)
-    uses = {name: [used for used in _uses(node) if used in head.expressions] for name, node in head.expressions.items()}
-    sizes: dict[str | None, int] = {}
-
-    def size(node: Expression | None) -> int:
-        return 0 if node is None else 1 + sizes.get(node.use, 0) + sum(size(part) for part in node.parts)
-
+    trees = {f"expressions.{name}": tree for name, tree in head.expressions.items()}
+    trees |= {f"joints.{name}.drive": joint.drive for name, joint in head.joints.items() if joint.drive}
+    for where, tree in trees.items():
+        for node in tree.nodes():
+            if node.use and node.use not in head.expressions:
+                choices = "; ".join(filter(None, (", ".join(head.expressions), ", ".join(CHANNEL_INDEX))))
+                yield f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices})"
+    for name, joint in head.joints.items():
+        if joint.mirror_of is not None:
+            yield from _mirror(name, joint, head.joints)
+    uses = {name: {node.use for node in tree.nodes() if node.use} for name, tree in head.expressions.items()}
+    sizes: dict[str | None, int] = {}  # of shared expressions, those that they use in their places
     try:
-        for name in TopologicalSorter(uses).static_order():
-            sizes[name] = size(head.expressions[name])
+        for used in TopologicalSorter(uses).static_order():
+            sizes[used] = _size(head.expressions[used], sizes) if used in head.expressions else 0
     except CycleError as error:
         circle = error.args[1][::-1]
         yield f"expressions.{circle[0]} uses itself: {' -> '.join(circle)}"
         return
-    for name, joint in _sound(head.joints):
-        if (count := size(joint.drive)) > MOST_NODES:
+    for name, joint in head.joints.items():
+        if joint.drive and (count := _size(joint.drive, sizes)) > MOST_NODES:
             counted = "shared expressions counted where they are used"
             yield f"joints.{name}.drive has {count} nodes, {counted}; at most {MOST_NODES}"
 
 
-def _uses(node: Expression | None) -> set[str]:
-    """Return the shared expressions that are named in a node."""
-    if node is None:
-        return set()
-    return ({node.use} if node.use else set[str]()).union(*map(_uses, node.parts))
+def _size(tree: Expression, sizes: Mapping[str | None, int]) -> int:
+    return sum(1 + sizes.get(node.use, 0) for node in tree.nodes())
 
 
-def _unknown(node: Expression | None, where: str, expressions: Mapping[str, Any]) -> Iterator[str]:
-    if node is None:
-        return
-    if node.use is not None and node.use not in expressions:
-        choices = "; ".join(filter(None, (", ".join(expressions), ", ".join(CHANNEL_INDEX))))
-        yield f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices})"
-    for i, part in enumerate(node.parts):
-        yield from _unknown(part, f"{where}.{node.group}.{i}", expressions)
-
-
-def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint | None]) -> Iterator[str]:
+def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint]) -> Iterator[str]:
     twin = joint.mirror_of
-    if twin is None:
-        return
-    if twin not in joints:
+    if (other := joints.get(twin or "")) is None:
         yield f"joints.{name}.mirror_of = {_not_a_joint(twin, joints)}"
-        return
-    other = joints[twin]
-    if twin == name or (other is not None and other.mirror_of is not None):
+    elif twin == name or other.mirror_of is not None:
         yield f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"
-    elif other is not None and other.unit != joint.unit:
+    elif other.unit != joint.unit:
         yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
 
 
-def _not_a_joint(name: str, joints: Mapping[str, Any]) -> str:
+def _not_a_joint(name: str | None, joints: Mapping[str, Joint]) -> str:
     return f"{name!r} is not a joint of this head ({', '.join(joints)})"
 
 
-def _parts(head: Any) -> Iterator[str]:
+def _parts(head: Head) -> Iterator[str]:
     """Yield the joints of folds, couplings and regions that are unknown or claimed twice."""
     for index, fold in enumerate(head.folds):
-        if fold is not None and fold.into not in head.joints:
+        if fold.into not in head.joints:
             yield f"folds.{index}.into = {_not_a_joint(fold.into, head.joints)}"
-    couplings = [(index, coupling) for index, coupling in enumerate(head.couplings) if coupling is not None]
-    for index, coupling in couplings:
-        yield from (
-            f"couplings.{index}.keep: {_not_a_joint(n, head.joints)}" for n in coupling.keep if n not in head.joints
-        )
-        for other, rival in couplings:
+    for index, coupling in enumerate(head.couplings):
+        for name in coupling.keep:
+            if name not in head.joints:
+                yield f"couplings.{index}.keep: {_not_a_joint(name, head.joints)}"
+        for other, rival in enumerate(head.couplings):
             for name in coupling.moving:
                 if other != index and rival.keep.get(name):
                     yield f"couplings.{index}.moving: {name!r} is also in couplings.{other}, one would undo the other"
     owner: dict[str, str] = {}
-    for name, region in _sound(head.regions):
+    for name, region in head.regions.items():
         for joint in region.joints:
             if joint not in head.joints:
                 yield f"regions.{name}.joints: {_not_a_joint(joint, head.joints)}"
@@ -151,20 +131,20 @@ def _parts(head: Any) -> Iterator[str]:
                 yield f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}"
 
 
-def _neck(head: Any) -> Iterator[str]:
+def _neck(head: Head) -> Iterator[str]:
     """Yield the neck's joints that are unknown, have a drive or a fold, or do not rest where the neck is at home."""
     if (neck := head.kinematics) is None:
         return
     for index, fold in enumerate(head.folds):
-        if fold is not None and fold.into in neck.joints():
+        if fold.into in neck.joints():
             yield f"folds.{index}.into = {fold.into!r}: the neck moves this joint (kinematics)"
     for name in neck.joints():
-        joint = head.joints.get(name)
-        if name not in head.joints:
+        if (joint := head.joints.get(name)) is None:
             yield f"kinematics: {_not_a_joint(name, head.joints)}"
-        elif joint is not None and joint.drive is not None:
+            continue
+        if joint.drive is not None:
             yield f"joints.{name}.drive: the neck moves this joint (kinematics), leave its drive out"
-        if joint is None or not isinstance(neck, SerialNeck):
+        if not isinstance(neck, SerialNeck):
             continue
         if not joint.min_rad <= 0.0 <= joint.max_rad:
             yield f"joints.{name}: its range leaves out 0, where the neck stands at home"
@@ -172,7 +152,7 @@ def _neck(head: Any) -> Iterator[str]:
             yield f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"
 
 
-def _description(head: Any) -> Iterator[str]:
+def _description(head: Head) -> Iterator[str]:
     """Yield the joints of the URDF section that the head lacks, and joints of the URDF that two of ours would move."""
     if head.urdf is None:
         return

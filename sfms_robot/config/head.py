@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, load
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, all_of, load
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.joint import (
     BusConfig,
@@ -180,16 +180,15 @@ class Head(Model):
         """Folder of its file; None for a head that was made otherwise."""
         return self._folder
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _expanded(cls, value: Any) -> Any:
-        return expanded(value)
+    def _expanded(cls, value: Any, handler: ModelWrapValidatorHandler[Head]) -> Head:
+        return handler(expanded(value))
 
     @model_validator(mode="after")
     def _consistent(self) -> Head:
         if found := problems(self):
-            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-            raise ValueError(found[0] + more)
+            raise all_of(found)
         return self
 
     def safety_of(self, joint: str) -> Safety:

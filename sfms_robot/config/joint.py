@@ -9,6 +9,8 @@ from rest where it is "rad".
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, StrictInt, ValidationInfo, WithJsonSchema, model_validator
@@ -21,10 +23,18 @@ GROUPS: Final = ("sum", "max", "min", "mean", "product")
 KINDS: Final = ("channel", "use", *GROUPS)
 MOST_FACTORS: Final = 4
 SMALLEST_STEP: Final = 1e-6  # of a curve's x
-MEASURED_FAULTS: Final = ("input voltage", "overheating")  # a threshold may be given for these
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
 
+
+def _channel(name: str) -> str:
+    if name not in CHANNEL_INDEX:
+        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+    return name
+
+
+Channel = Annotated[str, AfterValidator(_channel)]
+Parts = Annotated[tuple["Expression", ...], Field(min_length=1)]
 Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded: no drive can overflow
 Knob = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)]
 Lag = Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)]  # ms; the horizon of a plan is 320
@@ -42,15 +52,15 @@ class Expression(Model):
         clamp: (low, high) of the result.
     """
 
-    channel: str | None = None
+    channel: Channel | None = None
     use: str | None = None
-    sum: tuple[Expression, ...] | None = None
-    max: tuple[Expression, ...] | None = None
-    min: tuple[Expression, ...] | None = None
-    mean: tuple[Expression, ...] | None = None
-    product: tuple[Expression, ...] | None = None
+    sum: Parts | None = None
+    max: Parts | None = None
+    min: Parts | None = None
+    mean: Parts | None = None
+    product: Annotated[Parts, Field(max_length=MOST_FACTORS)] | None = None
     dead_band: NonNegative = 0.0
-    curve: tuple[tuple[Gain, Gain], ...] | None = None
+    curve: Annotated[tuple[tuple[Gain, Gain], ...], Field(min_length=2)] | None = None
     gain: Gain = 1.0
     gain_up: Gain | None = None
     gain_down: Gain | None = None
@@ -69,17 +79,9 @@ class Expression(Model):
         kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(kinds) != 1:
             raise ValueError(f"needs exactly one of {', '.join(KINDS)}; has {', '.join(kinds) or 'none'}")
-        if self.channel is not None:
-            _check_channel(self.channel)
-        if kinds[0] in GROUPS and not self.parts:
-            raise ValueError(f"{kinds[0]} is empty")
-        if self.product is not None and len(self.product) > MOST_FACTORS:
-            raise ValueError(f"product has {len(self.product)} factors, at most {MOST_FACTORS}")
         if self.clamp is not None and self.clamp[0] >= self.clamp[1]:
             raise ValueError(f"clamp {list(self.clamp)} is reversed or empty")
-        if self.curve is not None and len(self.curve) < 2:
-            raise ValueError(f"curve has {len(self.curve)} point, needs at least 2")
-        for (before, _), (after, _) in zip(self.curve or (), (self.curve or ())[1:], strict=False):
+        for (before, _), (after, _) in pairwise(self.curve or ()):
             if after - before < SMALLEST_STEP:
                 raise ValueError(f"curve is not a function: x goes from {before:g} to {after:g}, it has to rise")
         return self
@@ -99,15 +101,15 @@ class Expression(Model):
         down = self.gain if self.gain_down is None else self.gain_down
         return down, self.gain if self.gain_up is None else self.gain_up
 
+    def nodes(self) -> Iterator[Expression]:
+        """Yield this node and all below it, without those of shared expressions."""
+        yield self
+        for part in self.parts:
+            yield from part.nodes()
+
     def channels(self) -> set[str]:
         """Return every channel below this node, without those of shared expressions."""
-        own = {self.channel} if self.channel else set[str]()
-        return own.union(*(part.channels() for part in self.parts))
-
-
-def _check_channel(name: str) -> None:
-    if name not in CHANNEL_INDEX:
-        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+        return {node.channel for node in self.nodes() if node.channel}
 
 
 class Coupling(Model):
@@ -133,14 +135,9 @@ class Coupling(Model):
 class Fold(Model):
     """A channel without a joint, shown by the joint of another: `gain` x channel is added to that joint's drive."""
 
-    channel: str
+    channel: Channel
     into: Name
     gain: Gain
-
-    @model_validator(mode="after")
-    def _known(self) -> Fold:
-        _check_channel(self.channel)
-        return self
 
 
 class Region(Model):
@@ -216,14 +213,7 @@ class Faults(Model):
     """The servo faults that cause a reaction, by the names in the firmware map."""
 
     mask: tuple[str, ...] = ()
-    thresholds: dict[str, Threshold] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _measurable(self) -> Faults:
-        for name in self.thresholds:
-            if name not in MEASURED_FAULTS:
-                raise ValueError(f"thresholds.{name} is about nothing that is measured ({', '.join(MEASURED_FAULTS)})")
-        return self
+    thresholds: dict[Literal["input voltage", "overheating"], Threshold] = Field(default_factory=dict)
 
 
 class LimitClass(Model):

@@ -12,6 +12,7 @@ from sfms_robot.config.base import Model, Name, NonNegative, Positive, Share, pa
 from sfms_robot.config.listener import Arig, Count, Levels, Sfms, check_heads
 from sfms_robot.errors import ConfigError
 
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
 _RESUMABLE = frozenset({"checkpoint_every", "checkpoint_minutes", "patience"})
 
@@ -107,7 +108,7 @@ class PredictorTraining(Phase):
 class Training(Model):
     """Training of an SFMS listener: `configs/training/NAME.yaml`."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    seed: Seed = 1
     listener: Sfms
     tokenizer: TokenizerTraining
     predictor: PredictorTraining
@@ -224,7 +225,7 @@ class ArigPhase(Phase):
 class ArigTraining(Model):
     """Training of an ARIG listener: `configs/training/arig.yaml`."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    seed: Seed = 1
     listener: Arig
     training: ArigPhase
 
@@ -293,6 +294,6 @@ class Grouped(Baseline):
 class Recipe(Model):
     """One tokenizer of the comparison tables and how it is trained; its keyframes are for an sfms tokenizer alone."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    seed: Seed = 1
     model: Annotated[Sfms | Dense | Grouped, Field(discriminator="kind")]
     training: TokenizerTraining

@@ -26,9 +26,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -85,8 +85,7 @@ def curve_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: 
     return np.asarray(np.maximum.reduce([v / speed, np.sqrt(a / acceleration), np.cbrt(j / jerk)]).clip(GENTLE_S))
 
 
-@dataclass(frozen=True)
-class Recovery:
+class Recovery(NamedTuple):
     """The curves by which joints that were found outside their own ranges come in, (J,) each.
 
     From the angle where a joint was found to the near end of its range leads a quintic with neither speed nor
@@ -114,7 +113,7 @@ class Recovery:
 
     def replaced(self, joints: Bools, by: Recovery) -> Recovery:
         """Return the curves with others for some `joints` (J,)."""
-        return Recovery(*(np.where(joints, getattr(by, f.name), getattr(self, f.name)) for f in fields(self)))
+        return Recovery(*(np.where(joints, new, old) for new, old in zip(by, self, strict=True)))
 
     def now(self) -> Doubles:
         """Return angle, speed and acceleration (3, J) of the curves."""
@@ -211,7 +210,7 @@ class JerkLimiter:
         if state.recovery is None:
             after, chased, refused = self._tick(reference_rad, state.motion, self._own_bounds)
             return after[0].copy(), LimiterState(after, None, state.chased + chased, state.refused + refused)
-        recovery = replace(state.recovery, elapsed_s=state.recovery.elapsed_s + self._dt_s)
+        recovery = state.recovery._replace(elapsed_s=state.recovery.elapsed_s + self._dt_s)
         outside = ~self._own.holds(state.motion[0])
         guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
         within = self._within(self._own.reaching(state.motion[0]))

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -58,8 +59,7 @@ _FARTHEST = 1e6  # m or rad
 _JAW_OPEN = CHANNEL_INDEX["jawOpen"]
 
 
-@dataclass(frozen=True)
-class _Knots:
+class _Knots(NamedTuple):
     """Frames with slope and curvature: times (K,), the others (K, 58), per second."""
 
     times_s: Doubles
@@ -67,12 +67,8 @@ class _Knots:
     slopes: Doubles
     bends: Doubles
 
-    def fields(self) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-        return self.times_s, self.values, self.slopes, self.bends
-
     def part(self, first: int, stop: int) -> _Knots:
-        cut = slice(first, stop)
-        return _Knots(self.times_s[cut], self.values[cut], self.slopes[cut], self.bends[cut])
+        return _Knots(*(each[first:stop] for each in self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +255,7 @@ def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> 
         in_play = int(np.searchsorted(times_s, played_s, side="left"))  # the knot that ends the piece in play
         if in_play == len(times_s) - 1:  # that knot is extrapolated: leave the piece at its present point
             known, here = old.knots.part(max(0, in_play - HISTORY), in_play), _here(old, played_s)
-            return _Knots(*(np.concatenate(pair) for pair in zip(known.fields(), here.fields(), strict=True))), False
+            return _Knots(*map(np.concatenate, zip(known, here, strict=True))), False
         before = int(np.searchsorted(times_s[:-1], first_s - step_s / 4, side="left"))
         return old.knots.part(max(0, min(in_play, before) - HISTORY), max(in_play + 1, before)), False
     at_s = np.array([played_s if math.isfinite(played_s) else first_s - step_s])

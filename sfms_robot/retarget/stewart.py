@@ -8,7 +8,7 @@ sphere where
 
 s = +-1 being the side the crank is mounted on. No solution where |k| > 1: the rod is too short or too long.
 q is linear in (R, t), so all legs of many poses are one matrix product. The other way round there is no closed form:
-damped Newton on the six rod lengths, from a pose nearby.
+the six rod lengths are solved for the pose, from one nearby (scipy).
 
 The body takes the yaw beyond the platform's part, or the slow part of it; the platform gets the rest, shrunk toward its
 home where it is out of reach. In reach is a pose that keeps the lean limits of the head, has all cranks inside their
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -31,10 +32,8 @@ from sfms_robot.frames import POSE_CHANNELS, Doubles
 from sfms_robot.retarget.neck import Ranges, Solved, checked, low_pass
 from sfms_robot.signals import rotations
 
-MAX_STEPS: Final = 60
-SHORTEST_STEP: Final = 1e-3
-CLOSE_ENOUGH_M: Final = 1e-15  # rod lengths' error at which Newton stops at once; rounding often stops it before
-ARRIVED_M: Final = 1e-12
+TOLERANCE: Final = 1e-14  # of a pose that is searched for
+ARRIVED_M: Final = 1e-12  # error of the rods' lengths
 FOLLOW_STEPS: Final = 16
 MIN_STIFFNESS: Final = 0.02  # share of the stiffness (determinant) at home
 DEAD_CENTRE: Final = 0.999  # a crank turns at most some 22 times as fast as in the middle of its stroke
@@ -106,98 +105,54 @@ class Platform:
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         """Return the poses (..., 6) of crank angles (..., 6), from a pose (..., 6) nearby: the last one, or home.
 
-        Several poses fit the same cranks: where Newton arrives at one with a loose direction in between, it follows
-        the cranks in small steps from `start` instead. A row is NaN where its angles are not finite, no pose has
-        them, or `start` is not a pose of this platform.
+        A row is NaN where its angles are not finite, no pose has them, or `start` is not a pose of this platform. Takes
+        a millisecond a pose.
         """
-        angles = np.reshape(angles_rad, (-1, 6))
-        begin = np.broadcast_to(start, angles_rad.shape).reshape(-1, 6)
-        before = self.inverse(begin)
-        out = np.full(angles.shape, np.nan)
-        sound = np.isfinite(angles).all(axis=-1) & np.isfinite(before).all(axis=-1)
-        out[sound] = self._forward(angles[sound], begin[sound], before[sound])
-        return out.reshape(angles_rad.shape)
+        begin, out = np.broadcast_to(start, angles_rad.shape), np.full(angles_rad.shape, np.nan)
+        for row in np.ndindex(angles_rad.shape[:-1]):
+            out[row] = self._pose(angles_rad[row], begin[row])
+        return out
 
-    def _forward(self, angles: Doubles, begin: Doubles, before: Doubles) -> Doubles:
-        """Return the poses (n, 6) of crank angles (n, 6), from poses (n, 6) with cranks at `before` (n, 6)."""
-        found, off_m = self._newton(angles, begin)
-        same_side = self.stiffness(found, angles) * self.stiffness(begin, before) > 0
-        astray = np.flatnonzero((off_m > ARRIVED_M) | ~same_side)
-        if astray.size:
-            here, left_m = begin[astray], off_m[astray]
-            for share in np.arange(1, FOLLOW_STEPS + 1) / FOLLOW_STEPS:
-                here, left_m = self._newton(before[astray] + share * (angles[astray] - before[astray]), here)
-            found[astray], off_m[astray] = here, left_m
-        found[off_m > ARRIVED_M] = np.nan
-        return found
+    def _pose(self, angles: Doubles, begin: Doubles) -> Doubles:
+        """Return the pose (6,) of crank angles (6,).
+
+        Several poses fit the same cranks: where the search arrives at one with a loose direction in between, it follows
+        the cranks in small steps from `begin` instead.
+        """
+        from scipy.optimize import root  # only pictures of a head need it
+
+        before = self.inverse(begin)
+        for steps in (1, FOLLOW_STEPS) if np.isfinite([angles, before]).all() else ():
+            pose = begin
+            for share in np.arange(1, steps + 1) / steps:
+                tips = self._tips(before + share * (angles - before))
+                found = root(partial(self._excess_m, tips=tips), pose, tol=TOLERANCE)
+                pose = np.asarray(found.x)
+            same_side = self.stiffness(pose, angles) * self.stiffness(begin, before) > 0
+            if np.abs(found.fun).max() < ARRIVED_M and (same_side or steps > 1):
+                return pose
+        return np.full(6, np.nan)
+
+    def _excess_m(self, pose: Doubles, tips: Doubles) -> Doubles:
+        """Return the excess length (6,) of each rod, to first order."""
+        toward = self.rod_ends_m(rotations.rotation(pose[:3]), pose[3:]) - tips
+        return np.asarray(((toward * toward).sum(-1) - self.rod_m**2) / (2 * self.rod_m))
 
     def stiffness(self, poses: Doubles, angles_rad: Doubles) -> Doubles:
         """Return the determinant (...) of rod lengths against motion of the head; 0 for a head with a loose direction.
 
         Beyond 0, with the other sign, lie poses that these cranks also fit but can only reach by falling through.
         """
-        flat, cranks = poses.reshape(-1, 6), angles_rad.reshape(-1, 6)
-        rotation = rotations.rotation(flat[:, :3])
-        _, toward = self._errors(rotation, flat[:, 3:], self._tips(cranks))
-        determinant: Doubles = np.linalg.det(self._jacobian(rotation, toward))
-        return determinant.reshape(poses.shape[:-1])
+        rotation = rotations.rotation(poses[..., :3])
+        # The change of the rods' lengths with a rotation vector w, then a shift, of the head: (w x arm) . pull =
+        # w . (arm x pull), pull being the direction of a rod, seen from the body.
+        toward = self.rod_ends_m(rotation, poses[..., 3:]) - self._tips(angles_rad)
+        arm = self.rod_arms_m @ np.swapaxes(rotation, -1, -2)
+        pull = np.einsum("...li,lij->...lj", toward, self.turn) / self.rod_m
+        return np.asarray(np.linalg.det(np.concatenate([np.cross(arm, pull), pull], axis=-1)))
 
     def _tips(self, angles: Doubles) -> Doubles:
         return self.crank_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
-
-    def _errors(self, rotation: Doubles, place: Doubles, tips: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the excess length (n, 6) [m] of each rod, to first order, and the vectors tip -> rod end (n, 6, 3)."""
-        toward = self.rod_ends_m(rotation, place) - tips
-        return ((toward * toward).sum(-1) - self.rod_m**2) / (2 * self.rod_m), toward
-
-    def _jacobian(self, rotation: Doubles, toward: Doubles) -> Doubles:
-        """Return the change of the errors (n, 6, 6) with a rotation vector, then a shift, of the head."""
-        arm = self.rod_arms_m @ np.swapaxes(rotation, -1, -2)
-        pull = np.einsum("nli,lij->nlj", toward, self.turn) / self.rod_m  # the rods' directions, seen from the body
-        jacobian = np.empty((len(toward), 6, 6))
-        for axis in range(3):  # w x arm . pull = w . (arm x pull)
-            first, second = (axis + 1) % 3, (axis + 2) % 3
-            jacobian[..., axis] = arm[..., first] * pull[..., second] - arm[..., second] * pull[..., first]
-        jacobian[..., 3:] = pull
-        return jacobian
-
-    def _newton(self, angles: Doubles, start: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the poses (n, 6) with these crank angles (n, 6), and the final error of each (n,) [m]."""
-        rotation, place = rotations.rotation(start[:, :3]), start[:, 3:].copy()
-        tips = self._tips(angles)
-        error, toward = self._errors(rotation, place, tips)
-        for _ in range(MAX_STEPS):
-            busy = np.flatnonzero(_size(error) > CLOSE_ENOUGH_M)
-            if not busy.size:
-                break
-            step = _solve(self._jacobian(rotation[busy], toward[busy]), -error[busy])
-            length, better = np.ones(len(busy)), np.zeros(len(busy), dtype=bool)
-            while not better.all() and length.min() > SHORTEST_STEP:  # damping: half as far where it got no better
-                part = step * length[:, None]
-                turned, moved = rotations.from_vector(part[:, :3]) @ rotation[busy], place[busy] + part[:, 3:]
-                new_error, new_toward = self._errors(turned, moved, tips[busy])
-                better = _size(new_error) < _size(error[busy])
-                length = np.where(better, length, length / 2)
-            kept = busy[better]
-            if not kept.size:
-                break
-            rotation[kept], place[kept] = turned[better], moved[better]
-            error[kept], toward[kept] = new_error[better], new_toward[better]
-        return np.concatenate([rotations.angles_of(rotation), place], axis=-1), _size(error)
-
-
-def _size(error: Doubles) -> Doubles:
-    return np.asarray(np.linalg.norm(error, axis=-1))
-
-
-def _solve(matrices: Doubles, right: Doubles) -> Doubles:
-    """Return Newton steps (n, 6); by least squares, which handles a singular start, only where it is needed."""
-    column = right[..., None]
-    try:
-        steps = np.linalg.solve(matrices, column)
-    except np.linalg.LinAlgError:
-        steps = np.asarray(np.linalg.pinv(matrices) @ column)
-    return np.asarray(steps[..., 0], dtype=np.float64)
 
 
 class Stewart:

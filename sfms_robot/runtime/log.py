@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
@@ -126,7 +127,8 @@ class RunLog:
 
     def __post_init__(self) -> None:
         worker = ThreadPoolExecutor(1, "event counter")
-        worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
+        # Its thread begins, and loads what it searches with, before the loop's takes real-time priority.
+        worker.submit(import_module, "scipy.signal").result()
         rate_hz = 1.0 / self.period_s
         self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 

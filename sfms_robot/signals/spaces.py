@@ -10,7 +10,6 @@ A rotation R of a space turns our head by A R A^T, where A takes the space's axe
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -35,7 +34,6 @@ class Space:
         euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
         axes: A (3, 3), rows are our x, y, z in the space's axes.
         neutral: rotation of a face that looks straight ahead, as the space writes it.
-        verified: proof of the axes; None: they are unproved and may have to be flipped.
     """
 
     dim: int
@@ -46,9 +44,9 @@ class Space:
     euler: bool = False
     axes: tuple[tuple[int, int, int], ...]
     neutral: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    verified: str | None = None
 
 
+# The axes of both are unproved and may have to be flipped.
 # FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
 # row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
 SPACES: Final[Mapping[str, Space]] = {
@@ -284,7 +282,22 @@ def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
     """
     if order not in ORDERS:
         raise ConfigError(f"order {order!r} is not known ({', '.join(ORDERS)})")
-    names, values = _npy(file, order) if file.suffix == ".npy" else _csv(file, order)
+    names, known = ORDERS[order], (*BLENDSHAPES, "_neutral")
+    try:
+        if file.suffix == ".npy":
+            values = np.load(file, allow_pickle=False).astype(np.float64)
+        else:
+            cells = np.loadtxt(file, dtype=str, delimiter=",", comments=None, encoding="utf-8", ndmin=2)
+            if cells[0, 0] in known:
+                names, cells = tuple(cells[:, 0].tolist()), cells[:, 1:]
+            values = cells.astype(np.float64)
+    except (OSError, ValueError, IndexError) as error:
+        raise ConfigError(f"{file}: not a matrix of numbers: {error}") from error
+    for name in names:
+        if name not in known:
+            raise ConfigError.at(file, "row", name, "is not a blendshape", BLENDSHAPES)
+        if names.count(name) > 1:
+            raise ConfigError.at(file, "row", name, "is given twice")
     if values.ndim != 2 or values.shape[1] < COEFFICIENTS:
         raise ConfigError(f"{file}: is {values.shape}, not a row of at least {COEFFICIENTS} per blendshape")
     if len(values) != len(names):
@@ -298,31 +311,3 @@ def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
     if not rows.any():
         raise ConfigError(f"{file}: holds nothing but zeros")
     return FlameMatrix(rows)
-
-
-def _npy(file: Path, order: str) -> tuple[tuple[str, ...], Doubles]:
-    try:
-        return ORDERS[order], np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{file}: cannot be read as a matrix: {error}") from error
-
-
-def _csv(file: Path, order: str) -> tuple[tuple[str, ...], Doubles]:
-    try:
-        with file.open(encoding="utf-8", newline="") as text:
-            cells = [row for row in csv.reader(text) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
-    names = ORDERS[order]
-    if cells and cells[0][0] in (*BLENDSHAPES, "_neutral"):
-        names = tuple(row[0] for row in cells)
-        unknown = [name for name in names if name not in (*BLENDSHAPES, "_neutral")]
-        if unknown or len(set(names)) < len(names):
-            wrong = unknown[0] if unknown else next(name for name in names if names.count(name) > 1)
-            problem = "is not a blendshape" if unknown else "is given twice"
-            raise ConfigError.at(file, "row", wrong, problem, BLENDSHAPES if unknown else ())
-        cells = [row[1:] for row in cells]
-    try:
-        return names, np.array(cells, dtype=np.float64)
-    except ValueError as error:
-        raise ConfigError(f"{file}: not a matrix of numbers: {error}") from error

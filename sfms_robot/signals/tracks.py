@@ -2,7 +2,7 @@
 
 Columns go by name, in any case, so the column order of the Live Link app, of its UDP packet, of Apple's header and of
 MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without one
-they are radians and metres. Axes and signs of a source are one row of `SOURCES`; an unproved sign is marked there.
+they are radians and metres. Axes of other sources are turned into ours.
 
 A row of NaN means: no face was seen.
 """
@@ -38,36 +38,12 @@ from sfms_robot.frames import (
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class SourceAxes:
-    """Conversion of one source's head pose to ours: roll + right ear down, pitch + nose down, yaw + own left.
-
-    Attributes:
-        angles: sign of its roll, pitch, yaw.
-        position: its axis for our x (forward), y (left), z (up).
-        from_camera: position is measured from a camera, so its median over the file is subtracted.
-        verified: proof of the signs; None: they are unproved and may have to be flipped.
-    """
-
-    angles: tuple[int, int, int]
-    position: tuple[str, str, str]
-    from_camera: bool
-    verified: str | None
-
-
-# All three turn yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll).
-SOURCES: Final[Mapping[str, SourceAxes]] = {
-    "robot": SourceAxes((1, 1, 1), ("x", "y", "z"), False, "our own axes, written by write_track"),
-    "mediapipe": SourceAxes(
-        (1, 1, 1),
-        ("z", "x", "y"),
-        True,
-        "camera frame x viewer's right, y up, z to the viewer; R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform",
-    ),
-    # In think-biq/LLV @ 07ec14c examples/dao.gesichter the eyes turn against HeadYaw (r = -0.95 with the look-left
-    # channels), as they do when a face keeps looking at its phone: a hint that + is own left, no proof.
-    "live_link": SourceAxes((1, 1, 1), ("z", "x", "y"), True, None),
-}
+# Sources turn yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll), and so do
+# we. A source whose columns begin with "head" measures from a camera: x to the viewer's right, y up, z to the viewer.
+# Of MediaPipe that is proved (R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform), of Live Link it is not: in
+# think-biq/LLV @ 07ec14c examples/dao.gesichter the eyes turn against HeadYaw (r = -0.95 with the look-left channels),
+# as they do when a face keeps looking at its phone, a hint that + is own left.
+_FROM_CAMERA: Final = {"z": "x", "x": "y", "y": "z"}  # its axis -> ours
 
 _UNITS: Final = {"deg": math.pi / 180, "rad": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
 _POSE_COLUMN: Final = re.compile(r"(head)?_?(yaw|pitch|roll|x|y|z)(?:_(deg|rad|m|cm|mm))?")
@@ -117,7 +93,7 @@ class Track:
 
 
 def read_track(path: Path | str) -> Track:
-    """Read a face track; its source (`SOURCES`) is recognised by the header.
+    """Read a face track; its axes are recognised by the header.
 
     Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, cells
     divided by something else than commas, values or times that are in another unit.
@@ -126,8 +102,8 @@ def read_track(path: Path | str) -> Track:
     header, rows = _cells(file)
     if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
         raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
-    axes = _axes(header)
-    columns = _columns(file, header, axes)
+    from_camera = any(match and match[1] for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)))
+    columns = _columns(file, header, _FROM_CAMERA if from_camera else {})
     time_column = next((index for index, name in enumerate(header) if name.lower() in _TIME_COLUMNS), None)
     if time_column is None:
         raise ConfigError(f"{file}: no column tells the time (Timecode, t_s, time_s, t_ms, time_ms)")
@@ -145,7 +121,7 @@ def read_track(path: Path | str) -> Track:
             raise ConfigError(f"{file}: row {row + 2}, column {header[index]} = {cells[row]} {problem}")
         motion[:, CHANNEL_INDEX[channel]] = values
     motion[np.isnan(motion).any(axis=1)] = np.nan
-    if axes.from_camera and np.isfinite(motion[:, 0]).any():
+    if from_camera and np.isfinite(motion[:, 0]).any():
         motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
     motion[:, SHAPES] = np.clip(motion[:, SHAPES], 0.0, 1.0)
     times_s = _times(file, header[time_column], [row[time_column].strip() for row in rows])
@@ -234,17 +210,8 @@ def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column:
     return rows
 
 
-def _axes(header: Sequence[str]) -> SourceAxes:
-    posed = [match for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)) if match and match[1]]
-    if not posed:
-        return SOURCES["robot"]
-    return SOURCES["mediapipe" if any(match[3] for match in posed) else "live_link"]
-
-
-def _columns(file: Path, header: Sequence[str], axes: SourceAxes) -> dict[str, tuple[int, float]]:
+def _columns(file: Path, header: Sequence[str], moved: Mapping[str, str]) -> dict[str, tuple[int, float]]:
     """Return the column of each of our channels in the file, and its factor to our unit."""
-    signs = dict(zip(_ANGLES, axes.angles, strict=True))
-    moved = dict(zip(axes.position, ("x", "y", "z"), strict=True))
     columns: dict[str, tuple[int, float]] = {}
     for index, name in enumerate(header):
         channel, factor = _SHAPE_BY_KEY.get(name.lower()), 1.0
@@ -253,10 +220,10 @@ def _columns(file: Path, header: Sequence[str], axes: SourceAxes) -> dict[str, t
             if match is None:
                 continue
             axis, unit = match[2], match[3] or "rad"
-            if match[3] and (axis in signs) != (unit in ("deg", "rad")):
+            if match[3] and (axis in _ANGLES) != (unit in ("deg", "rad")):
                 choices = ("_deg, _rad for angles, _m, _cm, _mm for positions",)
                 raise ConfigError.at(file, "column", name, "has a unit that does not fit", choices)
-            channel, factor = moved.get(axis, axis), signs.get(axis, 1) * _UNITS[unit]
+            channel, factor = moved.get(axis, axis), _UNITS[unit]
         if channel in columns:
             raise ConfigError.at(file, "column", name, f"gives {channel} a second time")
         columns[channel] = (index, factor)

@@ -48,7 +48,7 @@ def test_a_right_head_loads(tmp_path):
 WRONG = {
     "unknown channel": (
         ("joints", "jaw", "drive", {"sum": ["jawOpne"]}),
-        ["joints.jaw.drive.sum.0", "'jawOpne' is not a channel", "jawOpen"],
+        ["joints.jaw.drive", "'jawOpne' is not a channel", "jawOpen"],
     ),
     "unknown bus": (("joints", "jaw", "bus", "mian"), ["joints.jaw.bus = 'mian'", "(main)"]),
     "unknown limit class": (("joints", "jaw", "limits", "fast"), ["joints.jaw.limits = 'fast'", "(slow)"]),
@@ -72,7 +72,7 @@ WRONG = {
         ("joints", "jaw", "drive", {"sum": ["jawOpen"], "max": ["jawOpen"]}),
         ["joints.jaw.drive", "sum, max"],
     ),
-    "empty sum": (("joints", "jaw", "drive", {"sum": []}), ["joints.jaw.drive", "sum is empty"]),
+    "empty sum": (("joints", "jaw", "drive", {"sum": []}), ["joints.jaw.drive.sum", "at least 1 item"]),
     "clamp reversed": (
         ("joints", "jaw", "drive", {"channel": "jawOpen", "clamp": [1, 0]}),
         ["joints.jaw.drive", "clamp [1.0, 0.0] is reversed"],
