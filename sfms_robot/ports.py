@@ -127,18 +127,6 @@ class Listener(Protocol):
         """Process one frame; return a Plan on every `hop`-th, None between. Never changes `memory` in place."""
 
 
-class BatchListener(Listener, Protocol):
-    """A listener that steps many streams at once, of different people, begun at different times."""
-
-    def step_each(self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]) -> list[tuple[Plan | None, Any]]:
-        """Run `step` of N streams, one frame and one memory each, in order, in a fraction of the time of N steps.
-
-        Every stream gives the same results as alone, in fp32 but for the last digits (sums are added in another order):
-        its plan is its own, and None where it is not due. Never changes memories in place. Raises as `step`, for the
-        first frame that is refused; then no stream has moved.
-        """
-
-
 class PlanFeed(Protocol):
     """The loop's side of a listener: frames in, plans out when they are ready."""
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, computed_field, model_validator
+from pydantic import Field, computed_field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive, load
 from sfms_robot.data import data_dir
@@ -29,19 +29,8 @@ Role = Literal[
     "torque_enable", "id", "baud_rate", "return_delay", "status_level", "error_status", "lock", "moving_speed",
     "torque_limit", "bus_watchdog", "operating_mode",
 ]  # fmt: skip
+_SIGN_RULE = r"^(no|twos_complement|offset_2048|sign_bit_([0-9]|[12][0-9]|3[01]))$"
 Bit = Annotated[int, Field(ge=0, le=15)]
-
-
-def _sign_rule(value: Any) -> Any:
-    """Accept `true` and `false`, short for two's complement and no sign."""
-    if isinstance(value, bool):
-        return "twos_complement" if value else "no"
-    if value in ("no", "twos_complement", "offset_2048"):
-        return value
-    bit = str(value).removeprefix("sign_bit_")
-    if str(value).startswith("sign_bit_") and bit.isdecimal() and int(bit) < 32:
-        return value
-    raise ValueError("is not a sign rule (no, twos_complement, sign_bit_N with N 0..31, offset_2048)")
 
 
 def value_range(size: int, signed: str) -> tuple[int, int]:
@@ -72,7 +61,7 @@ class Register(Model):
     scale: Finite = 1.0
     min: int | None = None
     max: int | None = None
-    signed: Annotated[str, BeforeValidator(_sign_rule)] = "no"
+    signed: Annotated[str, Field(pattern=_SIGN_RULE)] = "no"
     initial: int | None = None
 
     @computed_field  # type: ignore[prop-decorator]  # mypy has no rule for decorated properties
@@ -104,11 +93,10 @@ class Register(Model):
         for key, value in (("min", self.min), ("max", self.max), ("initial", self.initial)):
             if value is not None and not low <= value <= high:
                 yield f"{key} = {value} does not fit {self.size} byte(s) ({low}..{high})"
-        if self.min is not None and self.max is not None and self.min > self.max:
+        if self.low > self.high:
             yield f"min = {self.min} is above max = {self.max}"
-        elif self.initial is not None:
-            if (self.min is not None and self.initial < self.min) or (self.max is not None and self.initial > self.max):
-                yield f"initial = {self.initial} is outside min..max ({self.min}..{self.max})"
+        elif self.initial is not None and not self.low <= self.initial <= self.high:
+            yield f"initial = {self.initial} is outside min..max ({self.low}..{self.high})"
 
 
 class FirmwareRange(Model):
@@ -229,11 +217,10 @@ def load_firmware_map(model: str) -> FirmwareMap:
     """
     if model.endswith(".yaml"):
         return load(FirmwareMap, Path(model))
-    for file in sorted(data_dir("firmware_maps").glob("*")):
-        if (file / f"{model}.yaml").is_file():
-            return load(FirmwareMap, file / f"{model}.yaml")
-    shipped = [file.stem for file in map_files()]
-    raise ConfigError.at("firmware_maps", "model", model, "has no firmware map", shipped)
+    shipped = {file.stem: file for file in map_files()}
+    if model not in shipped:
+        raise ConfigError.at("firmware_maps", "model", model, "has no firmware map", shipped)
+    return load(FirmwareMap, shipped[model])
 
 
 def variant(model: str | FirmwareMap, firmware: int) -> FirmwareMap:

@@ -23,7 +23,7 @@ from typing import Final
 from sfms_robot.frames import FRAME_S
 
 STEP_S: Final = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
-LEAD_S: Final = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
+LEAD_S: Final = 0.080  # longest lead of a joint: the otherwise servo's lag and a tick
 P50_S: Final = 0.095  # wanted from a sound to the first goal of a plan that knows of it
 P95_S: Final = 0.135
 _EPS_S: Final = 1e-9
@@ -77,12 +77,24 @@ class Latencies:
 
     def fits(self, hop: int) -> bool:
         """Return whether the leads have room, sounds are answered in time, and the listener keeps up."""
-        return (
-            self.left_s(hop) >= self.lead_s - _EPS_S
-            and self.p50_s(hop) <= P50_S + _EPS_S
-            and self.p95_s(hop) <= P95_S + _EPS_S
-            and self.keeps_up(hop)
-        )
+        return not self.given_up(hop)
+
+    def given_up(self, hop: int) -> list[str]:
+        """Return a text about each part that does not fit."""
+        lost = []
+        short_s, p50_s, p95_s = self.lead_s - self.left_s(hop), self.p50_s(hop), self.p95_s(hop)
+        if short_s > _EPS_S:
+            cut_ms = min(short_s, self.lead_s) * 1e3
+            lost.append(f"the longest lead of {self.lead_s * 1e3:.0f} ms is {cut_ms:.0f} ms shorter")
+        if p50_s > P50_S + _EPS_S or p95_s > P95_S + _EPS_S:
+            lost.append(
+                f"a sound is answered after {p50_s * 1e3:.0f} ms, p95 {p95_s * 1e3:.0f} ms"
+                f" (wanted: {P50_S * 1e3:.0f}, {P95_S * 1e3:.0f})"
+            )
+        if not self.keeps_up(hop):
+            p50_ms, p99_ms, hop_ms = self.step_p50_s * 1e3, self.step_p99_s * 1e3, hop * FRAME_S * 1e3
+            lost.append(f"a plan takes {p50_ms:.0f}, p99 {p99_ms:.0f}, of a hop's {hop_ms:.0f} ms")
+        return lost
 
     def keeps_up(self, hop: int) -> bool:
         """Return whether a plan mostly takes half of its hop at most, and hardly ever all of it.
@@ -115,10 +127,8 @@ def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
     Of all that do not fit the smallest gives up least.
     """
     fitting = [hop for hop in hops if measured.fits(hop)]
-    if fitting:
-        hop = max(fitting)
-    else:
-        hop = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))
+    otherwise = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))
+    hop = max(fitting, default=otherwise)
     cut_s = min(max(measured.lead_s - measured.left_s(hop), 0.0), measured.lead_s)
     budget_s = {
         "horizon": measured.horizon * FRAME_S,
@@ -131,27 +141,8 @@ def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
         "sound_to_goal_p50": measured.p50_s(hop),
         "sound_to_goal_p95": measured.p95_s(hop),
     }
-    return HopChoice(hop, {name: round(1e3 * value, 1) for name, value in budget_s.items()}, _given_up(hop, measured))
-
-
-def _given_up(hop: int, measured: Latencies) -> str | None:
-    if measured.fits(hop):
-        return None
-    lost = []
-    short_s = measured.lead_s - measured.left_s(hop)
-    if short_s > _EPS_S:
-        cut_ms = min(short_s, measured.lead_s) * 1e3
-        lost.append(f"the longest lead of {measured.lead_s * 1e3:.0f} ms is {cut_ms:.0f} ms shorter")
-    p50_s, p95_s = measured.p50_s(hop), measured.p95_s(hop)
-    if p50_s > P50_S + _EPS_S or p95_s > P95_S + _EPS_S:
-        lost.append(
-            f"a sound is answered after {p50_s * 1e3:.0f} ms, p95 {p95_s * 1e3:.0f} ms"
-            f" (wanted: {P50_S * 1e3:.0f}, {P95_S * 1e3:.0f})"
-        )
-    if not measured.keeps_up(hop):
-        taken_ms = (measured.step_p50_s * 1e3, measured.step_p99_s * 1e3)
-        lost.append(f"a plan takes {taken_ms[0]:.0f}, p99 {taken_ms[1]:.0f}, of a hop's {hop * FRAME_S * 1e3:.0f} ms")
-    return "; ".join(lost)
+    budget_ms = {name: round(1e3 * value, 1) for name, value in budget_s.items()}
+    return HopChoice(hop, budget_ms, "; ".join(measured.given_up(hop)) or None)
 
 
 def _next_tick(time_s: float, tick_s: float) -> float:

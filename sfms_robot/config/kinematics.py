@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share
@@ -29,8 +30,6 @@ class Split(Model):
     def _one_rule(self) -> Split:
         if (self.lower_share is None) == (self.crossover_hz is None):
             raise ValueError("needs exactly one of lower_share, crossover_hz")
-        if self.lower == self.upper:
-            raise ValueError(f"lower and upper are the same joint, {self.lower!r}")
         return self
 
 
@@ -50,8 +49,6 @@ class Differential(Model):
         for key in ("pitch_gain", "roll_gain"):
             if getattr(self, key) == 0:
                 raise ValueError(f"{key} is 0: no servo angle would move that axis")
-        if self.left == self.right:
-            raise ValueError(f"left and right are the same joint, {self.left!r}")
         return self
 
 
@@ -138,12 +135,9 @@ class StewartPlatform(Model):
     def _sound(self) -> StewartPlatform:
         _distinct(self.joints())
         for number, leg in enumerate(self.legs):
-            turn = [row[:3] for row in leg.servo_from_body]
-            for i in range(3):
-                for j in range(3):
-                    dot = sum(a * b for a, b in zip(turn[i], turn[j], strict=True))
-                    if abs(dot - (i == j)) > 1e-6:
-                        raise ValueError(f"legs.{number}.servo_from_body is not a rotation and a shift")
+            turn = np.array(leg.servo_from_body)[:, :3]
+            if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6:
+                raise ValueError(f"legs.{number}.servo_from_body is not a rotation and a shift")
         return self
 
     def joints(self) -> tuple[str, ...]:

@@ -454,7 +454,7 @@ class ListenerKind:
     package: str
 
     def load_folder(self, folder: Path, engine: str = "auto", threads: int | None = None) -> Any:
-        """Return the listener of a folder (`ports.BatchListener`), computed by `engine` (`engine.EngineName`).
+        """Return the listener of a folder (`engine.RunsOnEngine`), computed by `engine` (`engine.EngineName`).
 
         Raises ConfigError or ModelError.
         """

@@ -34,7 +34,7 @@ _BISECTIONS: Final = 20
 def step_each(
     listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]
 ) -> list[tuple[Plan | None, Any]]:
-    """Step each stream once; in one batch where the listener can (`ports.BatchListener`)."""
+    """Step each stream once; in one batch where the listener can (`engine.RunsOnEngine`)."""
     together = getattr(listener, "step_each", None)
     if together is None:
         return [listener.step(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]

@@ -75,7 +75,7 @@ class Engine(Protocol):
 
 
 class RunsOnEngine:
-    """A `ports.BatchListener` whose networks an engine runs. It has no state but the weights, held by the engine."""
+    """A listener whose networks an engine runs. It has no state but the weights, held by the engine."""
 
     engine: Engine
 
@@ -101,7 +101,12 @@ class RunsOnEngine:
         memories: Sequence[Any],
         controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, Any]]:
-        """Step several streams, see `ports.BatchListener`; controls as of `step`."""
+        """Run `step` of N streams of different people, one frame and one memory each, in a fraction of the time.
+
+        Every stream gives the same results as alone, in fp32 but for the last digits (sums are added in another order):
+        its plan is its own, and None where it is not due. Never changes memories in place. Raises as `step`, for the
+        first frame that is refused; then no stream has moved.
+        """
         if len(speakers) != len(memories):
             raise ValueError(f"{len(speakers)} frames for {len(memories)} streams")
         return [*self._stepped(speakers, memories, controls)]

@@ -155,7 +155,7 @@ class EventfulListener:
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
     ) -> list[tuple[Plan | None, EventfulMemory]]:
-        """Step several streams, as `ports.BatchListener`."""
+        """Step several streams, as `engine.RunsOnEngine`."""
         return self._step(speakers, memories, self._move_each)
 
     def step_many(

@@ -26,7 +26,7 @@ def load_listener(
 ) -> Listener:
     """Return a listener: by its shipped name, from a folder with config.yaml and weights, or from another package.
 
-    Shipped ones are `ports.BatchListener`s.
+    Shipped ones are `engine.RunsOnEngine`s.
 
     Args:
         graphs: make it ready to run at full speed, which takes torch another second; else call `build_graphs` later.

@@ -89,8 +89,6 @@ class HeadTurn:
 
     def at(self, times_s: Doubles) -> Doubles:
         """Return angles (N, 2); before the turn those of its start."""
-        if not self.start.any() and not self.end_rad.any():
-            return np.zeros((len(times_s), 2))
         t = np.maximum(times_s - self.began_s, 0.0)[:, None]
         off, slope, bend = self._lags()
         angles: Doubles = self.end_rad + (off + (slope + bend * t) * t) * np.exp(-self.rate * t)

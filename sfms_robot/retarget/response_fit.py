@@ -111,10 +111,9 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
 def _binned(has: Doubles, looks: Doubles, low: float, high: float) -> tuple[Doubles, Doubles, Doubles]:
     """Return mean of `has`, median of `looks` and weight per bin, so that long rest does not dominate."""
     bins = np.clip(((has - low) / (high - low) * _BINS).astype(int), 0, _BINS - 1)
-    filled = np.unique(bins)
-    x = np.array([has[bins == b].mean() for b in filled])
-    y = np.array([np.median(looks[bins == b]) for b in filled])
-    count = np.array([(bins == b).sum() for b in filled])
+    _, bins, count = np.unique(bins, return_inverse=True, return_counts=True)
+    x = np.bincount(bins, has) / count
+    y = np.array([np.median(looks[bins == each]) for each in range(len(count))])
     weight = np.sqrt(np.minimum(count, _FULL_WEIGHT) / _FULL_WEIGHT)
     return x, y, weight / np.sqrt((weight**2).mean() * len(weight))
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
 from sfms_robot.motion.limits import JerkLimiter, LimiterState
-from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, StopPolicy, Tick, Timeline
+from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
 from sfms_robot.runtime.clock import tick_times
 from sfms_robot.runtime.halt import HaltLatch
@@ -116,7 +116,6 @@ def drive(
     rate_hz: float,
     duration_s: float,
     interrupted: Callable[[], bool],
-    stop: StopPolicy = "release",
 ) -> str:
     """Run: torque on, ease in, listen for `duration_s`, ease to rest, torque off. Return "done" or "interrupted".
 
@@ -180,7 +179,7 @@ def drive(
                 )
             log.state = state
     finally:
-        parts.bus.stop(stop)
+        parts.bus.stop("release")
     return "interrupted" if interrupted() else "done"
 
 

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, Doubles, Floats
-from sfms_robot.signals.mel import triangles
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.signals.mel import FFT, HOP, WINDOW, triangles
 
 DIM: Final = 78
 CEPSTRA: Final = 13
@@ -27,33 +27,28 @@ ENERGY_FLOOR: Final = 1.0
 EPSILON: Final = float(np.finfo(np.float32).eps)
 
 
-def mfcc78(samples: Floats, rate_hz: int = AUDIO_HZ, fps: int = FRAME_HZ) -> Floats:
-    """(n,) mono -1..1 -> (frames, 78), one row for every whole frame. Frames share nothing: streaming is the same call.
+def mfcc78(samples: Floats) -> Floats:
+    """Return (frames, 78) of samples (n,) mono 16 kHz -1..1, one row for every whole frame of 40 ms.
 
-    Raises ValueError where a frame of `rate_hz` and `fps` is too short for two windows.
+    Frames share nothing: streaming is the same call.
     """
-    size, window, hop = rate_hz // fps, int(rate_hz * 0.025), int(rate_hz * 0.010)
-    if size < window + hop:
-        raise ValueError(f"a frame at {fps} fps holds {size} samples, two windows need {window + hop}")
-    frames = len(samples) // size
-    chunks = samples[: frames * size].reshape(frames, size).astype(np.float64)
-    cut = np.lib.stride_tricks.sliding_window_view(chunks, window, axis=1)[:, ::hop]  # snipped edges
-    static = np.moveaxis(cepstra(cut, rate_hz), 1, 2)[..., :2]  # (frames, 13, 2)
+    frames = len(samples) // FRAME_SAMPLES
+    chunks = samples[: frames * FRAME_SAMPLES].reshape(frames, FRAME_SAMPLES).astype(np.float64)
+    cut = np.lib.stride_tricks.sliding_window_view(chunks, WINDOW, axis=1)[:, ::HOP]  # snipped edges
+    static = np.moveaxis(cepstra(cut), 1, 2)[..., :2]  # (frames, 13, 2)
     delta = deltas(static)
     stacked = np.stack([static, delta, deltas(delta)], axis=1)
     return np.asarray(stacked.reshape(frames, DIM), dtype=np.float32)
 
 
-def cepstra(windows: NDArray[np.floating], rate_hz: int) -> Doubles:
-    """(..., n) samples of windows -> (..., 13): Kaldi's defaults with energy in place of the first."""
+def cepstra(windows: NDArray[np.floating]) -> Doubles:
+    """Return (..., 13) of windows (..., 400): Kaldi's defaults with energy in place of the first."""
     centred = windows - windows.mean(axis=-1, keepdims=True)
     energy = np.log(np.maximum(np.square(centred).sum(axis=-1), max(ENERGY_FLOOR, EPSILON)))
     before = np.concatenate([centred[..., :1], centred[..., :-1]], axis=-1)
-    size = windows.shape[-1]
-    povey = np.hanning(size) ** 0.85
-    fft = 1 << (size - 1).bit_length()
-    power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, fft)) ** 2
-    logs = np.log(np.maximum(power[..., :-1] @ _filters(rate_hz, fft).T, EPSILON))
+    povey = np.hanning(WINDOW) ** 0.85
+    power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, FFT)) ** 2
+    logs = np.log(np.maximum(power[..., :-1] @ _filters().T, EPSILON))
     from scipy.fft import dct  # a quarter of a second, and few listeners hear these features
 
     out: Doubles = dct(logs, type=2, norm="ortho", axis=-1)[..., :CEPSTRA]
@@ -71,10 +66,10 @@ def deltas(values: Doubles) -> Doubles:
 
 
 @lru_cache
-def _filters(rate_hz: int, fft: int) -> Doubles:
-    """(23, fft / 2) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
-    edges = np.linspace(_mel(LOW_HZ), _mel(rate_hz / 2), MEL_BINS + 2)
-    bins = _mel(np.arange(fft // 2) * rate_hz / fft)
+def _filters() -> Doubles:
+    """Return (23, 256) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
+    edges = np.linspace(_mel(LOW_HZ), _mel(AUDIO_HZ / 2), MEL_BINS + 2)
+    bins = _mel(np.arange(FFT // 2) * AUDIO_HZ / FFT)
     return triangles(edges, bins)
 
 

@@ -51,23 +51,17 @@ REJECTED_GAIN: Final = 0.03  # -30 dB, for what is own voice or own motors
 _RAMP: Final = 160  # samples over which the gain changes
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class HeardFrame:
     """40 ms of sound that may hold a person's voice.
 
     Attributes:
         audio: (640,) without echo; 30 dB down where own voice or own motors are the only sound.
         voice: the person speaks.
-        probability: 0..1, of any speech, after echo cancellation and motor suppression.
-        mic_db, left_db, reference_db: levels of the microphone, after echo cancellation, of own voice.
     """
 
     audio: Floats
     voice: bool
-    probability: float
-    mic_db: float
-    left_db: float
-    reference_db: float
 
 
 class OwnVoiceGate:
@@ -116,27 +110,20 @@ class OwnVoiceGate:
 
     def _frame(self, mic: Floats, reference: Floats, speed_rad_s: ArrayLike) -> HeardFrame:
         left, linear, echo_power = self._echo.push(mic, reference) if self._echo else (mic, mic, None)
-        reference_db = energy_db(reference)
+        says = energy_db(reference) > OWN_VOICE_DB
         moves = total_speed(speed_rad_s) > STILL_RAD_S
-        self._echoes = ECHO_FRAMES if reference_db > OWN_VOICE_DB else max(0, self._echoes - 1)
-        self._said_frames += reference_db > OWN_VOICE_DB
+        self._echoes = ECHO_FRAMES if says else max(0, self._echoes - 1)
+        self._said_frames += says
         clean = self._motors.suppress(linear, speed_rad_s, echo_power)
         heard = self._speech.push(clean, noise=moves or self._echoes > 0)
         self._probability = max(heard, default=self._probability)
-        mic_db, left_db = energy_db(mic), energy_db(left)
-        is_left = left_db - mic_db > self._least_left_db() and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
+        left_db = energy_db(left) - energy_db(mic)
+        is_left = left_db > self._least_left_db() and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
         voice = self._judge(is_left, moves)
         if self._probability < NO_SPEECH and not voice and not self._echoes:
             self._motors.learn()
         audio = self._turn(left, REJECTED_GAIN if (self._echoes or moves) and not voice else 1.0)
-        return HeardFrame(
-            audio=audio,
-            voice=voice,
-            probability=self._probability,
-            mic_db=mic_db,
-            left_db=left_db,
-            reference_db=reference_db,
-        )
+        return HeardFrame(audio, voice)
 
     def _least_left_db(self) -> float:
         """Return the least share of the microphone's level that a voice leaves [dB]: less is residual echo."""

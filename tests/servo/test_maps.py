@@ -145,7 +145,7 @@ WRONG = {
     "registers.goal_position.address = 255 ends past the address space (256 bytes)": goal(address=255),
     "registers.goal_position.size = 3": goal(size=3),
     "registers.goal_position.unit = 'furlong'": goal(unit="furlong"),
-    "registers.goal_position.signed = 'sign_bit_x': is not a sign rule": goal(signed="sign_bit_x"),
+    "registers.goal_position.signed = 'sign_bit_x': String should match pattern": goal(signed="sign_bit_x"),
     "registers.id.signed = 'sign_bit_11' does not fit 1 byte(s)": other_id(signed="sign_bit_11"),
     "registers.id.signed = 'offset_2048' needs a size of 2": other_id(signed="offset_2048"),
     "registers.id.max = 300 does not fit 1 byte(s) (0..255)": other_id(max=300),
