@@ -8,7 +8,7 @@ Radians, metres and seconds throughout. A *motion* array is (..., 58): pose 6, t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
@@ -78,10 +78,7 @@ _APPLE: Final = (
 )  # fmt: skip
 
 
-def _swapped(order: Sequence[str], *pairs: tuple[str, str]) -> tuple[str, ...]:
-    other = {a: b for a, b in pairs} | {b: a for a, b in pairs}
-    return tuple(other.get(name, name) for name in order)
-
+_SWAPPED: Final = {"jawLeft": "jawRight", "jawRight": "jawLeft", "mouthLeft": "mouthRight", "mouthRight": "mouthLeft"}
 
 # Name order of each outside format. MediaPipe puts `_neutral` first and has no tongueOut. The Live Link app's CSV
 # swaps jaw and mouth left/right against Apple's header; its UDP packet does not.
@@ -90,7 +87,7 @@ ORDERS: Final[Mapping[str, tuple[str, ...]]] = {
     "faceverse": BLENDSHAPES,
     "apple": _APPLE,
     "live_link_udp": _APPLE,
-    "live_link_csv": _swapped(_APPLE, ("jawLeft", "jawRight"), ("mouthLeft", "mouthRight")),
+    "live_link_csv": tuple(_SWAPPED.get(name, name) for name in _APPLE),
     "mediapipe": ("_neutral", *BLENDSHAPES[:-1]),
 }
 

@@ -28,7 +28,6 @@ QUEUE: Final = 16  # messages that wait for a busy machine, the most that zenoh 
 RETRY: Final = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1.0}
 AWAY_S: Final = 5.0  # without a router, after which that is reported
 SAFE: Final = ("tls", "quic", "unixsock-stream", "unixpipe", "serial", "vsock")  # encrypted, or not a network
-NAME_CHARACTERS: Final = "letters, digits, '-', '_' and '.'"
 
 Role = Literal["serve", "call"]
 
@@ -60,8 +59,8 @@ def check_zenoh() -> None:
 
 def check_name(name: str, what: str) -> str:
     """Return `name`, which becomes a part of keys. Raises ConfigError for one that cannot."""
-    if not name or not all(each.isascii() and (each.isalnum() or each in "-_.") for each in name):
-        raise ConfigError(f"{what}: expected a name of {NAME_CHARACTERS}, got {name!r}")
+    if not re.fullmatch(r"[\w.-]+", name, re.ASCII):
+        raise ConfigError(f"{what}: expected a name of letters, digits, '-', '_' and '.', got {name!r}")
     return name
 
 

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final
 
 from sfms_robot.config.joint import Expression, Joint
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.config.wire_time import BITS, FRAMINGS
 from sfms_robot.frames import CHANNEL_INDEX
 
-if TYPE_CHECKING:
-    from sfms_robot.config.head import Head
-
 MOST_NODES: Final = 2000
 HIGHEST_RATE_HZ: Final = 1000.0
 
 
-def problems(head: Head) -> list[str]:
-    """Return every contradiction between the parts of a head."""
+def problems(head: Any) -> list[str]:
+    """Return every contradiction between the parts of a `config.Head`."""
     return [*_wiring(head), *_rates(head), *_drives(head), *_parts(head), *_neck(head), *_description(head)]
 
 
-def _wiring(head: Head) -> Iterator[str]:
+def _wiring(head: Any) -> Iterator[str]:
     """Yield the joints that are on no bus, of no limit class, or on another's id."""
     seen: dict[tuple[str, int], str] = {}
     for name, joint in head.joints.items():
@@ -47,7 +44,7 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
     return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (BITS * framing.goals(joints)))))
 
 
-def _rates(head: Head) -> Iterator[str]:
+def _rates(head: Any) -> Iterator[str]:
     """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
     for name, bus in head.buses.items():
         count = sum(joint.bus == name for joint in head.joints.values())
@@ -61,7 +58,7 @@ def _rates(head: Head) -> Iterator[str]:
             yield f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}"
 
 
-def _drives(head: Head) -> Iterator[str]:
+def _drives(head: Any) -> Iterator[str]:
     """Yield unknown names, wrong mirrors, circles, and drives that are too large."""
     for name in head.expressions:
         if name in CHANNEL_INDEX:
@@ -109,7 +106,7 @@ def _not_a_joint(name: str | None, joints: Mapping[str, Joint]) -> str:
     return f"{name!r} is not a joint of this head ({', '.join(joints)})"
 
 
-def _parts(head: Head) -> Iterator[str]:
+def _parts(head: Any) -> Iterator[str]:
     """Yield the joints of folds, couplings and regions that are unknown or claimed twice."""
     for index, fold in enumerate(head.folds):
         if fold.into not in head.joints:
@@ -131,7 +128,7 @@ def _parts(head: Head) -> Iterator[str]:
                 yield f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}"
 
 
-def _neck(head: Head) -> Iterator[str]:
+def _neck(head: Any) -> Iterator[str]:
     """Yield the neck's joints that are unknown, have a drive or a fold, or do not rest where the neck is at home."""
     if (neck := head.kinematics) is None:
         return
@@ -152,7 +149,7 @@ def _neck(head: Head) -> Iterator[str]:
             yield f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"
 
 
-def _description(head: Head) -> Iterator[str]:
+def _description(head: Any) -> Iterator[str]:
     """Yield the joints of the URDF section that the head lacks, and joints of the URDF that two of ours would move."""
     if head.urdf is None:
         return

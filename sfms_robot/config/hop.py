@@ -113,12 +113,12 @@ class HopChoice:
     given_up: str | None
 
 
-def default_hop(horizon: int, step_s: float = STEP_S, lead_s: float = LEAD_S) -> int:
+def default_hop(horizon: int) -> int:
     """Return the largest hop with hop T + step + lead <= (H - 1) T, at least 1.
 
     For virtual time and training, without measurements.
     """
-    return max(1, math.floor((horizon - 1) - (step_s + lead_s) / FRAME_S + _EPS_S))
+    return max(1, math.floor((horizon - 1) - (STEP_S + LEAD_S) / FRAME_S + _EPS_S))
 
 
 def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:

@@ -82,10 +82,6 @@ class Measured(Identity):
             raise ValueError(f"min_ticks and max_ticks are both {self.min_ticks}: no travel")
         return self
 
-    @property
-    def identity(self) -> Identity:
-        return Identity(**{key: getattr(self, key) for key in Identity.model_fields})
-
 
 class Layer(Model):
     """Part of an overlay, and the head file that it was made for."""
@@ -253,7 +249,7 @@ def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None
     if servos is None or name not in servos:
         return None
     now = servos[name]
-    return "its servo does not answer" if now is None else found.identity.difference(now)
+    return "its servo does not answer" if now is None else found.difference(now)
 
 
 def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from sfms_robot.config.listener import LISTENER_KINDS, Calmness
+from sfms_robot.config.listener import Calmness, listener_package
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.engine import Engine, EngineName
 from sfms_robot.listeners.eventful import EventfulListener, MotionModel
@@ -40,7 +40,7 @@ def load_listener(
     if folder is None:
         return load_plugin(str(name))
     settings = load_config(folder)
-    listener = cast(Listener, LISTENER_KINDS[settings.kind].load_folder(folder, engine, threads))
+    listener = cast(Listener, listener_package(settings.kind).load(folder, engine, threads))
     if settings.events:
         resting = folder / IDLE_FILE
         idle = IdleMotion.load(resting) if resting.is_file() else None

@@ -350,7 +350,8 @@ def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
     first, last = int(piece.min()), int(piece.max())
     # One product for all the pieces in play: each row has its powers in the columns of its own piece, 0 elsewhere.
     powers = np.zeros((len(asked_s), last + 1 - first, 6))
-    powers[np.arange(len(asked_s)), piece - first] = _powers(np.minimum(np.maximum(along, 0.0), 1.0))
+    along = np.minimum(np.maximum(along, 0.0), 1.0)
+    powers[np.arange(len(asked_s)), piece - first] = np.vander(along, 6, increasing=True)
     coefficients = curve.coefficients[first : last + 1].reshape(-1, MOTION_DIM)
     out: Doubles = powers.reshape(len(asked_s), -1) @ coefficients
     np.maximum(out, curve.low[piece], out=out)
@@ -358,11 +359,3 @@ def _motion(curve: Curve | None, asked_s: Doubles) -> Doubles:
     if float(asked_s.max()) > curve.made_at_s + STALL_S:
         out *= (1 - ease((asked_s - curve.made_at_s - STALL_S) / EASE_S))[:, None]
     return out
-
-
-def _powers(x: Doubles) -> Doubles:
-    """Return (N, 6): 1, x, x^2, ... x^5 of x (N,)."""
-    powers = np.empty((len(x), 6))
-    powers[:, 0], powers[:, 1:] = 1.0, x[:, None]
-    np.multiply.accumulate(powers, axis=1, out=powers)
-    return powers

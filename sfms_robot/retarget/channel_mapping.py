@@ -8,31 +8,31 @@ neutral face is the rest pose whatever came before, and on the knobs, which may 
 A value u inside its range, |u| = 1 at the end of it, leaves the knobs as intensity x u x (1 + (style - 1)(1 - |u|)):
 style bends the response without moving its ends, so that small motions come out doubled (2) or vanish (0).
 
-The drives of all joints are one forest, compiled into a few array operations. It is cut into levels, deepest first: all
-leaves are one gather from the motion, and every level above is one `reduceat` per kind of group over its children, then
-dead band, curve, gain, offset and clamp. So the cost does not depend on the form of the file, only a little on the
-depth of the deepest expression.
+Each node of a drive is compiled into a function that calls those of its parts: their combination passes dead band,
+curve, gain, offset and clamp.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial, reduce
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 
-Indices = NDArray[np.intp]
-Step = Callable[[Doubles], object]  # changes its argument in place
-
-STILL = Expression(channel=CHANNELS[0], gain=0.0)
-_REDUCE = {"sum": np.add, "mean": np.add, "max": np.maximum, "min": np.minimum, "product": np.multiply}
+_COMBINE: Mapping[str | None, Callable[[list[Doubles]], Doubles]] = {
+    "sum": lambda values: values[0] + sum(values[1:]),
+    "mean": lambda values: values[0] + sum(values[1:]),  # until it is scaled, by its gain or before its curve
+    "max": partial(reduce, np.maximum),
+    "min": partial(reduce, np.minimum),
+    "product": partial(reduce, np.multiply),
+}
 _PRODUCT_LIMIT = 1e6  # keeps products of products finite, whatever the motion
 
 
@@ -100,7 +100,7 @@ class ChannelMapping:
         self._high_rad = np.array([joint.max_rad for joint in head.joints.values()])
 
         trees = drives(head)
-        self._program = Program(list(trees.values()))
+        self._drives = [compiled(tree, row) if tree else None for row, tree in enumerate(trees.values())]
         # Couplings: C sums of joints that may not fall below a bound, and the joints that give way, the first first.
         self._keep = np.array([[each.keep.get(name, 0.0) for name in self.joints] for each in head.couplings])
         self._at_least = np.array([each.at_least for each in head.couplings])
@@ -137,7 +137,12 @@ class ChannelMapping:
         if np.count_nonzero(finite) < finite.size:
             where = np.argwhere(~finite)[0]
             raise ValueError(f"motion channel {CHANNELS[where[-1]]} is {motion[tuple(where)]}")
-        values = self._inside(self._program(motion))
+        rows = np.broadcast_to(motion.astype(np.float64), (*motion.shape[:-2], len(self.joints), MOTION_DIM))
+        values, rows = np.zeros(rows.shape[:-1]), np.moveaxis(rows, (-2, -1), (0, 1))
+        for column, drive in enumerate(self._drives):
+            if drive:
+                values[..., column] = drive(rows)
+        values = self._inside(values)
         knobs = knobs or self._knobs
         if not knobs.neutral:
             values = self._inside(self._turned(values, knobs))
@@ -172,112 +177,35 @@ class ChannelMapping:
         return turned
 
 
-# --- Compiled drives ------------------------------------------------------------------------------------------------
+def compiled(node: Expression, row: int) -> Callable[[Doubles], Doubles]:
+    """Return the function from motion (J, 58, ...) to the values (...) of a node of joint `row`."""
+    parts = [compiled(part, row) for part in node.parts]
+    combine, column = _COMBINE.get(node.group), CHANNEL_INDEX.get(node.channel or "")
+    count = float(len(node.mean or (1,)))
+    dead = node.dead_band * count
+    curve = _pchip(np.array(node.curve) * [count, 1.0]) if node.curve else None
+    down, up = np.array(node.gains) / (1.0 if curve else count)
+    limit = _PRODUCT_LIMIT if node.product else np.inf
+    low, high = node.clamp or (-limit, limit)
+
+    def value(motion: Doubles) -> Doubles:
+        x = combine([part(motion) for part in parts]) if combine else motion[row, column]
+        if dead:
+            x = x - np.minimum(np.maximum(x, -dead), dead)
+        if curve:  # beyond its points it keeps its end values
+            x = curve(np.minimum(np.maximum(x, curve.x[0]), curve.x[-1]))
+        if up != down or up != 1:
+            x = x * (up if up == down else np.where(x > 0, up, down))
+        if node.offset:
+            x = x + node.offset
+        return x if high == np.inf else np.minimum(np.maximum(x, low), high)
+
+    return value
 
 
-@dataclass(frozen=True)
-class _Level:
-    """Nodes at one depth, evaluated together from the values one level deeper.
+def _pchip(points: Doubles) -> Any:
+    """Return the monotone cubic (PCHIP) through points (K, 2)."""
+    from scipy.interpolate import PchipInterpolator  # only heads with curves load scipy
 
-    Attributes:
-        starts: where the children of each node begin; they lie side by side.
-        groups: each way to combine children, and the nodes (n,) of that kind.
-        steps: what follows, in place on the values (..., n); an operation that no node has is left out.
-    """
-
-    starts: Indices
-    groups: Sequence[tuple[np.ufunc, NDArray[np.bool_]]]
-    steps: Sequence[Step]
-
-    def __call__(self, below: Doubles) -> Doubles:
-        (first, _), *others = self.groups
-        values: Doubles = first.reduceat(below, self.starts, axis=-1)
-        for combine, mask in others:
-            np.copyto(values, combine.reduceat(below, self.starts, axis=-1), where=mask)
-        for step in self.steps:
-            step(values)
-        return values
-
-
-class Program:
-    """The compiled drives of J joints: motion -> values in joint units. A drive that is None gives 0."""
-
-    def __init__(self, trees: Sequence[Expression | None]) -> None:
-        forest = [(row, tree or STILL) for row, tree in enumerate(trees)]  # joint, node
-        self._levels: list[_Level] = []
-        while any(node.parts for _, node in forest):
-            # A leaf above the deepest level becomes a sum of one.
-            nodes = [node if node.parts else Expression.model_construct(sum=(node,)) for _, node in forest]
-            ways = [_REDUCE[node.group or "sum"] for node in nodes]
-            groups = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
-            starts = np.cumsum([0, *(len(node.parts) for node in nodes[:-1])])
-            self._levels.insert(0, _Level(starts, groups, _steps(nodes)))
-            forest = [(row, part) for (row, _), node in zip(forest, nodes, strict=True) for part in node.parts]
-        self._steps = _steps([leaf for _, leaf in forest])
-        # The channel of each leaf, and its place in a flattened (J, 58), in the row of its joint.
-        self._columns = np.array([CHANNEL_INDEX[leaf.channel or ""] for _, leaf in forest], dtype=np.intp)
-        self._cells = np.array([row for row, _ in forest], dtype=np.intp) * MOTION_DIM + self._columns
-
-    def __call__(self, motion: Floats) -> Doubles:
-        """Return values (J,) or (..., J) of motion (58,) or (..., J, 58), row j for joint j."""
-        flat = motion.reshape(*motion.shape[:-2], -1)
-        values = flat.take(self._columns if motion.ndim == 1 else self._cells, axis=-1).astype(np.float64)
-        for step in self._steps:
-            step(values)
-        for level in self._levels:
-            values = level(values)
-        return values
-
-
-def _steps(nodes: Sequence[Expression]) -> list[Step]:
-    """Return the operations that turn what n nodes combine, or read, into their values (..., n)."""
-    steps: list[Step] = []
-    # A mean is a sum until it is scaled, by its gain or before its curve.
-    count = np.array([float(len(node.mean or (1,))) for node in nodes])
-    dead = np.array([node.dead_band for node in nodes]) * count
-    if dead.any():
-        steps.append(lambda values: np.subtract(values, np.minimum(np.maximum(values, -dead), dead), out=values))
-    curves = {i: np.array(node.curve) for i, node in enumerate(nodes) if node.curve is not None}
-    if curves:
-        steps.append(_Curves({i: points * [count[i], 1.0] for i, points in curves.items()}))
-        count[list(curves)] = 1.0
-    down, up = np.array([node.gains for node in nodes]).T / count
-    if (down != up).any():
-        steps.append(lambda values: np.multiply(values, np.where(values > 0, up, down), out=values))
-    elif (up != 1).any():
-        steps.append(lambda values: np.multiply(values, up, out=values))
-    offset = np.array([node.offset for node in nodes])
-    if offset.any():
-        steps.append(lambda values: np.add(values, offset, out=values))
-    limits = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
-    low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limits, strict=True)]).T
-    if np.isfinite(low).any():
-        steps.append(lambda values: np.minimum(np.maximum(values, low, out=values), high, out=values))
-    return steps
-
-
-class _Curves:
-    """Monotone cubics (PCHIP) of C nodes, evaluated together; beyond its points a curve keeps its end values."""
-
-    def __init__(self, curves: Mapping[int, Doubles]) -> None:
-        """Take the points (K, 2) of each curve, by the column of its node. K differs: places left over are inf or 0."""
-        from scipy.interpolate import PchipInterpolator  # only heads with curves load scipy
-
-        self._columns = np.array(list(curves), dtype=np.intp)
-        self._rows = np.arange(len(curves))
-        self._ends = np.array([(x[0], x[-1]) for x, _ in (points.T for points in curves.values())])
-        pieces = max(len(points) for points in curves.values()) - 1
-        self._breaks = np.full((len(curves), pieces), np.inf)  # ends of the pieces but the last
-        self._begins = np.zeros((len(curves), pieces))
-        self._cubics = np.zeros((len(curves), pieces, 4))  # about the beginning of the piece, highest power first
-        for row, (x, y) in enumerate(points.T for points in curves.values()):
-            self._breaks[row, : len(x) - 2], self._begins[row, : len(x) - 1] = x[1:-1], x[:-1]
-            with np.errstate(over="ignore"):  # slopes too small for a float are 0
-                self._cubics[row, : len(x) - 1] = PchipInterpolator(x, y).c.T
-
-    def __call__(self, values: Doubles) -> None:
-        x = np.clip(values[..., self._columns], self._ends[:, 0], self._ends[:, 1])
-        piece = (x[..., None] >= self._breaks).sum(axis=-1)
-        c = self._cubics[self._rows, piece]
-        t = x - self._begins[self._rows, piece]
-        values[..., self._columns] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
+    with np.errstate(over="ignore"):  # slopes too small for a float are 0
+        return PchipInterpolator(*points.T)

@@ -259,18 +259,16 @@ class FlameMatrix:
 
     rows: Doubles
 
-    def solve(self, expression: Doubles, jaw_open: Doubles | None = None) -> Doubles:
+    def solve(self, expression: Doubles, jaw_open: Doubles) -> Doubles:
         """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is taken unchanged."""
         scale = float(np.sqrt((self.rows**2).sum(axis=1).mean()))
-        sides = np.zeros((len(_SIDES), len(BLENDSHAPES)))
-        for row, (left, right) in enumerate(_SIDES):
-            sides[row, left], sides[row, right] = 1.0, -1.0
-        prices = np.concatenate([_SIZE_PRICE * np.eye(len(BLENDSHAPES)), _SIDES_PRICE * sides]) * scale
+        each, (left, right) = np.eye(len(BLENDSHAPES)), np.transpose(_SIDES)
+        prices = np.concatenate([_SIZE_PRICE * each, _SIDES_PRICE * (each[left] - each[right])]) * scale
         wanted = np.concatenate([expression, np.zeros((len(expression), len(prices)))], axis=1)
-        low, high = np.zeros((len(expression), len(BLENDSHAPES))), np.ones((len(expression), len(BLENDSHAPES)))
+        low = np.zeros((len(expression), len(BLENDSHAPES)))
+        high = np.ones_like(low)
         high[:, _FIXED_AT_0] = 0.0
-        if jaw_open is not None:
-            low[:, _JAW] = high[:, _JAW] = jaw_open
+        low[:, _JAW] = high[:, _JAW] = jaw_open
         return bounded_least_squares(np.concatenate([self.rows.T, prices]), wanted, low, high)
 
 

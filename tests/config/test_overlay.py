@@ -49,6 +49,10 @@ def measured(joint="jaw", low=1800, rest=2000, high=2400, sign=1, **more) -> Mea
     return Measured.model_validate({**known, "date": DAY, "sign": sign, **ticks, **more})
 
 
+def identity(found: Measured) -> Identity:
+    return Identity(**{key: getattr(found, key) for key in Identity.model_fields})
+
+
 def overlay(sha256=SHA, fit=None, **joints) -> Overlay:
     return Overlay(head="face28", calibrate=CalibrateLayer(head_sha256=sha256, joints=joints), fit=fit)
 
@@ -87,7 +91,7 @@ def test_without_an_overlay_the_head_is_as_its_file_says():
 
 
 def test_only_what_was_measured_changes():
-    layers = layered(FACE, overlay(jaw=measured()), SHA, {"jaw": measured().identity})
+    layers = layered(FACE, overlay(jaw=measured()), SHA, {"jaw": identity(measured())})
     assert layers.calibrated == {"jaw"} and not layers.refused
     assert layers.head.joints["jaw"] == calibrated(FACE.joints["jaw"], measured())
     assert {**layers.head.joints, "jaw": None} == {**FACE.joints, "jaw": None}
@@ -105,7 +109,7 @@ def test_only_what_was_measured_changes():
 )
 def test_a_joint_with_another_servo_is_to_be_calibrated_first_and_no_other(now, why):
     both = overlay(jaw=measured(), lid_left=measured("lid_left"))
-    servos = {"jaw": measured().identity, "lid_left": measured("lid_left").identity}
+    servos = {"jaw": identity(measured()), "lid_left": identity(measured("lid_left"))}
     servos["jaw"] = None if now is None else Identity(**{**servos["jaw"].model_dump(), **now})
     layers = layered(FACE, both, SHA, servos)
     assert layers.refused == {"jaw": why} and layers.calibrated == {"lid_left"}

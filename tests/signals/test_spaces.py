@@ -85,7 +85,7 @@ def test_expression_comes_back_through_the_matrix():
 
 
 def test_solved_weights_are_bounded_and_gaze_stays_still():
-    weights = FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)))
+    weights = FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
     assert weights.min() >= 0 and weights.max() <= 1
     assert not weights[:, [name.startswith("eyeLook") for name in BLENDSHAPES]].any()
 

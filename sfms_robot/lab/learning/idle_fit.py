@@ -21,7 +21,7 @@ from rich.progress import Progress
 from scipy.optimize import nnls
 
 from sfms_robot.config import find
-from sfms_robot.config.listener import LISTENER_KINDS
+from sfms_robot.config.listener import listener_package
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.collection import usable
@@ -199,7 +199,7 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
         raise ConfigError(
             f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
         )
-    how = LISTENER_KINDS[settings.kind].load_folder(folder)
+    how = listener_package(settings.kind).load(folder)
     with Progress(console=Console(stderr=True)) as progress:
         playing = progress.add_task(f"{name} listens", total=len(chosen))
         shown = rollouts(how, chosen, seed, lambda: progress.advance(playing))
