@@ -1,7 +1,7 @@
 """The fastest stop of one joint, and one tick of its way to a reference that it cannot meet in one tick.
 
 A state is position, speed and acceleration of a joint, all along one axis. Plain floats: the limiter calls this for one
-joint at a time, and only where its array arithmetic has not settled the matter.
+joint at a time.
 
 `ruckig` (Berscheid and Kroeger, 2021) plans the fastest way, where it is installed. It has no wheel for Linux on ARM;
 `StopChase` is the fallback without it: always lawful, a little slower to arrive.
