@@ -342,10 +342,6 @@ def test_a_process_of_a_pool_computes_with_one_thread(monkeypatch):
     assert {name: os.environ[name] for name in LOOSE} == LOOSE
 
 
-def test_a_worker_of_pytest_computes_with_one_thread():
-    assert threads() == (ONE_THREAD, 1)
-
-
 def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place():
     package = Path(sfms_robot.__file__).parent
     making = ("ProcessPoolExecutor(", "multiprocessing.Pool", "get_context(", "start_new_session=")

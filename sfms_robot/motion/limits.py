@@ -150,6 +150,7 @@ class JerkLimiter:
     """Limiter of joints that share one tick of `dt_s`. `chase`: the fastest available by default."""
 
     def __init__(self, limits: JointLimits, dt_s: float, chase: type[Chase] = FASTEST) -> None:
+        # The limits of this class are a little inside those of the head, so that rounding never crosses them.
         self._speed = limits.speed * _HEADROOM
         self._acceleration = limits.acceleration * _HEADROOM
         self._jerk = limits.jerk * _HEADROOM
@@ -172,6 +173,7 @@ class JerkLimiter:
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
         """Return the state with some `joints` (J,) at rest at `angles_rad` (J,), in range or not."""
+        # Torque was off meanwhile: whatever speed the joint had by the last command is gone.
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
         return self._found(replace(state, motion=motion), joints)
@@ -186,14 +188,15 @@ class JerkLimiter:
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Return angles (J,) that may be sent for a reference (3, J) one tick ahead, and the state after the tick."""
         recovery, guided, refused = state.recovery, reference_rad, 0
-        if recovery is not None:
+        if recovery is not None:  # some joint is outside its own range: its curve leads where the reference does not
             recovery = recovery._replace(elapsed_s=recovery.elapsed_s + self._dt_s)
             outside = ~self._own.holds(state.motion[0])
             guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
+            # Guided joints never show a reference that is not finite to `_tick`, so it is counted here.
             refused = int(np.count_nonzero(outside & ~np.isfinite(reference_rad).all(axis=0)))
         after, chased, braked = self._tick(guided, state.motion)
         if self._own.holds(after[0]).all():
-            recovery = None
+            recovery = None  # all are in, for good: the range in force never reaches out again
         return after[0].copy(), LimiterState(after, recovery, state.chased + chased, state.refused + refused + braked)
 
     def brake(self, state: LimiterState) -> tuple[Doubles, LimiterState]:
@@ -203,6 +206,7 @@ class JerkLimiter:
         """
         before = state.motion.T.tolist()
         after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).T
+        # Rounding may have left the range in force by an ulp.
         reach = self._own.reaching(state.motion[0])
         np.clip(after[0], reach.low, reach.high, out=after[0])
         return after[0].copy(), replace(state, motion=after)
@@ -221,12 +225,12 @@ class JerkLimiter:
         settled, chased, refused = [], 0, 0
         for j, (ok, column) in enumerate(zip(met.tolist(), columns, strict=True)):
             before, reference, target, ends = column[:3], column[3:6], column[6:9], column[9:]
-            if not all(map(math.isfinite, reference)):
+            if not all(map(math.isfinite, reference)):  # refused, not clipped: clipping NaN gives NaN
                 settled.append(self._braked(j, before))
                 refused += 1
-            elif ok and self._lawful(j, target, *ends):
+            elif ok and self._lawful(j, target, *ends):  # step 1 of the law: the sample passes unchanged
                 settled.append(target)
-            else:
+            else:  # steps 2 and 3
                 settled.append(self._chased(j, before, target, *ends))
                 chased += 1
         after = np.array(settled).T
@@ -244,6 +248,7 @@ class JerkLimiter:
             return False
         if first <= state[0] <= last:  # it comes in: from here on the own range holds
             return lawful(state, first, last, bound)
+        # Still outside: the side on which the range in force reaches out tells the way in. Its stop must not turn back.
         way = 1.0 if low < first else -1.0
         return lawful(state, low, high, bound) and moves_in(state, way, bound)
 
@@ -257,6 +262,7 @@ class JerkLimiter:
             still = self._chase.step(j, before, (target[0], 0.0, 0.0), lawful_next)
             way = 1.0 if low < self._ends[j][0] else -1.0
             after = max((each for each in (after, still) if each), key=lambda each: way * each[1], default=None)
+        # The braking curve of a lawful state is lawful: there is always this way out.
         return self._braked(j, before) if after is None else after
 
     def _braked(self, j: int, before: State) -> State:

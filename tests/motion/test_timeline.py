@@ -209,14 +209,6 @@ def horizon_left_s(horizon: int, hop: int, latency_s: float) -> float:
     return (horizon - hop + delay) * FRAME_S - latency_s
 
 
-def test_the_horizon_left_is_enough_to_never_hold():
-    frames = motions(60, pitch=0.1)
-    for horizon, hop in ((8, 4), (8, 7), (1, 1)):
-        lead_s = horizon_left_s(horizon, hop, latency_s=0.02)
-        _, _, state = ran(frames, lead_s - TICK_S, horizon, hop, latency_ticks=2)
-        assert lead_s > 0 and state.held == 0 and state.played_s <= state.curve.end_s + 1e-9
-
-
 def led(horizon: int, hop: int, latency_s: float, lead_s: float, seconds: float = 6.0):
     """Times asked for (T,) and the last state, of a listener whose plans become visible after `latency_s`."""
     state, asked, rng = TIMELINE.start(), [], np.random.default_rng(0)

@@ -110,13 +110,6 @@ def test_the_lips_never_cross_whatever_the_mouth_does():
         assert gap.min() >= -0.3 - 1e-9, part
 
 
-def test_a_lid_follows_gaze_squint_and_surprise():
-    half = angle_deg("lid_left", eyeLookDownLeft=1.0)
-    assert 0 < angle_deg("lid_left", eyeSquintLeft=0.5) < half < HEAD.joints["lid_left"].max_deg
-    assert angle_deg("lid_left", eyeWideLeft=1.0) < 0 and angle_deg("lid_left", eyeLookUpLeft=1.0) < 0
-    assert angle_deg("lid_left", eyeBlinkLeft=1.0) > angle_deg("lid_left", eyeBlinkLeft=0.5) > 0
-
-
 def test_the_neck_is_the_pose():
     assert angle_deg("neck_pitch", pitch=np.radians(10)) == pytest.approx(10, abs=1e-4)
     assert angle_deg("neck_yaw", yaw=np.radians(-20)) == pytest.approx(-20, abs=1e-4)

@@ -300,17 +300,6 @@ def test_a_handler_does_not_wait_for_the_latch_that_it_interrupts() -> None:
     assert signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL
 
 
-def test_a_refusal_of_sigusr2_is_one_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    latch, said = Seen(), threading.Event()
-    latch.switches["button"] = lambda: True
-    with halt_signals(latch), caplog.filtering(lambda record: not said.set()):
-        signal.raise_signal(signal.SIGUSR2)
-        assert said.wait(LONG_S)
-    assert [record.getMessage() for record in caplog.records] == [
-        "still halted: button: still on; let go of it, then resume"
-    ]
-
-
 # --- switches -----------------------------------------------------------------------------------------------------
 
 

@@ -37,37 +37,29 @@ def test_level_is_in_decibels_of_full_scale():
     assert energy_db(np.zeros(0, dtype=np.float32)) == energy_db(np.zeros(640, dtype=np.float32)) == -100.0
 
 
-def test_what_is_no_sound_is_refused_in_one_line(tmp_path):
-    (tmp_path / "text.wav").write_text("this is not a sound")
-    (tmp_path / "zero.wav").write_bytes(b"")
-    soundfile.write(tmp_path / "empty.wav", np.zeros(0), 16000)
-    soundfile.write(tmp_path / "nan.wav", np.full(10, np.nan), 16000, subtype="FLOAT")
-    for name, message in {
-        "text.wav": "not a sound file",
-        "zero.wav": "not a sound file",
-        "empty.wav": "holds no samples",
-        "nan.wav": "not finite",
-        "missing.wav": "no such file",
-        ".": "is a folder",
-    }.items():
-        with pytest.raises(ConfigError, match=message) as error:
-            read_audio(tmp_path / name)
-        assert "\n" not in str(error.value)
-
-
 UNUSABLE = {
+    "no samples": (np.zeros(0), 16000, "PCM_16", "holds no samples"),
     "one sample a second": (np.full(10, 0.1), 1, "PCM_16", "1 samples a second is not a rate of speech"),
     "integers as floats": (np.full(10, 1e6), 16000, "FLOAT", r"samples up to 1e\+06, full scale is 1"),
     "the largest float": (np.full(100_000, 1e38), 48000, "FLOAT", r"samples up to 1e\+38"),
     "one NaN late": (np.r_[np.zeros(200_000), np.nan], 16000, "DOUBLE", "not finite"),
+    "text": (b"this is not a sound", 0, "", "not a sound file"),
+    "empty": (b"", 0, "", "not a sound file"),
+    "missing": (None, 0, "", "no such file"),
 }
 
 
 @pytest.mark.parametrize(("samples", "rate_hz", "subtype", "told"), UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_a_file_that_would_shake_the_listener_is_refused_before_it_is_played(tmp_path, samples, rate_hz, subtype, told):
-    soundfile.write(tmp_path / "a.wav", samples, rate_hz, subtype=subtype)
+def test_what_is_no_sound_or_would_shake_the_listener_is_refused_before_it_is_played(
+    tmp_path, samples, rate_hz, subtype, told
+):
+    file = tmp_path / "a.wav"
+    if isinstance(samples, bytes):
+        file.write_bytes(samples)
+    elif samples is not None:
+        soundfile.write(file, samples, rate_hz, subtype=subtype)
     with pytest.raises(ConfigError, match=told) as error:
-        AudioFile(tmp_path / "a.wav")
+        AudioFile(file)
     assert "\n" not in str(error.value)
 
 
@@ -135,9 +127,6 @@ def test_at_whole_positions_samples_are_what_they_are_and_0_around_them(seed, sh
     np.testing.assert_allclose(at_positions(samples, positions), expected, atol=1e-6)
 
 
-def test_of_nothing_asked_there_is_nothing():
-    assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)
-
-
 def test_a_constant_stays_one():
     assert at_positions(np.ones(200, np.float32), np.linspace(50, 150, 333)) == pytest.approx(np.ones(333), abs=1e-6)
+    assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)

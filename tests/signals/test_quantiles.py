@@ -34,11 +34,6 @@ def test_the_largest_is_exact_and_zeros_stay_zeros():
     assert (quantiles.at(50), quantiles.at(100), len(quantiles)) == (0.0, 123.456, 10_001)
 
 
-def test_memory_does_not_grow_with_the_number_of_values():
-    quantiles = taken(np.linspace(0, 1, 20_000))
-    assert quantiles._values == [] and len(quantiles._bins) == 2048
-
-
 def test_nothing_taken_is_none_in_a_report_and_an_error_when_asked():
     assert Quantiles().report(p50=50) == {"p50": None}
     with pytest.raises(ValueError, match="no value"):
