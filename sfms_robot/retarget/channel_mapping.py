@@ -26,9 +26,10 @@ from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 
+# The first plus the sum of the others: the last digits of the motion depend on this order.
 _COMBINE: Mapping[str | None, Callable[[list[Doubles]], Doubles]] = {
     "sum": lambda values: values[0] + sum(values[1:]),
-    "mean": lambda values: values[0] + sum(values[1:]),  # until it is scaled, by its gain or before its curve
+    "mean": lambda values: values[0] + sum(values[1:]),  # divided in `compiled`
     "max": partial(reduce, np.maximum),
     "min": partial(reduce, np.minimum),
     "product": partial(reduce, np.multiply),
@@ -178,10 +179,13 @@ class ChannelMapping:
 
 
 def compiled(node: Expression, row: int) -> Callable[[Doubles], Doubles]:
-    """Return the function from motion (J, 58, ...) to the values (...) of a node of joint `row`."""
+    """Return the function from motion (J, 58, ...) to the values (...) of a node of joint `row`.
+
+    At a tick the values are numbers, for a recording arrays; an operation that changes nothing is left out.
+    """
     parts = [compiled(part, row) for part in node.parts]
     combine, column = _COMBINE.get(node.group), CHANNEL_INDEX.get(node.channel or "")
-    count = float(len(node.mean or (1,)))
+    count = float(len(node.mean or (1,)))  # a mean is divided by it with the gain, or in the curve
     dead = node.dead_band * count
     curve = _pchip(np.array(node.curve) * [count, 1.0]) if node.curve else None
     down, up = np.array(node.gains) / (1.0 if curve else count)
