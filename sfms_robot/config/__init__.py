@@ -1,5 +1,8 @@
 """Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from sfms_robot.config.base import Model, load, parse
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files, variant
 from sfms_robot.config.head import (
@@ -35,23 +38,25 @@ from sfms_robot.config.listener import (
     load_listener,
     parse_listener,
 )
-from sfms_robot.config.training import (
-    ArigPhase,
-    ArigTraining,
-    Baseline,
-    Dense,
-    Grouped,
-    GroupWeights,
-    Phase,
-    PredictorTraining,
-    Recipe,
-    Stage,
-    TokenizerTraining,
-    Training,
-    load_training,
-    parse_training,
-)
 from sfms_robot.data import find
+
+if TYPE_CHECKING:
+    from sfms_robot.config.training import (
+        ArigPhase,
+        ArigTraining,
+        Baseline,
+        Dense,
+        Grouped,
+        GroupWeights,
+        Phase,
+        PredictorTraining,
+        Recipe,
+        Stage,
+        TokenizerTraining,
+        Training,
+        load_training,
+        parse_training,
+    )
 
 __all__ = [
     "Arig",
@@ -104,3 +109,10 @@ __all__ = [
     "parse_training",
     "variant",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name of `config.training` when it is first used: only the lab needs them (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.training"), name)
