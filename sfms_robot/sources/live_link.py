@@ -10,7 +10,7 @@ One packet a frame, big-endian:
     uint8   number of values: 61, or 0 while no face is seen
     float32 52 blendshapes in the order "live_link_udp"; head yaw, pitch, roll; yaw, pitch, roll of each eye [rad]
 
-What the signs of the head's angles mean is in `signals.tracks.SOURCES`.
+The head's angles turn as ours do, which is not proved (`signals.tracks`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ import numpy as np
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
-from sfms_robot.signals.tracks import SOURCES
 from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
 
 PORT: Final = 11111  # what the app suggests
@@ -39,9 +38,9 @@ _VALUES: Final = (*_SHAPES, "yaw", "pitch", "roll", *(f"eye{i}" for i in range(6
 # A tracker may overshoot 0..1, and is clipped; another unit is refused.
 _LOWEST: Final = np.array([-0.5] * 52 + [-2 * np.pi] * 9, dtype=np.float32)
 _HIGHEST: Final = np.array([2.0] * 52 + [2 * np.pi] * 9, dtype=np.float32)
-# Of each of our channels: where it stands in a packet, and its sign; a packet has no position.
+# Of each of our channels: where it stands in a packet, and its factor; a packet has no position.
 _COLUMNS: Final = np.array([_VALUES.index(name) if name in _VALUES else 0 for name in CHANNELS])
-_FACTORS: Final = np.array([*SOURCES["live_link"].angles, 0, 0, 0, *[1] * 52], dtype=np.float32)
+_FACTORS: Final = np.array([1, 1, 1, 0, 0, 0, *[1] * 52], dtype=np.float32)
 
 
 class LiveLinkPacket(NamedTuple):
