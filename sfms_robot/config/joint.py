@@ -34,6 +34,7 @@ def _channel(name: str) -> str:
 
 
 Channel = Annotated[str, AfterValidator(_channel)]
+MeasuredFault = Annotated[str, Field(pattern="^(input voltage|overheating)$")]
 Parts = Annotated[tuple["Expression", ...], Field(min_length=1)]
 Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded: no drive can overflow
 Knob = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)]
@@ -213,7 +214,7 @@ class Faults(Model):
     """The servo faults that cause a reaction, by the names in the firmware map."""
 
     mask: tuple[str, ...] = ()
-    thresholds: dict[Literal["input voltage", "overheating"], Threshold] = Field(default_factory=dict)
+    thresholds: dict[MeasuredFault, Threshold] = Field(default_factory=dict)
 
 
 class LimitClass(Model):
