@@ -109,7 +109,12 @@ def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[PhaseState]
 
 def of_audio(audio: Floats) -> Floats:
     """Return the features (N, 21) of samples (N * 640,), equal to `step_each`; samples left over are not used."""
-    return features(times(hear(voice_activity.levels_db(audio))))
+    return of_levels(voice_activity.levels_db(audio))
+
+
+def of_levels(levels_db: Doubles) -> Floats:
+    """Return the features (N, 21) of the levels (N,) of frames from the start of a stream."""
+    return features(times(hear(levels_db)))
 
 
 def hear(levels_db: Doubles) -> list[bool]:

@@ -36,6 +36,7 @@ from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
 from sfms_robot.signals.control import control_track
+from sfms_robot.signals.voice_activity import mel_levels_db
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
 LEAST_SPEED = 0.05  # deviations a frame
@@ -141,7 +142,7 @@ def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor,
     elif frontend.phased and dyad.mel is not None:
         rows = dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS)
         ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases count our frames
-        phase = at_rate(phases.of_mel(ours), FRAME_HZ, frames, dyad.fps)
+        phase = at_rate(phases.of_levels(mel_levels_db(ours)), FRAME_HZ, frames, dyad.fps)
     sound = (
         torch.zeros(frames, *frontend.shape) if found is None else torch.from_numpy(found).view(frames, *frontend.shape)
     )
