@@ -117,7 +117,6 @@ class ChainBus(WireBus[RegisterLink]):
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
         simple = self.maps[1] == 2 and goal.sign in ("no", "twos_complement")
         self._goal_type = np.dtype(f"<{'i' if goal.signed else 'u'}{goal.size}") if simple else None
-        self._streamed: tuple[NDArray[np.intp], tuple[int, ...]] = (self._places, ())  # places, and their ids
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed
@@ -374,19 +373,18 @@ class ChainBus(WireBus[RegisterLink]):
     def _send(self, link: RegisterLink, places: NDArray[np.intp], ticks: NDArray[np.int64]) -> None:
         """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
         goal, now_s = self._telemetry.goal, link.port.now_s()
-        if places is not self._streamed[0]:
-            self._streamed = places, tuple(self._ids[places].tolist())
+        ids = self._ids[places].tolist()
         if now_s - self._wrote_s > _STALL * self._watchdog * _WATCHDOG_TICK_S:
             self._settings.look_for_trips()
         self._wrote_s = now_s
         if self._goal_type is not None:
-            data = ticks.astype(self._goal_type).tobytes()
+            data = ticks.astype(self._goal_type).view(f"V{goal.size}").tolist()
         else:
-            data = b"".join(map(goal.to_bytes, ticks.tolist()))
-        link.sync_write_block(goal.address, self._streamed[1], goal.size, data)
+            data = map(goal.to_bytes, ticks.tolist())
+        link.sync_write(goal.address, dict(zip(ids, data, strict=True)))
         if self._watchdog and places is not self._fed:
             self._fed = places
-            self._settings.arm(self._streamed[1], self._watchdog)
+            self._settings.arm(ids, self._watchdog)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Return whether a rejoining member gets goals from now on."""

@@ -77,6 +77,7 @@ class RegisterLink(ABC):
         self.silence_s = silence_s
         self.tries = 1
         self.judged = True
+        self._sent = b""  # the last request
         self._byte_s = BITS / baud
         self._end_s = math.inf
         self._left_s = math.inf
@@ -105,10 +106,6 @@ class RegisterLink(ABC):
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """Write to one servo; return the acknowledgement. Without one the servo may still have taken the data."""
 
-    @abstractmethod
-    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
-        """Write `length` bytes to each of `servos`, `data` in their order, in one packet. Nothing answers."""
-
     @staticmethod
     @abstractmethod
     def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
@@ -128,8 +125,13 @@ class RegisterLink(ABC):
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write to several servos in one packet; all values have one length. Nothing answers."""
-        length = len(next(iter(values.values())))
-        self.sync_write_block(address, tuple(values), length, b"".join(values.values()))
+        self._send(self.sync_write_packet(address, values))
+
+    def _send(self, packet: bytes) -> None:
+        """Send a packet; drop what came before it."""
+        self.port.discard_input()
+        self.port.write(packet)
+        self._sent = packet
 
     # --- time ---------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,7 @@
 """Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
 
-The vendor's SDK builds the Dynamixel packets (`sdk_packets`), our codec those of Feetech, which has other instructions.
+The vendor's SDK builds requests to Dynamixel servos (`sdk_packets`); our codec builds sync writes, and all of Feetech,
+which has other instructions.
 
 The frame does not say what an answer answers, so a late answer could pass for the next one. Three rules prevent that:
 an answer counts only from an id that was asked and with the number of bytes that was asked for; what came before a
@@ -15,14 +16,14 @@ Withholding goals keeps a limp one limp. They have no reboot, and report their f
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Final
 
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import PacketError, ServoError
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
-from sfms_robot.servo.chain.sdk_packets import SdkPackets1
+from sfms_robot.servo.chain.sdk_packets import instruction1
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, Frame, encode, maybe_frame, salvage
@@ -41,16 +42,12 @@ class Protocol1Link(RegisterLink):
     family: ClassVar[str]
     who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
     refusal_bits: ClassVar[int] = 0  # of the error byte, about the request
+    packet: ClassVar[Callable[[int, int, bytes], bytes]]  # (id, instruction, parameters) -> a request
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
-        self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
         self._echoed = False
-
-    @abstractmethod
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
-        """Return a request."""
 
     @abstractmethod
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
@@ -101,7 +98,7 @@ class Protocol1Link(RegisterLink):
     def _ask(self, servo: int, code: int, params: bytes, length: int) -> Answer | None:
         if self._owes(servo, length) and not self._fence(servo):
             return None
-        self._send(servo, code, params)
+        self._send(self.packet(servo, code, params))
         return self._answers([servo], length).get(servo)
 
     # --- several servos -----------------------------------------------------------------------------------------
@@ -109,10 +106,6 @@ class Protocol1Link(RegisterLink):
     @staticmethod
     def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
         return encode(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
-
-    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
-        values = {servo: data[i * length : (i + 1) * length] for i, servo in enumerate(servos)}
-        self._send(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         late = [servo for servo in servos if self._owes(servo, length)]
@@ -132,7 +125,7 @@ class Protocol1Link(RegisterLink):
         if not asked:
             self.judged = judged  # by one of them: the last may have had no time left
             return {}
-        self._send(BROADCAST, *self._group_request(address, length, asked))
+        self._send(self.packet(BROADCAST, *self._group_request(address, length, asked)))
         return self._answers(asked, length)
 
     # --- the wire -----------------------------------------------------------------------------------------------
@@ -149,16 +142,9 @@ class Protocol1Link(RegisterLink):
     def _fence(self, servo: int) -> bool:
         """Ask for data of a length that no owed answer has; return whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
-        if size == 0:
-            self._send(servo, protocol1.PING, b"")
-        else:
-            self._send(servo, protocol1.READ, bytes([0, size]))
+        request = (protocol1.READ, bytes([0, size])) if size else (protocol1.PING, b"")
+        self._send(self.packet(servo, *request))
         return servo in self._answers([servo], size)
-
-    def _send(self, servo: int, code: int, params: bytes) -> None:
-        self.port.discard_input()
-        self._sent = self._packet(servo, code, params)
-        self.port.write(self._sent)
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
         """Return answers of `servos` with `length` bytes of data, or with a refusal and none.
@@ -201,13 +187,7 @@ class Dynamixel1Link(Protocol1Link):
     framing = FRAMINGS["dynamixel1"]
     who_length = 3
     refusal_bits = protocol1.REFUSAL_BITS
-
-    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
-        super().__init__(port, baud, silence_s)
-        self._sdk = SdkPackets1()
-
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
-        return self._sdk.instruction(servo, code, params)
+    packet = staticmethod(instruction1)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.BULK_READ, protocol1.bulk_read_params((servo, address, length) for servo in servos)
@@ -231,9 +211,7 @@ class FeetechLink(Protocol1Link):
     family = "feetech"
     framing = FRAMINGS["feetech"]
     who_length = 5
-
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
-        return encode(servo, code, params)
+    packet = staticmethod(encode)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)
@@ -243,7 +221,7 @@ class FeetechLink(Protocol1Link):
 
     def broadcast_ping(self) -> dict[int, Found]:
         ids = range(protocol1.MAX_ID + 1)
-        self._send(BROADCAST, protocol1.PING, b"")
+        self._send(encode(BROADCAST, protocol1.PING))
         with self.patient(_STAGGER_S * len(ids)):
             there = sorted(self._answers(ids, 0))
         self._owed.clear()  # no servo owes an answer to a broadcast

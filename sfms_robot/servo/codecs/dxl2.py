@@ -28,7 +28,7 @@ Source: ROBOTIS e-manual, docs/en/dxl/protocol2.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
 from fastcrc.crc16 import umts
@@ -76,6 +76,7 @@ STATUS_OVERHEAD: Final = 11  # bytes of a status packet without its data
 _HEADER: Final = b"\xff\xff\xfd\x00"  # "Header" and "Reserved"
 _LOOKALIKE: Final = b"\xff\xff\xfd"  # inside a packet; byte stuffing makes it the next one
 _STUFFED: Final = b"\xff\xff\xfd\xfd"
+_BYTES: Final = [bytes([value]) for value in range(256)]
 
 
 class Packet(NamedTuple):
@@ -93,6 +94,13 @@ crc16: Final = umts  # CRC-16/BUYPASS: 0x8005, start 0, not reflected. A second 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
     """Return an instruction packet. Raises PacketError if it would be longer than `MAX_PACKET`."""
     return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
+
+
+def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
+    """Return the parameters of a sync write; all data have one length."""
+    length = len(next(iter(values.values())))
+    parts = [_BYTES[servo] + data for servo, data in values.items()]
+    return address.to_bytes(2, "little") + length.to_bytes(2, "little") + b"".join(parts)
 
 
 def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
