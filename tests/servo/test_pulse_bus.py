@@ -10,7 +10,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.codecs import maestro, ssc32
-from sfms_robot.servo.pulse_bus import MaestroBus
+from sfms_robot.servo.pulse_bus import PulseBus
 
 KINDS = ("maestro-24", "maestro-6", "ssc-32")
 
@@ -237,7 +237,7 @@ def test_two_boards_on_one_bus_are_refused():
     six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
     servos = [bus_servo("a", 0, six, 0.1), bus_servo("b", 1, all_, 0.1)]
     with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
-        MaestroBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200)
+        PulseBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200)
 
 
 def test_noise_that_comes_back_is_no_answer():

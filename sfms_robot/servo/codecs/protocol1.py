@@ -34,7 +34,7 @@ Sources: ROBOTIS e-manual, docs/en/dxl/protocol1.md; Feetech communication proto
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from sfms_robot.errors import PacketError
@@ -152,32 +152,11 @@ def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
     return bytes([address, length]) + b"".join(bytes([servo]) + data for servo, data in values.items())
 
 
-def sync_write_parts(params: bytes) -> tuple[int, Iterator[tuple[int, bytes]]]:
-    """Return (address, (id, data) of each servo); bytes behind the last whole part are ignored.
-
-    Raises IndexError if address or length are missing.
-    """
-    address, length = params[0], params[1]
-    starts = range(2, len(params) - length, length + 1)
-    return address, ((params[i], params[i + 1 : i + 1 + length]) for i in starts)
-
-
 def bulk_read_params(requests: Iterable[tuple[int, int, int]]) -> bytes:
     """Return the parameters of a bulk read of (id, address, length)."""
     return b"\x00" + b"".join(bytes([length, servo, address]) for servo, address, length in requests)
 
 
-def bulk_read_parts(params: bytes) -> Sequence[tuple[int, int, int]]:
-    """Return (id, address, length) of each servo asked."""
-    body = params[1:]  # behind the 00
-    return [(body[i + 1], body[i + 2], body[i]) for i in range(0, len(body) - 2, 3)]
-
-
 def sync_read_params(address: int, length: int, servos: Sequence[int]) -> bytes:
     """Return the parameters of a Feetech sync read; one answer per id comes back, in this order."""
     return bytes([address, length, *servos])
-
-
-def sync_read_parts(params: bytes) -> tuple[int, int, bytes]:
-    """Return (address, length, ids). Raises IndexError if address or length are missing."""
-    return params[0], params[1], params[2:]
