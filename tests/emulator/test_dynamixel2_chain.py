@@ -57,7 +57,8 @@ def host():
 def test_unknown_id_and_other_baud_are_silence(host):
     assert host.ask(9, dxl2.PING) == []
     assert host.ask(1, dxl2.PING, baud=57600) == []
-    assert host.ask(1, dxl2.PING, baud=None) == []
+    assert host.ask(1, dxl2.PING, baud=None) == host.ask(1, dxl2.PING, baud=921_600) == []
+    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1
 
 
 @pytest.mark.parametrize(
@@ -99,12 +100,6 @@ def test_status_return_level_decides_who_answers(host):
     host.ask(1, dxl2.WRITE, words(68) + b"\x00")
     assert host.ask(1, dxl2.READ, words(65, 1)) == []
     assert len(host.ask(1, dxl2.PING)) == 1
-
-
-def test_without_torque_a_goal_moves_nothing(host):
-    host.write(1, "goal_position", 3000)
-    host.t = 2.0
-    assert host.read(1, "present_position") == 2001
 
 
 def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
@@ -251,7 +246,3 @@ def test_each_reply_waits_its_return_delay(host):
 
 def test_broadcast_ping_is_answered_in_slots(host):
     assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))
-
-
-def test_baud_may_be_a_little_off(host):
-    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1 and host.ask(1, dxl2.PING, baud=921_600) == []

@@ -35,16 +35,6 @@ def tick_rad(rig):
     return rig.conversion.rad
 
 
-def test_servos_are_identified_and_left_without_torque(rig):
-    rig.bus.connect()
-    readings = rig.bus.poll(0.0)
-    assert [round(r.position_rad / tick_rad(rig)) for r in readings.values()] == [-40, 0, 60, 20]
-    assert {"position", "velocity", "voltage", "temperature", "torque"} <= rig.bus.capabilities["joint1"]
-    assert rig.torques() == [0, 0, 0, 0]
-    with pytest.raises(ValueError, match="no joint is enabled"):
-        rig.bus.write(np.zeros(4), 0.0)
-
-
 def test_goal_is_reached_and_motion_is_seen_on_the_way(rig):
     held = rig.hold()
     moving = rig.ticks(held + 0.3, 5)
@@ -68,19 +58,6 @@ def test_joint_outside_its_limits_is_held_and_may_only_come_in(model):
         rig.bus.write(np.array([1.1]), rig.clock.t)
 
 
-def test_absent_servo_is_a_silent_member_that_comes_in_when_it_appears(rig):
-    rig.kill(2)
-    held = rig.hold()
-    assert held[1] == 0.0 and rig.torques() == [1, 0, 1, 1]
-    readings = rig.ticks(held, 20)
-    assert {joint: r.fault for joint, r in readings.items() if r.fault} == {"joint2": "no answer"}
-    assert readings["joint2"].position_rad is None
-    assert rig.bus.statistics()["silent"] == [2] and rig.bus.statistics()["faults"] == ["joint2: no answer"]
-    rig.revive(2)
-    assert rig.ticks(held, 250)["joint2"].fault is None
-    assert rig.rejoined == {"joint2"} and rig.torques() == [1, 1, 1, 1]
-
-
 def test_families_and_byte_orders_cannot_share_a_bus():
     with pytest.raises(
         ConfigError, match="scs0009 and sts3215 have present_position at different places or in different forms"
@@ -88,18 +65,6 @@ def test_families_and_byte_orders_cannot_share_a_bus():
         rig_of(["sts3215", "scs0009"], [2048, 512])
     with pytest.raises(ConfigError, match="sts3215 does not speak dynamixel protocol 1"):
         rig_of(["ax-12a", "sts3215"], [512, 2048])
-
-
-def test_silent_servo_is_probed_seldom_and_taken_back(rig):
-    held = rig.hold()
-    rig.kill(2)
-    rig.ticks(held, 300)
-    assert rig.bus.statistics()["retries"] < 12
-    rig.revive(2)
-    assert rig.ticks(held, 200)["joint2"].age_s == 0.0
-    after = rig.bus.statistics()
-    assert after["silent"] == [] and after["reconnects"] == 1
-    assert rig.torques() == [1, 1, 1, 1]
 
 
 def test_wire_that_is_wholly_quiet_blames_nobody_at_once(rig):
@@ -344,14 +309,6 @@ def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():
     ages = sorted(r.age_s for r in readings.values())
     assert ages[7] == 0.0 and ages[8] > 0.0  # eight of 28 in 6 ms at 1 Mbps
     assert ages[-1] == pytest.approx(0.03)  # and all of them within four ticks
-
-
-@pytest.mark.parametrize("model", OLDER)
-def test_one_sync_request_goes_out_per_tick_for_all_goals(rig):
-    held = rig.hold()
-    before = len(rig.port.sent)
-    rig.bus.write(held, 0.01)
-    assert [len(packet) for packet in rig.port.sent[before:]] == [8 + 4 * 3]
 
 
 def test_bus_of_unknown_model_number_is_not_checked():

@@ -1,7 +1,6 @@
 """Dynamixel 2.0: what was away comes back (a servo, the wire, the supply), watchdogs, modes."""
 
 import logging
-import math
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from emulated_port import BAUD
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import ServoError
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.port import SerialPort
 
@@ -135,16 +133,6 @@ def test_stop_opens_a_port_that_is_back_to_release_the_head(make_rig):
     rig.come_back()
     rig.bus.stop("release")
     assert [rig.state(i)["torque"] for i in (1, 2, 3, 4)] == [0, 0, 0, 0]
-
-
-RAD_PER_TICK = 2 * math.pi / 4096
-
-
-def test_servo_in_shutdown_is_named_at_torque_on(rig):
-    rig.bus.connect()
-    rig.fault(2, 1 << 2)
-    with pytest.raises(ServoError, match=r"joint2 \(id 2\) refuses torque_enable := 1.*hardware error"):
-        rig.bus.enable(rig.bus.joints)
 
 
 def test_mode_and_drive_mode_are_set_before_the_first_goal(rig):
