@@ -78,11 +78,6 @@ def test_write_is_checked(host, name, value, error):
     assert host.read(1, name) == (before if error else value)
 
 
-def test_part_of_a_register_cannot_be_written(host):
-    [status] = host.ask(1, dxl2.WRITE, words(116) + b"\x00\x08")
-    assert status.error == dxl2.DATA_LENGTH_ERROR
-
-
 def test_eeprom_is_locked_under_torque(host):
     assert host.write(1, "torque_enable", 1) == 0
     assert host.write(1, "return_delay_time", 0) == dxl2.ACCESS_ERROR
@@ -107,23 +102,6 @@ def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
 
 
-def test_registered_write_waits_for_action(host):
-    host.ask(1, dxl2.REG_WRITE, words(65) + b"\x01")
-    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (0, 1)
-    assert host.ask(dxl2.BROADCAST, dxl2.ACTION) == []
-    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (1, 0)
-
-
-def test_reboot_restores_ram_and_keeps_eeprom(host):
-    host.write(1, "return_delay_time", 7)
-    host.write(1, "led", 1)
-    host.write(1, "torque_enable", 1)
-    assert len(host.ask(1, dxl2.REBOOT)) == 1
-    assert host.ask(1, dxl2.PING) == []  # it is busy starting
-    host.t = 0.5
-    assert [host.read(1, n) for n in ("led", "torque_enable", "return_delay_time")] == [0, 0, 7]
-
-
 def test_hardware_error_is_latched_until_reboot(host):
     host.write(2, "torque_enable", 1)
     host.chain.servo(2).fail(1 << 5, 0.0)
@@ -134,19 +112,6 @@ def test_hardware_error_is_latched_until_reboot(host):
     host.ask(2, dxl2.REBOOT)
     host.t = 0.5
     assert host.read(2, "hardware_error_status") == 0 and host.write(2, "torque_enable", 1) == 0
-
-
-def test_watchdog_stops_the_servo_when_the_host_is_gone(host):
-    host.write(1, "profile_velocity", 20)
-    host.write(1, "goal_position", 2001)
-    host.write(1, "torque_enable", 1)
-    host.write(1, "bus_watchdog", 5)
-    host.write(1, "goal_position", 4000)
-    host.t = 5.0
-    stopped = host.read(1, "present_position")
-    assert 2001 < stopped < 2060 and host.read(1, "bus_watchdog") == -1
-    assert host.write(1, "goal_position", 3000) == dxl2.DATA_RANGE_ERROR
-    assert host.write(1, "bus_watchdog", 0) == 0 and host.write(1, "goal_position", 3000) == 0
 
 
 def test_watchdog_is_fed_by_any_instruction(host):

@@ -160,17 +160,6 @@ def test_sts_is_calibrated_where_it_stands(how):
     assert device.servo(1).plant.position == 3100
 
 
-def test_profile_speed_and_acceleration_are_kept():
-    device = chain_of("sts3215")
-    put(device, 1, "goal_velocity", 100)
-    put(device, 1, "goal_position", 3000)
-    assert get(device, 1, "present_position", 1.0) == pytest.approx(2048 + 100, abs=10)
-    slow = chain_of("mx-28-1.0")
-    put(slow, 1, "moving_speed", 10)  # 1.14 rpm
-    put(slow, 1, "goal_position", 3000)
-    assert get(slow, 1, "present_position", 1.0) == pytest.approx(2048 + 1.14 * 4096 / 60, abs=10)
-
-
 def test_two_servos_with_one_id_both_answer():
     device = chain_of("ax-12a", "ax-12a")
     ask(device, 2, protocol1.WRITE, bytes([3, 1]))

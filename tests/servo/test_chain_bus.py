@@ -189,17 +189,6 @@ def test_fault_is_met_by_the_policy_of_the_head(policy, torques, moves):
     assert rig.bus.statistics()["faults"] == ["joint2: motor encoder"]
 
 
-def test_servo_that_gave_way_comes_on_again_where_the_head_says_so():
-    rig = rig_of("sts3215", [2048], safety=Safety(on_fault="reboot_and_ease_in"))
-    rig.hold()
-    rig.ticks([0.0], 2)
-    rig.servo(1).fail(1 << 5, rig.clock.t)
-    rig.ticks([0.0], 100)
-    assert rig.torques() == [0]
-    readings = rig.ticks([0.0], 250)
-    assert rig.torques() == [1] and readings["joint1"].fault is None
-
-
 def test_pinched_joint_whose_cable_came_out_meanwhile_comes_back_all_the_same():
     rule = LoadRule(current_mA=400, for_s=0.1, then="limp")
     rig = rig_of("sts3215", [2048, 2048], safety=Safety(pinch=rule))

@@ -144,19 +144,6 @@ def test_joint_that_came_back_is_told_once_however_often_its_bus_ticks():
     assert told == 1
 
 
-def test_what_goes_wrong_in_a_thread_is_raised_once_by_a_later_poll():
-    slow = Gate()
-    slow.refuse = True
-    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
-    with pytest.raises(BusError, match="not in range"):
-        while True:
-            bus.write(np.zeros(1), 0.0)
-            bus.poll(0.0)
-    bus.write(np.zeros(1), 0.0)
-    assert bus.poll(0.0)["slow"].fault == "bus failed"
-    bus.close()
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_goal_that_is_not_finite_reaches_no_thread(bad):
     slow = Gate()

@@ -55,19 +55,6 @@ def test_servo_that_is_rebooted_waits_where_it_stands(make_rig):
     assert readings["joint2"].position_rad == pytest.approx(held[1], abs=2 * RAD_PER_TICK)
 
 
-def test_servo_that_fails_again_and_again_is_left_alone(make_rig):
-    rig = three(make_rig, safety=Safety(on_fault="reboot_and_ease_in"))
-    held = rig.hold()
-    rig.ticks(held, 10)
-    back = 0
-    for _ in range(6):
-        rig.fault(2, OVERLOAD)
-        for _ in range(200):
-            back += rig.ticks(held, 1)["joint2"].rejoined
-    assert 1 <= back <= 3
-    assert rig.ticks(held, 1)["joint1"].age_s == 0.0
-
-
 def test_masked_fault_is_reported_by_nobody_and_acted_upon_by_nobody(make_rig, caplog):
     caplog.set_level(logging.INFO)
     rig = three(make_rig, faults=Faults(mask=("input voltage",)))

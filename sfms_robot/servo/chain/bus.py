@@ -115,8 +115,8 @@ class ChainBus(WireBus[RegisterLink]):
         self._sending = RLock()
         goal = self._telemetry.goal
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
-        simple = self.maps[1] == 2 and goal.sign in ("no", "twos_complement")
-        self._goal_type = np.dtype(f"<{'i' if goal.signed else 'u'}{goal.size}") if simple else None
+        simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
+        self._goal_type = np.dtype(f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}") if simple else None
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed

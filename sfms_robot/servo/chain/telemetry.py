@@ -58,7 +58,12 @@ class Telemetry:
                 raise ConfigError(
                     f"bus {bus!r}: {table.model} does not speak {family} protocol {protocol} and cannot be on it"
                 )
-        present, self.goal, self.torque = (_needed(bus, tables, role) for role in _NEEDED)
+        needed = []
+        for role in _NEEDED:
+            if (field := common(bus, tables, role)) is None:
+                raise ConfigError(f"bus {bus!r}: {tables[0].model} has no register for {role}, which every tick needs")
+            needed.append(field)
+        present, self.goal, self.torque = needed
         self.error = common(bus, tables, "error_status") if protocol == 2 else None
         common(bus, tables, "bus_watchdog")
         zero, one = (conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
@@ -174,18 +179,10 @@ def common(bus: str, tables: Sequence[Table], role: str) -> Field | None:
     return first
 
 
-def _needed(bus: str, tables: Sequence[Table], role: str) -> Field:
-    field = common(bus, tables, role)
-    if field is None:
-        raise ConfigError(f"bus {bus!r}: {tables[0].model} has no register for {role}, which every tick needs")
-    return field
-
-
 def _alike(field: Field | None, other: Field | None) -> bool:
     """Return whether two registers have the same address and form."""
-    return (field and (field[1:4], field.sign, field.byte_order)) == (
-        other and (other[1:4], other.sign, other.byte_order)
-    )
+    first, second = (each and (each.address, each.size, each.signed, each.byte_order) for each in (field, other))
+    return first == second
 
 
 def _shared(fields: Sequence[Field | None]) -> Field | None:
@@ -211,15 +208,15 @@ def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:
 
 def _values(field: Field, rows: bytes, where: Block) -> NDArray[Any]:
     """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` of one."""
-    kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.sign == "twos_complement"]
+    kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.signed == "twos_complement"]
     start, length = where
     raw: NDArray[Any] = np.ndarray(
         len(rows) // length, f"{kind}{field.size}", rows, field.address - start, strides=(length,)
     )
-    if field.sign == "offset_2048":
+    if field.signed == "offset_2048":
         return np.asarray(raw.astype(np.int64) - 2048)
-    if field.sign.startswith("sign_bit_"):
-        wide, bit = raw.astype(np.int64), 1 << int(field.sign[9:])
+    if field.signed.startswith("sign_bit_"):
+        wide, bit = raw.astype(np.int64), 1 << int(field.signed[9:])
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)
     return raw
