@@ -22,11 +22,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from sfms_robot.config.wire_time import BITS
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import TickConversion
+from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -269,9 +268,8 @@ class Ssc32:
 
 def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
     """Return the board of these servos. Raises ConfigError if they are not all on one."""
-    tables = [Table.of(servo.map) for servo in servos]
-    table = tables[0]
-    others = sorted({each.model for each in tables} - {table.model})
+    table = servos[0].table
+    others = sorted({servo.table.model for servo in servos} - {table.model})
     if others:
         raise ConfigError(f"bus {bus!r}: one board is one model, the head says {table.model} and {', '.join(others)}")
     if table.channels is None or table.pulse_us is None or table.tick_us is None:
@@ -291,8 +289,7 @@ def pulses_beyond(
     """Return the joints, each with the pulses of its range, that do not fit between (shortest, longest)."""
     if range_us is None:
         return ""
-    ends = [conversion.to_ticks(np.array([getattr(servo, end) for servo in servos])) for end in ("min_rad", "max_rad")]
-    pulses = np.sort(np.stack(ends), axis=0) * (table.tick_us or 1.0)
+    pulses = tick_ranges(servos, conversion) * (table.tick_us or 1.0)
     return ", ".join(
         f"{servo.joint} ({low:g}..{high:g} us, not in {range_us[0]:g}..{range_us[1]:g})"
         for servo, low, high in zip(servos, *pulses, strict=True)

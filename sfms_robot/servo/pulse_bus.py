@@ -79,8 +79,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
         self._confirmed = confirmed
-        self._lowest = np.array([servo.min_rad for servo in servos])
-        self._highest = np.array([servo.max_rad for servo in servos])
         table = board_of(name, servos)
         self.model = table.model
         crc = config is not None and config.crc
@@ -90,7 +88,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):
             log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, wide)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
-        self._ticks = conversion.to_ticks(np.clip(rest, self._lowest, self._highest))  # goals; before any, the rest
+        self._ticks = conversion.to_ticks(self._goals.own.nearest(rest))  # goals; before any, the rest
         self._warned = False  # that servos jump
         self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
@@ -204,7 +202,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         if output.pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
             ticks = self._ticks.copy()
             ticks[index] = output.pulse
-            angles = np.clip(self._conversion.to_rad(ticks), self._lowest, self._highest)
+            angles = self._goals.own.nearest(self._conversion.to_rad(ticks))
             self._ticks = self._conversion.to_ticks(angles)
         self._send(wire, [output])
         if new and output.pulse != self._ticks[index]:

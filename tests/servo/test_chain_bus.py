@@ -35,15 +35,6 @@ def tick_rad(rig):
     return rig.conversion.rad
 
 
-def test_goal_is_reached_and_motion_is_seen_on_the_way(rig):
-    held = rig.hold()
-    moving = rig.ticks(held + 0.3, 5)
-    assert all(r.extra["velocity_rad_s"] > 0.1 for r in moving.values())
-    arrived = rig.ticks(held + 0.3, 60)
-    assert [r.position_rad for r in arrived.values()] == pytest.approx(held + 0.3, abs=tick_rad(rig))
-    assert all(r.fault is None and 20 < r.extra["temperature_C"] < 40 for r in arrived.values())
-
-
 def test_joint_outside_its_limits_is_held_and_may_only_come_in(model):
     per_rad = table_of(model).ticks_per_revolution / (2 * math.pi)
     rig = rig_of(model, starts(model, round(1.4 * per_rad)))
@@ -143,29 +134,6 @@ def test_one_lost_answer_is_not_an_absence(rig):
     assert rig.bus.statistics()["silent"] == []
 
 
-def test_late_answers_are_never_taken_for_fresh_ones(rig):
-    held = rig.hold()
-    rig.ticks(held, 2)
-    for round_ in range(12):
-        rig.port.late = 2 + round_ % 3
-        goals = held + 0.02 * (round_ + 1)
-        readings = rig.ticks(goals, 1)
-        for i, reading in enumerate(readings.values()):
-            if reading.age_s == 0.0 and not reading.rejoined:  # which tells the goal it holds
-                there = rig.servo(i + 1).plant.position
-                assert reading.position_rad == pytest.approx(
-                    (there - rig.conversion.center) * tick_rad(rig), abs=tick_rad(rig)
-                )
-    assert all(r.age_s == 0.0 for r in rig.ticks(goals, 100).values())
-
-
-def test_adapter_that_hears_itself_does_no_harm(rig):
-    rig.port.hears_itself = True
-    held = rig.hold()
-    assert all(r.age_s == 0.0 for r in rig.ticks(held, 5).values())
-    assert rig.bus.statistics()["errors"] == 0
-
-
 def test_joint_may_be_told_to_hold_at_the_end(model):
     rig = rig_of(model, starts(model, 0, 0), safety=Safety(stop="hold"))
     rig.hold()
@@ -250,16 +218,6 @@ def test_answers_are_switched_on_before_anything_is_asked(model):
     rig.set(1, level, 0)
     rig.hold()
     assert rig.register(1, level) == rig.servo(1).table[level].high
-
-
-def test_mode_is_changed_through_the_lock():
-    rig = rig_of("sts3215", [2048])
-    for name, value in (("lock", 0), ("operating_mode", 1), ("lock", 1)):
-        rig.set(1, name, value)
-    rig.hold()
-    assert (rig.register(1, "operating_mode"), rig.register(1, "lock")) == (0, 1)
-    rig.servo(1).power_cycle(1.0)
-    assert rig.register(1, "operating_mode") == 0  # and it stays so
 
 
 def test_mode_that_cannot_be_changed_under_torque_is_an_error():

@@ -15,6 +15,7 @@ from sfms_robot.servo.bus import AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import SerialPort
+from sfms_robot.servo.registers import Table
 
 
 def test_two_buses_answer_as_one_in_the_order_of_the_head(make_rig):
@@ -218,7 +219,7 @@ def test_bus_that_fails_in_its_thread_is_said_once_and_the_others_go_on():
 
 
 def test_joints_that_were_left_out_take_goals_and_say_so():
-    servo = BusServo(joint="jaw", id=4, map=load_firmware_map("xl330-m288"), min_rad=0.2, max_rad=1.0)
+    servo = BusServo(joint="jaw", id=4, table=Table.of(load_firmware_map("xl330-m288")), min_rad=0.2, max_rad=1.0)
     bus = CompositeBus({"out": AbsentBus([servo]), "rest": Steady("neck")}, ["jaw", "neck"])
     bus.connect()
     assert bus.enable(["jaw", "neck"]).tolist() == [0.2, 0.0]

@@ -13,7 +13,6 @@ from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.servo.chain.member import Member, MemberState
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
 from sfms_robot.servo.policy import counts, load_rules
-from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds
 
 RAD_PER_TICK = 2 * np.pi / 4096
@@ -101,7 +100,7 @@ def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_ri
 
 def jaw(**safety):
     servo = bus_servo("jaw", 1, load_firmware_map("xl330-m288"), safety=Safety(**safety))
-    startup = Dynamixel2Startup(servo, Table.of(servo.map), JointNeeds(0, 4095), {})
+    startup = Dynamixel2Startup(servo, JointNeeds(0, 4095), {})
     return servo, Member(0, startup, Faults(), {})
 
 

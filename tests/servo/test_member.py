@@ -8,7 +8,6 @@ from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain import member as rules
 from sfms_robot.servo.chain.member import LONGEST_PAUSE_S, Member, MemberState
 from sfms_robot.servo.chain.startup import Silent
-from sfms_robot.servo.registers import Table
 
 OVERLOAD = 1 << 5
 STANDS = 2100
@@ -20,7 +19,7 @@ class Way:
 
     def __init__(self, can_reboot=True, **safety):
         self.servo = bus_servo("jaw", 4, load_firmware_map("xl330-m288"), safety=Safety(**safety))
-        self.table = Table.of(self.servo.map)
+        self.table = self.servo.table
         self.can_reboot = can_reboot
         self.failure = None
         self.asked = []

@@ -40,7 +40,7 @@ from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, ne
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
 
@@ -90,14 +90,13 @@ class ChainBus(WireBus[RegisterLink]):
         config = config or BusConfig(family="dynamixel2", baud=baud)
         self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
-        tables = [Table.of(servo.map) for servo in servos]
         self._ids = np.array([servo.id for servo in servos])
-        self._telemetry = Telemetry(name, *self.maps, tables, conversion)
+        self._telemetry = Telemetry(name, *self.maps, [servo.table for servo in servos], conversion)
         self._faults: dict[str, None] = {}  # reported so far, for the statistics
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._startups = [
-            self.startup(servo, table, needs, self._warnings, self._coming_back)
-            for servo, table, needs in zip(servos, tables, needs_of(servos, conversion), strict=True)
+            self.startup(servo, needs, self._warnings, self._coming_back)
+            for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)
         ]
         self._members = [Member(i, each, faults or Faults(), self._faults) for i, each in enumerate(self._startups)]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)

@@ -13,6 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import ClassVar, Final, NamedTuple, TypeVar
 
 from sfms_robot.config.wire_time import BITS, Framing
@@ -138,7 +139,7 @@ class RegisterLink(ABC):
     @contextmanager
     def patient(self, silence_s: float, tries: int = 1) -> Iterator[None]:
         """Wait at least `silence_s` for answers inside the block, and let a startup ask `tries` times."""
-        usual = self.silence_s, self.tries
+        usual = self.silence_s, self.tries  # also restored after an error
         self.silence_s, self.tries = max(self.silence_s, silence_s), tries
         try:
             yield
@@ -277,7 +278,7 @@ def verified_write(
     BusError if the port is gone.
     """
     name = about or f"id {servo_id}"
-    if lock is None or not field.eeprom:
+    if lock is None or not field.eeprom:  # RAM, or an EEPROM without a lock (Dynamixel 2.0)
         yield from _write(link, servo_id, field, value, tries, name)
         return
     yield from _write(link, servo_id, lock, 0, tries, name)
@@ -366,14 +367,10 @@ def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> Pin
         data += part
     if data.startswith(sent):  # an adapter that receives its own bytes
         del data[: len(sent)]
-    total, answers, known = len(data), 0, 0
+    total = len(data)
     if protocol == 2:
-        while (packet := dxl2.maybe_packet(data)) is not None:
-            if packet.instruction == dxl2.STATUS:
-                known += dxl2.STATUS_OVERHEAD + len(packet.params)
-                answers += packet.servo == servo
+        packets = [each for each in iter(partial(dxl2.maybe_packet, data), None) if each.instruction == dxl2.STATUS]
+        found = [(each.servo, dxl2.STATUS_OVERHEAD + len(each.params)) for each in packets]
     else:
-        for frame in protocol1.salvage(data):
-            known += protocol1.OVERHEAD + len(frame.params)
-            answers += frame.servo == servo
-    return PingReplies(answers, total - known)
+        found = [(frame.servo, protocol1.OVERHEAD + len(frame.params)) for frame in protocol1.salvage(data)]
+    return PingReplies(sum(each == servo for each, _ in found), total - sum(size for _, size in found))

@@ -16,7 +16,7 @@ Withholding goals keeps a limp one limp. They have no reboot, and report their f
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Final
 
 from sfms_robot.config.wire_time import FRAMINGS
@@ -42,12 +42,16 @@ class Protocol1Link(RegisterLink):
     family: ClassVar[str]
     who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
     refusal_bits: ClassVar[int] = 0  # of the error byte, about the request
-    packet: ClassVar[Callable[[int, int, bytes], bytes]]  # (id, instruction, parameters) -> a request
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
         self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
         self._echoed = False
+
+    @staticmethod
+    def _packet(servo: int, code: int, params: bytes) -> bytes:
+        """Return a request."""
+        return encode(servo, code, params)
 
     @abstractmethod
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
@@ -98,7 +102,7 @@ class Protocol1Link(RegisterLink):
     def _ask(self, servo: int, code: int, params: bytes, length: int) -> Answer | None:
         if self._owes(servo, length) and not self._fence(servo):
             return None
-        self._send(self.packet(servo, code, params))
+        self._send(self._packet(servo, code, params))
         return self._answers([servo], length).get(servo)
 
     # --- several servos -----------------------------------------------------------------------------------------
@@ -125,7 +129,7 @@ class Protocol1Link(RegisterLink):
         if not asked:
             self.judged = judged  # by one of them: the last may have had no time left
             return {}
-        self._send(self.packet(BROADCAST, *self._group_request(address, length, asked)))
+        self._send(self._packet(BROADCAST, *self._group_request(address, length, asked)))
         return self._answers(asked, length)
 
     # --- the wire -----------------------------------------------------------------------------------------------
@@ -143,7 +147,7 @@ class Protocol1Link(RegisterLink):
         """Ask for data of a length that no owed answer has; return whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
         request = (protocol1.READ, bytes([0, size])) if size else (protocol1.PING, b"")
-        self._send(self.packet(servo, *request))
+        self._send(self._packet(servo, *request))
         return servo in self._answers([servo], size)
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
@@ -187,7 +191,10 @@ class Dynamixel1Link(Protocol1Link):
     framing = FRAMINGS["dynamixel1"]
     who_length = 3
     refusal_bits = protocol1.REFUSAL_BITS
-    packet = staticmethod(instruction1)
+
+    @staticmethod
+    def _packet(servo: int, code: int, params: bytes) -> bytes:
+        return instruction1(servo, code, params)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.BULK_READ, protocol1.bulk_read_params((servo, address, length) for servo in servos)
@@ -211,7 +218,6 @@ class FeetechLink(Protocol1Link):
     family = "feetech"
     framing = FRAMINGS["feetech"]
     who_length = 5
-    packet = staticmethod(encode)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)

@@ -49,6 +49,7 @@ class Dynamixel2Link(RegisterLink):
     # --- one servo ----------------------------------------------------------------------------------------------
 
     def ping(self, servo: int) -> Found | None:
+        # The status of a ping holds 3 bytes: model number (2), firmware (1).
         self._send(dxl2.encode_instruction(servo, dxl2.PING))
         return _found(self._answers([servo], 3)).get(servo)
 
@@ -77,9 +78,10 @@ class Dynamixel2Link(RegisterLink):
 
     def refusal(self, answer: Answer) -> str:
         """Return the error number in bits 0..6 in words; bit 7 only says that register 70 is worth a look."""
-        if not answer.error & ~dxl2.ALERT:
+        if not (number := answer.error & ~dxl2.ALERT):
             return ""
-        return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
+        text = dxl2.ERRORS.get(number, f"error {number}")
+        return text + ", and reports a hardware error" * bool(answer.error & dxl2.ALERT)
 
     def _instruct(self, servo: int, instruction: int, params: bytes = b"") -> Answer | None:
         self._send(dxl2.encode_instruction(servo, instruction, params))
@@ -130,7 +132,7 @@ class Dynamixel2Link(RegisterLink):
         buffer, start = bytearray(), -1
         for data in self._incoming(len(self._sent) + size):
             buffer += data
-            if start < 0:
+            if start < 0:  # noise may come before the header; FE is the id of the one packet of all
                 start = buffer.find(_HEADER + b"\x00\xfe")
             if len(buffer) >= max(start, 0) + size or len(buffer) > _LONGEST_FAST:
                 break
@@ -150,7 +152,7 @@ def _found(answers: Mapping[int, Answer]) -> dict[int, Found]:
 class Dynamixel2Startup(Startup):
     """Startup of servos that report their firmware, which decides the addresses of their registers."""
 
-    can_reboot = True
+    can_reboot = True  # instruction 08
     unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
 
     def recognise(self, found: Found) -> None:
@@ -159,7 +161,7 @@ class Dynamixel2Startup(Startup):
         low, high = self.table.firmware
         if found.firmware is not None and not low <= found.firmware <= high:
             try:
-                self.table = Table.of(variant(self.servo.map.model, found.firmware))
+                self.table = Table.of(variant(self.servo.table.model, found.firmware))
             except ConfigError as error:
                 raise self._error(f"has firmware {found.firmware}: {error}") from error
 

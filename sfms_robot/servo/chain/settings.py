@@ -131,9 +131,9 @@ class Settings:
         """Halve the force that startup gave a servo: one value, however often this is called."""
         fields = member.startup.table.fields
         bounded = member.servo.safety.current_limit_mA is not None and "goal_current" in fields
-        name = "goal_current" if bounded else torque_register(member.servo.map)
-        if name is not None and name in fields and name not in self._changed.get(member.id, ()):
-            self._change(member.id, name, self.wanted(member.id).get(name, fields[name].high) // 2)
+        field = fields["goal_current"] if bounded else torque_register(member.startup.table)
+        if field is not None and field.name not in self._changed.get(member.id, ()):
+            self._change(member.id, field.name, self.wanted(member.id).get(field.name, field.high) // 2)
 
     def _change(self, servo: int, name: str, value: int) -> None:
         """Give a register another value than startup did, from now on."""

@@ -66,6 +66,7 @@ class Telemetry:
         present, self.goal, self.torque = needed
         self.error = common(bus, tables, "error_status") if protocol == 2 else None
         common(bus, tables, "bus_watchdog")
+        # Angles are affine in ticks, so two conversions give the angle of one tick.
         zero, one = (conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
         loads = [_load(table) for table in tables]
         speeds, voltages, temperatures = (
@@ -119,7 +120,7 @@ class Telemetry:
         at = np.asarray(indices, np.intp)
         self.ticks[at] = _values(self._present, rows, where)
         self.seen_s[at] = now_s
-        if where == self.block:
+        if where == self.block:  # the position alone brings nothing else
             for field, row, scales in self._columns:
                 self.extra[row][at] = _values(field, rows, where) * scales[at]
 
@@ -213,9 +214,10 @@ def _values(field: Field, rows: bytes, where: Block) -> NDArray[Any]:
     raw: NDArray[Any] = np.ndarray(
         len(rows) // length, f"{kind}{field.size}", rows, field.address - start, strides=(length,)
     )
-    if field.signed == "offset_2048":
+    if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)
         return np.asarray(raw.astype(np.int64) - 2048)
     if field.signed.startswith("sign_bit_"):
+        # A bit above the magnitude is the sign (AX speed and load, Feetech).
         wide, bit = raw.astype(np.int64), 1 << int(field.signed[9:])
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)

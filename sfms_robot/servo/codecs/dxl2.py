@@ -37,18 +37,18 @@ from sfms_robot.errors import PacketError
 
 # Instructions, e-manual "Instruction"; 55 marks what a servo sends.
 PING: Final = 0x01
-READ: Final = 0x02
-WRITE: Final = 0x03
+READ: Final = 0x02  # address (2), length (2)
+WRITE: Final = 0x03  # address (2), data
 REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05
+ACTION: Final = 0x05  # carries out what REG_WRITE has left
 FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
 CLEAR: Final = 0x10  # with the key 44 58 4C 22
 STATUS: Final = 0x55
-SYNC_READ: Final = 0x82
-SYNC_WRITE: Final = 0x83
+SYNC_READ: Final = 0x82  # one block of several ids; each sends its own status
+SYNC_WRITE: Final = 0x83  # one address, other data for each id
 FAST_SYNC_READ: Final = 0x8A  # from a firmware on that differs by model
-BULK_READ: Final = 0x92
+BULK_READ: Final = 0x92  # another block of each id
 BULK_WRITE: Final = 0x93
 
 # Error byte of a status packet (byte 8): e-manual "Status Packet: Error".
@@ -99,6 +99,7 @@ def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> byt
 def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
     """Return the parameters of a sync write; all data have one length."""
     length = len(next(iter(values.values())))
+    # address (2), length (2), then id and data of each: e-manual "Sync Write"
     parts = [_BYTES[servo] + data for servo, data in values.items()]
     return address.to_bytes(2, "little") + length.to_bytes(2, "little") + b"".join(parts)
 
@@ -165,10 +166,11 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
     while True:
         start = buffer.find(_HEADER)
         if start < 0:
-            del buffer[: len(buffer) - _header_begun(buffer)]
+            begun = next((size for size in (3, 2, 1) if buffer.endswith(_HEADER[:size])), 0)
+            del buffer[: len(buffer) - begun]
             return None
         del buffer[:start]
-        if len(buffer) < 7:
+        if len(buffer) < 7:  # LEN_H, the last byte that says how long the packet is
             return None
         servo, length = buffer[4], buffer[5] | buffer[6] << 8
         total = length + 7  # LEN counts what is behind byte 6
@@ -194,16 +196,3 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
         if body[0] == STATUS:
             return Packet(servo, STATUS, body[2:], body[1])
         return Packet(servo, body[0], body[1:])
-
-
-def _header_begun(buffer: bytearray) -> int:
-    """Return how many bytes at the end of `buffer` may be the beginning of a header."""
-    for size in (3, 2, 1):
-        if buffer.endswith(_HEADER[:size]):
-            return size
-    return 0
-
-
-def error_text(error: int) -> str:
-    """Return the error number in the low bits of an error byte, in words."""
-    return ERRORS.get(error & ~ALERT, f"error {error & ~ALERT}")

@@ -41,10 +41,10 @@ from sfms_robot.errors import PacketError
 
 # Instructions: e-manual "Instruction"; the last three are Feetech's.
 PING: Final = 0x01
-READ: Final = 0x02
-WRITE: Final = 0x03
+READ: Final = 0x02  # address, length
+WRITE: Final = 0x03  # address, data
 REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05
+ACTION: Final = 0x05  # carries out what REG WRITE has left
 FACTORY_RESET: Final = 0x06
 SYNC_WRITE: Final = 0x83
 BULK_READ: Final = 0x92  # Dynamixel MX
@@ -110,7 +110,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
             del buffer[: len(buffer) - buffer.endswith(_HEADER[:1])]
             return None
         del buffer[:start]
-        if len(buffer) < 4:
+        if len(buffer) < 4:  # LENGTH is byte 3
             if len(buffer) == 3 and buffer[2] == 0xFF:
                 del buffer[0]
             return None
@@ -124,6 +124,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
         if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:
             del buffer[0]
             continue
+        # byte 4 is the code, the parameters follow
         frame = Frame(servo, buffer[4], bytes(buffer[5 : total - 1]))
         del buffer[:total]
         return frame
@@ -149,6 +150,7 @@ def refusal_text(error: int) -> str:
 def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
     """Return the parameters of a sync write; all data have one length."""
     length = len(next(iter(values.values())))
+    # start address, L, then id and L bytes of each: e-manual "Sync Write"
     return bytes([address, length]) + b"".join(bytes([servo]) + data for servo, data in values.items())
 
 

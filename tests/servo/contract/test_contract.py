@@ -83,9 +83,12 @@ def test_torque_comes_on_without_a_jump_where_the_position_is_known(rig):
 def test_goal_is_reached(rig):
     held = rig.hold()
     goals = held - np.copysign(0.1, held)
+    moving = rig.ticks(goals, 2)
     readings = rig.ticks(goals, 60)
     if rig.tells("position"):
         assert [r.position_rad for r in readings.values()] == near(goals, rig)
+        assert all(abs(r.extra["velocity_rad_s"]) > 0.1 for r in moving.values())
+        assert all(20 < r.extra["temperature_C"] < 60 for r in readings.values())
     if rig.chain is not None:
         assert rig.shafts_rad() == near(goals, rig)
 
