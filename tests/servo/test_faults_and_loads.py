@@ -104,15 +104,6 @@ def jaw(**safety):
     return servo, Member(0, startup, Faults(), {})
 
 
-@given(st.lists(st.floats(0, 99), min_size=1, max_size=30))
-def test_current_below_the_rule_never_breaks_it(currents_mA):
-    _, member = jaw(pinch=LoadRule(current_mA=100, for_s=0.1))
-    member.enabled()
-    for k, current in enumerate(currents_mA):
-        member.take_current(current, 0.05 * k)
-    assert member.state is MemberState.ONLINE
-
-
 def test_pinch_needs_current_without_a_break():
     _, member = jaw(pinch=LoadRule(current_mA=100, for_s=0.1))
     member.enabled()
