@@ -126,7 +126,7 @@ def test_sync_writes_are_those_of_the_vendor_sdk(values):
     port = VendorPort()
     flat = [byte for servo, data in values.items() for byte in (servo, *data)]
     Protocol1PacketHandler().syncWriteTxOnly(port, 30, 2, flat, len(flat))
-    assert port.written == encode(protocol1.BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(30, values))
+    assert port.written == protocol1.encode_sync_write(30, 2, bytes(flat))
 
 
 @given(st.integers(0, 252), st.integers(0, 127), st.binary(min_size=1, max_size=100))

@@ -115,7 +115,8 @@ class ChainBus(WireBus[RegisterLink]):
         goal = self._telemetry.goal
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
         simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
-        self._goal_type = np.dtype(f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}") if simple else None
+        kind = f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}"
+        self._goal_type = np.dtype([("id", np.uint8), ("goal", kind)]) if simple else None
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed
@@ -372,18 +373,21 @@ class ChainBus(WireBus[RegisterLink]):
     def _send(self, link: RegisterLink, places: NDArray[np.intp], ticks: NDArray[np.int64]) -> None:
         """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
         goal, now_s = self._telemetry.goal, link.port.now_s()
-        ids = self._ids[places].tolist()
+        ids = self._ids[places]
         if now_s - self._wrote_s > _STALL * self._watchdog * _WATCHDOG_TICK_S:
             self._settings.look_for_trips()
         self._wrote_s = now_s
         if self._goal_type is not None:
-            data = ticks.astype(self._goal_type).view(f"V{goal.size}").tolist()
+            rows = np.empty(len(ids), self._goal_type)
+            rows["id"], rows["goal"] = ids, ticks
+            data = rows.tobytes()
         else:
-            data = map(goal.to_bytes, ticks.tolist())
-        link.sync_write(goal.address, dict(zip(ids, data, strict=True)))
+            pairs = zip(ids.tolist(), ticks.tolist(), strict=True)
+            data = b"".join(bytes([servo]) + goal.to_bytes(tick) for servo, tick in pairs)
+        link.sync_write_rows(goal.address, goal.size, data)
         if self._watchdog and places is not self._fed:
             self._fed = places
-            self._settings.arm(ids, self._watchdog)
+            self._settings.arm(ids.tolist(), self._watchdog)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Return whether a rejoining member gets goals from now on."""

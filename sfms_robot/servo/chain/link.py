@@ -109,8 +109,8 @@ class RegisterLink(ABC):
 
     @staticmethod
     @abstractmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        """Return the packet of `sync_write`, to be written from any thread."""
+    def sync_packet(address: int, length: int, rows: bytes) -> bytes:
+        """Return the packet of `sync_write_rows`."""
 
     @abstractmethod
     def refusal(self, answer: Answer) -> str:
@@ -124,9 +124,19 @@ class RegisterLink(ABC):
     def factory_reset(self, servo: int, option: int) -> Answer | None:
         """Reset everything (0xFF); Protocol 2.0 also all but the id (1), all but id and baud (2)."""
 
+    @classmethod
+    def sync_write_packet(cls, address: int, values: Mapping[int, bytes]) -> bytes:
+        """Return the packet of `sync_write`, to be written from any thread."""
+        length = len(next(iter(values.values())))
+        return cls.sync_packet(address, length, b"".join(bytes([servo]) + data for servo, data in values.items()))
+
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write to several servos in one packet; all values have one length. Nothing answers."""
         self._send(self.sync_write_packet(address, values))
+
+    def sync_write_rows(self, address: int, length: int, rows: bytes) -> None:
+        """Do as `sync_write`; `rows` are the id and the `length` bytes of each servo."""
+        self._send(self.sync_packet(address, length, rows))
 
     def _send(self, packet: bytes) -> None:
         """Send a packet; drop what came before it."""

@@ -107,9 +107,7 @@ class Protocol1Link(RegisterLink):
 
     # --- several servos -----------------------------------------------------------------------------------------
 
-    @staticmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        return encode(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
+    sync_packet = staticmethod(protocol1.encode_sync_write)
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         late = [servo for servo in servos if self._owes(servo, length)]

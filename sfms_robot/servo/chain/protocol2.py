@@ -89,9 +89,7 @@ class Dynamixel2Link(RegisterLink):
 
     # --- many servos --------------------------------------------------------------------------------------------
 
-    @staticmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, dxl2.sync_write_params(address, values))
+    sync_packet = staticmethod(dxl2.encode_sync_write)
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         longer = length + self._extra

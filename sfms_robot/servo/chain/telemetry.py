@@ -80,7 +80,7 @@ class Telemetry:
             _TEMPERATURE: (temperatures, _scales(temperatures)),
         }
         shared = {row: field for row, (fields, _) in sources.items() if (field := _shared(fields)) is not None}
-        self._present = present
+        self._present = present, _raw_type(present)
         self.position: Block = (present.address, present.size)
         self.block = span_of([present, *shared.values()])
         self.currents = [_apart(table, shared.get(_CURRENT)) for table in tables]
@@ -92,8 +92,8 @@ class Telemetry:
                 shared[_CURRENT], self.block = current, wider
                 sources[_CURRENT] = self.currents, _scales(self.currents)
                 self.currents = [None] * len(tables)
-        columns = [(field, row, sources[row][1]) for row, field in shared.items()]
-        self._columns = [column for column in columns if np.isfinite(column[2]).any()]
+        columns = [(field, _raw_type(field), row, sources[row][1]) for row, field in shared.items()]
+        self._columns = [column for column in columns if np.isfinite(column[3]).any()]
         self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
         self._conversion = conversion
         self.ticks: NDArray[np.int64] = np.zeros(len(tables), np.int64)
@@ -109,7 +109,7 @@ class Telemetry:
         """Return what a servo reports or does, as `ports.Bus`."""
         known = {
             name
-            for _, row, scales in self._columns
+            for _, _, row, scales in self._columns
             if (name := _CAPABILITIES.get(row)) is not None and math.isfinite(scales[index])
         }
         return frozenset({"position", "torque", *known} | ({"current"} if self.currents[index] is not None else set()))
@@ -118,11 +118,11 @@ class Telemetry:
         """Decode answers to a read of `where`, `position` or `block`; `data` hold its whole length."""
         rows = b"".join(data)
         at = np.asarray(indices, np.intp)
-        self.ticks[at] = _values(self._present, rows, where)
+        self.ticks[at] = _values(*self._present, rows, where)
         self.seen_s[at] = now_s
         if where == self.block:  # the position alone brings nothing else
-            for field, row, scales in self._columns:
-                self.extra[row][at] = _values(field, rows, where) * scales[at]
+            for field, raw_type, row, scales in self._columns:
+                self.extra[row][at] = _values(field, raw_type, rows, where) * scales[at]
 
     def take_current(self, index: int, field: Field, data: bytes) -> None:
         """Decode an answer to a read of `currents[index]`."""
@@ -207,13 +207,15 @@ def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:
     return np.array([field.scale if field and unit in (None, field.unit) else math.nan for field in fields])
 
 
-def _values(field: Field, rows: bytes, where: Block) -> NDArray[Any]:
-    """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` of one."""
+def _raw_type(field: Field) -> np.dtype[Any]:
     kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.signed == "twos_complement"]
+    return np.dtype(f"{kind}{field.size}")
+
+
+def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) -> NDArray[Any]:
+    """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` of one."""
     start, length = where
-    raw: NDArray[Any] = np.ndarray(
-        len(rows) // length, f"{kind}{field.size}", rows, field.address - start, strides=(length,)
-    )
+    raw: NDArray[Any] = np.ndarray(len(rows) // length, raw_type, rows, field.address - start, strides=(length,))
     if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)
         return np.asarray(raw.astype(np.int64) - 2048)
     if field.signed.startswith("sign_bit_"):

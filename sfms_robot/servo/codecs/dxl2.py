@@ -28,7 +28,7 @@ Source: ROBOTIS e-manual, docs/en/dxl/protocol2.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from fastcrc.crc16 import umts
@@ -76,7 +76,6 @@ STATUS_OVERHEAD: Final = 11  # bytes of a status packet without its data
 _HEADER: Final = b"\xff\xff\xfd\x00"  # "Header" and "Reserved"
 _LOOKALIKE: Final = b"\xff\xff\xfd"  # inside a packet; byte stuffing makes it the next one
 _STUFFED: Final = b"\xff\xff\xfd\xfd"
-_BYTES: Final = [bytes([value]) for value in range(256)]
 
 
 class Packet(NamedTuple):
@@ -96,12 +95,11 @@ def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> byt
     return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
 
 
-def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
-    """Return the parameters of a sync write; all data have one length."""
-    length = len(next(iter(values.values())))
+def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as above."""
     # address (2), length (2), then id and data of each: e-manual "Sync Write"
-    parts = [_BYTES[servo] + data for servo, data in values.items()]
-    return address.to_bytes(2, "little") + length.to_bytes(2, "little") + b"".join(parts)
+    head = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+    return encode_instruction(BROADCAST, SYNC_WRITE, head + rows)
 
 
 def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:

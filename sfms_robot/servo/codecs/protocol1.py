@@ -147,11 +147,10 @@ def refusal_text(error: int) -> str:
     return ", ".join(text for bit, text in REFUSALS.items() if error & bit)
 
 
-def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
-    """Return the parameters of a sync write; all data have one length."""
-    length = len(next(iter(values.values())))
+def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as `encode`."""
     # start address, L, then id and L bytes of each: e-manual "Sync Write"
-    return bytes([address, length]) + b"".join(bytes([servo]) + data for servo, data in values.items())
+    return encode(BROADCAST, SYNC_WRITE, bytes([address, length]) + rows)
 
 
 def bulk_read_params(requests: Iterable[tuple[int, int, int]]) -> bytes:
