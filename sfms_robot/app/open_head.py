@@ -301,7 +301,7 @@ def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[Bu
         BusServo(
             joint=name,
             id=joint.id,
-            map=maps[joint.model],
+            table=Table.of(maps[joint.model]),
             min_rad=joint.min_rad,
             max_rad=joint.max_rad,
             safety=head.safety_of(name),
@@ -364,15 +364,15 @@ def check_safety(head: Head, joints: Mapping[str, Joint]) -> None:
 
 
 def _check_limits(head: Head, name: str, table: FirmwareMap) -> None:
-    safety, joint = head.safety_of(name), head.joints[name]
-    limits_torque = torque_register(table) is not None
+    safety, joint, registers = head.safety_of(name), head.joints[name], Table.of(table)
+    limits_torque = torque_register(registers) is not None
     impossible: dict[str, tuple[float | None, str]] = {}
     if "goal_current" not in table.registers:
         instead = "; torque_limit_percent limits its torque" if limits_torque else ""
         impossible["current_limit_mA"] = safety.current_limit_mA, f"cannot limit its current{instead}"
     if not limits_torque:
         impossible["torque_limit_percent"] = safety.torque_limit_percent, "has no torque limit"
-    if not tells_current(table):
+    if not tells_current(registers):
         for key in ("pinch", "strain"):
             rule = getattr(safety, key)
             impossible[key] = rule and rule.current_mA, "does not report its current in mA"

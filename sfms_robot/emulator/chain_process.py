@@ -248,16 +248,16 @@ class Server:
             case ["stamps"]:
                 return _json(wire.stamps())
             case ["faults"]:
-                return _json(wire.faults(now_s))
+                return _json(wire.faults.texts(now_s))
             case ["kill" | "revive" | "fault" | "turn" | "heat" | "state" as name, servo_id, *value]:
                 servo = wire.servo(int(servo_id))
                 return "error no such servo" if servo is None else _to_servo(servo, name, value, now_s)
             case ["time", _]:
                 pass
             case ["inject", spec]:
-                wire.inject(spec, now_s)
+                wire.add(parse_fault(spec, now_s))
             case ["clear"]:
-                wire.clear(now_s)
+                wire.faults.clear(now_s)
             case ["supply", volts]:
                 wire.set_supply(float(volts), now_s)
             case ["hangup" | "return" as name]:

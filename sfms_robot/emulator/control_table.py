@@ -112,11 +112,11 @@ class ControlTable:
 
 def _value_range(field: Field) -> tuple[int, int]:
     """Return the smallest and the largest value that fit the register's size and sign rule."""
-    if field.sign.startswith("sign_bit_"):
-        high = (1 << int(field.sign.removeprefix("sign_bit_"))) - 1
+    if field.signed.startswith("sign_bit_"):
+        high = (1 << int(field.signed.removeprefix("sign_bit_"))) - 1
         return -high, high
-    bits = 12 if field.sign == "offset_2048" else 8 * field.size
-    low = -(1 << bits - 1) if field.signed else 0
+    bits = 12 if field.signed == "offset_2048" else 8 * field.size
+    low = -(1 << bits - 1) if field.signed != "no" else 0
     return low, low + (1 << bits) - 1
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
-from sfms_robot.emulator.faults import TO_SERVOS, Fault, WireFaults, parse_fault
+from sfms_robot.emulator.faults import TO_SERVOS, Fault, WireFaults
 from sfms_robot.errors import ConfigError
 
 Timing = Literal["instant", "wire"]
@@ -95,6 +95,7 @@ class EmulatedWire:
     """Devices, faults and the line between. Times are seconds of the emulator's clock.
 
     Attributes:
+        faults: What lasts or is to come; one is added by `add`.
         hung: The adapter is unplugged; the server closes the terminal meanwhile.
     """
 
@@ -104,7 +105,7 @@ class EmulatedWire:
         self.hung = False
         self._devices = list(devices)
         self._on_the_wire = timing == "wire"
-        self._faults = WireFaults(seed=seed)
+        self.faults = WireFaults(seed)
         self._inbox: deque[tuple[float, bytes, int | None]] = deque()  # (arrives at, data, baud), in that order
         self._outbox: list[Out] = []
         self._number = 0
@@ -136,13 +137,13 @@ class EmulatedWire:
         if self.hung:
             return
         through_s = self._occupy(now_s, len(data), baud)
-        if self._faults.echoes(now_s):
+        if self.faults.echoes(now_s):
             self._post(Reply((), data), through_s, 0.0)
-        for spoilt, late_s in self._faults.spoil((), data, now_s, TO_SERVOS):
+        for spoilt, late_s in self.faults.spoil((), data, now_s, TO_SERVOS):
             # Bytes do not overtake one another.
             self._inbox.append((max([now_s + late_s, *(each[0] for each in self._inbox)]), spoilt, baud))
         self.advance(now_s)
-        if noise := self._faults.noise(now_s):
+        if noise := self.faults.noise(now_s):
             self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)
 
     def _deliver(self, until_s: float) -> None:
@@ -154,7 +155,7 @@ class EmulatedWire:
                 for reply in device.replies(data, baud, now_s):
                     start_s = max(now_s, self._free_s) + (reply.pause_s if self._on_the_wire else 0.0)
                     due_s = self._occupy(start_s, len(reply.data), baud)
-                    for spoilt, late_s in self._faults.spoil(reply.servos, reply.data, now_s):
+                    for spoilt, late_s in self.faults.spoil(reply.servos, reply.data, now_s):
                         self._post(reply._replace(data=spoilt), due_s, late_s)
 
     def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:
@@ -178,7 +179,7 @@ class EmulatedWire:
     @property
     def next_s(self) -> float:
         """Time of the next event without the host: a request arrives, an answer is due, a fault begins or ends."""
-        return min([self._faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
+        return min([self.faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
     def statistics(self) -> dict[str, Any]:
         """Return counts since the start, the lateness of answers [ms], and how long the line was busy [s]."""
@@ -211,21 +212,7 @@ class EmulatedWire:
         servos = self._supplied if fault.kind == "voltage" else self._servos
         if fault.kind not in ("echo", "noise", "hangup") and not any(map(fault.concerns, servos)):
             raise ConfigError.at("emulate", "fault", fault.text, "concerns no servo of this wire")
-        self._faults.add(fault)
-
-    def inject(self, text: str, now_s: float) -> None:
-        """Add a fault by its spec, which begins now unless it names a time. Raises ConfigError."""
-        self.add(parse_fault(text, now_s))
-        self.advance(now_s)
-
-    def clear(self, now_s: float) -> None:
-        """Remove all faults."""
-        self._faults.clear(now_s)
-        self.advance(now_s)
-
-    def faults(self, now_s: float) -> list[str]:
-        """Return the specs of the faults that last or are to come."""
-        return self._faults.texts(now_s)
+        self.faults.add(fault)
 
     def advance(self, now_s: float) -> None:
         """Let requests arrive and faults begin and end by `now_s`, in the order of their times."""
@@ -253,7 +240,7 @@ class EmulatedWire:
         return [servo for servo in self._servos if hasattr(servo, "set_supply")]
 
     def _turn_faults(self, now_s: float) -> None:
-        for time_s, fault, began in self._faults.edges(now_s):
+        for time_s, fault, began in self.faults.edges(now_s):
             self._happen(fault, began, time_s)
 
     def _happen(self, fault: Fault, began: bool, now_s: float) -> None:

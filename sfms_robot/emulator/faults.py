@@ -131,13 +131,11 @@ def parse_ids(text: str) -> list[int]:
 class WireFaults:
     """The faults of one wire, and their random numbers."""
 
-    def __init__(self, faults: Iterable[Fault] = (), seed: int = 0) -> None:
+    def __init__(self, seed: int = 0) -> None:
         self._random = random.Random(seed)
         self._faults: list[Fault] = []
         self._edges: list[tuple[float, int, bool, Fault]] = []
         self._count = 0
-        for fault in faults:
-            self.add(fault)
 
     def add(self, fault: Fault) -> None:
         """Add a fault."""

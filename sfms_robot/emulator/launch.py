@@ -16,14 +16,13 @@ import queue
 import shutil
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
 from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
-from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.processes import Child
 
@@ -188,12 +187,16 @@ def launch(
     Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
     link that is taken; BusError when the process does not start.
     """
-    maps = {(servo.model, servo.firmware): _map(servo) for servo in servos}
+    named = {servo.model: load_firmware_map(servo.model) for servo in servos}
+    maps = [
+        variant(each.model, each.firmware) if named[each.model].protocol == 2 else named[each.model] for each in servos
+    ]
     _check(servos, maps)
-    for text in faults:
-        parse_fault(text)
     if link is not None:
-        _check_link(link)
+        if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
+            raise _refusal("link", link, "is already there")
+        if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
+            raise _refusal("link", link, "lies in a folder that does not exist")
     description = {
         "virtual": virtual,
         "timing": timing,
@@ -201,19 +204,13 @@ def launch(
         "faults": list(faults),
         "seed": seed,
         "link": link and os.path.abspath(link),
-        "tables": {each.model: each.model_dump(mode="json") for each in maps.values()},
-        "servos": [asdict(servo) | {"model": maps[servo.model, servo.firmware].model} for servo in servos],
+        "tables": {model: each.model_dump(mode="json") for model, each in {each.model: each for each in maps}.items()},
+        "servos": [asdict(servo) | {"model": each.model} for servo, each in zip(servos, maps, strict=True)],
     }
-    child, ready = _started(description)
-    return Chain(child=child, servos=tuple(servos), virtual=virtual, **ready)
-
-
-def _started(description: Mapping[str, Any]) -> tuple[Child, dict[str, str]]:
-    """Return the process, and its message when it is ready. Raises ConfigError for what it refuses, BusError."""
     child = Child("sfms_robot.emulator.chain_process:main", description, name="emulator")
     answer = child.receive(_START_S)
     if isinstance(answer, dict):
-        return child, answer
+        return Chain(child=child, servos=tuple(servos), virtual=virtual, **answer)
     child.close(_CLOSE_S)
     if isinstance(answer, ConfigError):
         raise answer
@@ -233,16 +230,9 @@ def wait(chains: Sequence[Chain]) -> Chain:
     return ended.get()
 
 
-def _map(servo: EmulatedServo) -> FirmwareMap:
-    """Return the registers of a servo's firmware; for families without firmware maps, the only ones."""
-    named = load_firmware_map(servo.model)
-    return variant(servo.model, servo.firmware) if named.protocol == 2 else named
-
-
-def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], FirmwareMap]) -> None:
+def _check(servos: Sequence[EmulatedServo], maps: Sequence[FirmwareMap]) -> None:
     seen: set[tuple[str, int]] = set()
-    for servo in servos:
-        table = maps[servo.model, servo.firmware]
+    for servo, table in zip(servos, maps, strict=True):
         highest = 252 if table.channels is None else table.channels - 1
         key = ("" if table.channels is None else servo.model, servo.id)
         if key in seen:
@@ -265,10 +255,3 @@ def _check(servos: Sequence[EmulatedServo], maps: Mapping[tuple[str, int], Firmw
             if not register.low <= value <= register.high:
                 allowed = [f"{register.low}..{register.high}"]
                 raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
-
-
-def _check_link(link: str) -> None:
-    if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
-        raise _refusal("link", link, "is already there")
-    if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
-        raise _refusal("link", link, "lies in a folder that does not exist")

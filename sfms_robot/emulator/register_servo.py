@@ -332,8 +332,8 @@ class RegisterServo(ABC):
             self._torque_written(wanted[torque.name], locked)
         elif "goal_position" in wanted and self._goal_enables and not self.torque and not self._shut_down():
             self._put_role("torque_enable", 1)
-        if self.drive is not None and not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
-            if self._mode in POSITIONING:
+        elif not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
+            if self.drive is not None and self._mode in POSITIONING:
                 goal = self.frame.shaft(float(self._get("goal_position")))
                 self.drive = self.drive._replace(goal=self._stepped(wanted) if self._mode is Mode.STEP else goal)
             return

@@ -28,8 +28,9 @@ _RESET_BY_MODE: Final = ("profile_velocity", "profile_acceleration", "goal_veloc
 _CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"  # parameters of CLEAR
 _RESULT_FAIL: Final = 1
 _REBOOT_S: Final = 0.3  # a Dynamixel 2.0 neither listens nor answers after a reboot
-Request = tuple[int, int, int]  # id, address, length
 S = TypeVar("S", bound=RegisterServo)
+T = TypeVar("T")
+Request = tuple[int, int, T]  # id, address, and length or data
 
 
 class ServoChain(EmulatedDevice, Generic[S]):
@@ -80,6 +81,17 @@ class ServoChain(EmulatedDevice, Generic[S]):
         """Return an address or a length. Raises IndexError where it is missing."""
         place = index * self._width
         return sum(params[place + i] << 8 * i for i in range(self._width))
+
+    def _sync_writes(self, params: bytes) -> Iterator[Request[bytes]]:
+        """Yield (id, address, data) of a sync write: address, length, then id and data of each."""
+        address, length = self._number(params, 0), self._number(params, 1)
+        for start in range(2 * self._width, len(params) - length, length + 1):
+            yield params[start], address, params[start + 1 : start + 1 + length]
+
+    def _sync_reads(self, params: bytes) -> list[Request[int]]:
+        """Return (id, address, length) of a sync read: address, length, then ids."""
+        address, length = self._number(params, 0), self._number(params, 1)
+        return [(servo_id, address, length) for servo_id in params[2 * self._width :]]
 
     def _common(self, servo: S, code: int, params: bytes, now_s: float) -> tuple[int, bytes, int] | None:
         """Return (error, data, status return level of the answer) of an instruction of every family; else None."""
@@ -159,9 +171,8 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             for servo_id, address, data in parts:
                 for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
                     servo.write(address, data, now_s)
-        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):  # address (2), length (2), then ids
-            requests = [(servo_id, number(params, 0), number(params, 1)) for servo_id in params[4:]]
-            yield from self._reads(requests, code == dxl2.FAST_SYNC_READ, listening, now_s)
+        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
+            yield from self._reads(self._sync_reads(params), code == dxl2.FAST_SYNC_READ, listening, now_s)
         elif code in (dxl2.BULK_READ, FAST_BULK_READ):  # id, address (2), length (2) of each
             starts = range(0, len(params), 5)
             requests = [(params[i], number(params[i + 1 :], 0), number(params[i + 1 :], 1)) for i in starts]
@@ -177,13 +188,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
                 self._single(servo, code, params, now_s)
             yield from self._together(listening.get(packet.servo, []), code, params, now_s)
 
-    def _sync_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (id, address, data) of a sync write."""
-        address, length = self._number(params, 0), self._number(params, 1)  # then id and data of each
-        for start in range(4, len(params) - length, length + 1):
-            yield params[start], address, params[start + 1 : start + 1 + length]
-
-    def _bulk_writes(self, params: bytes) -> Iterator[tuple[int, int, bytes]]:
+    def _bulk_writes(self, params: bytes) -> Iterator[Request[bytes]]:
         """Yield (id, address, data) of a bulk write."""
         while params:  # id, address (2), length (2), data
             length = self._number(params[1:], 1)
@@ -191,7 +196,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             params = params[5 + length :]
 
     def _reads(
-        self, requests: Sequence[Request], fast: bool, listening: dict[int, list[Dynamixel2Servo]], now_s: float
+        self, requests: Sequence[Request[int]], fast: bool, listening: dict[int, list[Dynamixel2Servo]], now_s: float
     ) -> Iterator[Reply]:
         """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
 
@@ -331,15 +336,15 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
     ) -> Iterator[Reply]:
         target, code, params = packet
         if code == protocol1.SYNC_WRITE:
-            address, parts = protocol1.sync_write_parts(params)
-            for servo_id, data in parts:
+            for servo_id, address, data in self._sync_writes(params):
                 for servo in listening.get(servo_id, ()):
                     servo.write(address, data, now_s)
         elif code == protocol1.SYNC_READ:
-            address, length, ids = protocol1.sync_read_parts(params)
-            yield from self._group([(servo_id, address, length) for servo_id in ids], code, listening, now_s)
+            yield from self._group(self._sync_reads(params), code, listening, now_s)
         elif code == protocol1.BULK_READ:
-            yield from self._group(protocol1.bulk_read_parts(params), code, listening, now_s)
+            # behind the 00: length, id, address of each
+            requests = [(params[i + 1], params[i + 2], params[i]) for i in range(1, len(params) - 2, 3)]
+            yield from self._group(requests, code, listening, now_s)
         elif target == protocol1.BROADCAST:
             for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
                 answers = list(self._single(servo, code, params, now_s))
@@ -350,7 +355,7 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
                 yield from self._single(servo, code, params, now_s)
 
     def _group(
-        self, requests: Sequence[Request], code: int, listening: dict[int, list[Protocol1Servo]], now_s: float
+        self, requests: Sequence[Request[int]], code: int, listening: dict[int, list[Protocol1Servo]], now_s: float
     ) -> Iterator[Reply]:
         for servo_id, address, length in requests:
             there = [servo for servo in listening.get(servo_id, ()) if code in servo.group_reads and servo.answers(1)]

@@ -19,15 +19,13 @@ instead of steps.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, Final, NamedTuple
-
-import numpy as np
+from typing import Final, NamedTuple
 
 from sfms_robot.config.wire_time import BITS
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import TickConversion
+from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -147,8 +145,8 @@ class Output:
         self.fault: str | None = None
 
 
-class Board(ABC):
-    """The bytes to and from one kind of board.
+class Maestro:
+    """The bytes to and from a Pololu Maestro, with the compact protocol.
 
     Args:
         table: of its model.
@@ -160,62 +158,30 @@ class Board(ABC):
         reports_pulses: whether `read_pulses` works.
     """
 
-    status_length: ClassVar[int]
-    factory_us: ClassVar[tuple[float, float] | None] = None
-    reports_pulses: ClassVar[bool] = False
+    status_length = 2
+    factory_us: tuple[float, float] | None = maestro.FACTORY_PULSE_US
+    reports_pulses = True
 
     def __init__(self, table: Table, crc: bool) -> None:
         self._table = table
         self._crc = crc
 
-    @abstractmethod
-    def status_request(self, restarted: bool) -> bytes:
-        """Return a request for the status; `restarted`: the board may have been off since it last answered."""
-
-    @abstractmethod
-    def decode_status(self, answer: bytes) -> BoardStatus | None:
-        """Return the status in an answer; None for bytes that are not an answer."""
-
-    @abstractmethod
-    def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
-        """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
-
-    @abstractmethod
-    def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
-        """Return what ends the pulses, whatever the bytes before were; `restarted` as in `status_request`."""
-
-    def misfit(self, exchange: Exchange, present: bool) -> str | None:
-        """Return how the board's settings differ from the head's file, and the cure; None if they do not.
-
-        `present`: it has answered `status_request`.
-        """
-        return None
-
-    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
-        """Return ticks of the pulses it sends now, 0 for none; None if a channel is not answered."""
-        return None
-
-
-class Maestro(Board):
-    """A Pololu Maestro with the compact protocol."""
-
-    status_length = 2
-    factory_us = maestro.FACTORY_PULSE_US
-    reports_pulses = True
-
     def _sealed(self, command: bytes) -> bytes:
         return maestro.sealed(command) if self._crc else command
 
     def status_request(self, restarted: bool) -> bytes:
+        """Return a request for the status; `restarted`: the board may have been off since it last answered."""
         return bytes([maestro.BAUD_INDICATION] * restarted) + self._sealed(maestro.get_errors())
 
     def decode_status(self, answer: bytes) -> BoardStatus | None:
+        """Return the status in an answer; None for bytes that are not an answer."""
         bits = int.from_bytes(answer, "little")
         if len(answer) != self.status_length or bits >> (max(self._table.faults, default=15) + 1):
             return None
         return BoardStatus(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
+        """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
         grouped = (self._table.channels or 0) > _MICRO
         runs: list[list[int]] = []  # of neighbouring channels, which one command can move
         for channel in sorted(ticks):
@@ -232,10 +198,16 @@ class Maestro(Board):
         return b"".join(map(self._sealed, commands))
 
     def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
+        """Return what ends the pulses, whatever the bytes before were; `restarted` as in `status_request`."""
         off = b"".join(self._sealed(maestro.set_target(channel, maestro.OFF)) for channel in channels)
         return bytes([maestro.BAUD_INDICATION] * restarted) + off
 
     def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        """Return how the board's settings differ from the head's file, and the cure; None if they do not.
+
+        `present`: it has answered `status_request`.
+        """
+
         def answers(request: bytes) -> bool:
             return self.decode_status(exchange(request, self.status_length) or b"") is not None
 
@@ -249,6 +221,7 @@ class Maestro(Board):
         return None
 
     def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+        """Return ticks of the pulses it sends now, 0 for none; None if a channel is not answered."""
         pulses = {}
         for channel in channels:
             answer = exchange(self._sealed(maestro.get_position(channel)), 2)
@@ -258,14 +231,16 @@ class Maestro(Board):
         return pulses
 
 
-class Ssc32(Board):
-    """A Lynxmotion SSC-32. It has no error word: it answers, or it does not.
+class Ssc32:
+    """The bytes to and from a Lynxmotion SSC-32, with the methods of `Maestro`.
 
-    It reports pulses in steps of 10 us, and for a channel that it never moved the value is not documented, so
-    `read_pulses` returns None.
+    It has no error word: it answers, or it does not. It reports pulses in steps of 10 us, and for a channel that it
+    never moved the value is not documented, so `read_pulses` returns None.
     """
 
     status_length = 1
+    factory_us: tuple[float, float] | None = None
+    reports_pulses = False
 
     def status_request(self, restarted: bool) -> bytes:
         """Return a query; after a restart, a carriage return in front ends what line noise had begun."""
@@ -282,12 +257,19 @@ class Ssc32(Board):
         """Return the command, always behind a carriage return: another thread may have been in the middle of a line."""
         return b"\r" + ssc32.outputs_low(channels)
 
+    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+        """Return None: it has no settings that could differ."""
+        return None
+
+    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+        """Return None."""
+        return None
+
 
 def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
     """Return the board of these servos. Raises ConfigError if they are not all on one."""
-    tables = [Table.of(servo.map) for servo in servos]
-    table = tables[0]
-    others = sorted({each.model for each in tables} - {table.model})
+    table = servos[0].table
+    others = sorted({servo.table.model for servo in servos} - {table.model})
     if others:
         raise ConfigError(f"bus {bus!r}: one board is one model, the head says {table.model} and {', '.join(others)}")
     if table.channels is None or table.pulse_us is None or table.tick_us is None:
@@ -307,8 +289,7 @@ def pulses_beyond(
     """Return the joints, each with the pulses of its range, that do not fit between (shortest, longest)."""
     if range_us is None:
         return ""
-    ends = [conversion.to_ticks(np.array([getattr(servo, end) for servo in servos])) for end in ("min_rad", "max_rad")]
-    pulses = np.sort(np.stack(ends), axis=0) * (table.tick_us or 1.0)
+    pulses = tick_ranges(servos, conversion) * (table.tick_us or 1.0)
     return ", ".join(
         f"{servo.joint} ({low:g}..{high:g} us, not in {range_us[0]:g}..{range_us[1]:g})"
         for servo, low, high in zip(servos, *pulses, strict=True)

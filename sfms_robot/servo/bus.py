@@ -43,7 +43,7 @@ _SLACK_RAD: Final = 1e-9
 
 
 class Goals:
-    """Checks and conversion of the goals of one bus, joints in bus order.
+    """Checks and conversion of the goals of one bus, joints in bus order; `own` are the ranges of the joints, rad.
 
     A goal may be sent if it lies in the range in force of its joint (`sfms_robot.ranges`).
 
@@ -57,9 +57,9 @@ class Goals:
         self._bus = bus
         self._servos = tuple(servos)
         self._conversion = conversion
-        self._own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
-        self._last_rad = self._own.low.copy()  # where each joint was found, or sent last
-        self._lowest, self._highest = self._own.low - _SLACK_RAD, self._own.high + _SLACK_RAD
+        self.own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
+        self._last_rad = self.own.low.copy()  # where each joint was found, or sent last
+        self._lowest, self._highest = self.own.low - _SLACK_RAD, self.own.high + _SLACK_RAD
         self._outside = False  # a joint was found outside its own range, and may still be there
         self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
         self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
@@ -78,7 +78,7 @@ class Goals:
 
     def allows(self, index: int, goal_rad: float) -> bool:
         """Return whether a goal lies in the range in force of a servo."""
-        return bool(self._own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
+        return bool(self.own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
 
     def ticks(self, goals_rad: Doubles, sent: NDArray[np.intp]) -> NDArray[np.int64]:
         """Convert goals (J,) to ticks (J,). Those at the indices `sent` (n,) are to be sent, and are checked.
@@ -93,7 +93,7 @@ class Goals:
         finite = np.isfinite(goals_rad)
         if not finite.all():
             raise ValueError(f"goal of {self._servos[int(np.argmin(finite))].joint} is not finite")
-        in_force = self._own.reaching(self._last_rad)
+        in_force = self.own.reaching(self._last_rad)
         allowed = in_force.holds(goals_rad, _SLACK_RAD)
         refused = sent[~allowed[sent]]
         if refused.size:
@@ -102,11 +102,17 @@ class Goals:
             raise ValueError(f"goal of {self._servos[first].joint} = {goals_rad[first]:g} rad is not in {valid}")
         ticks = self._conversion.to_ticks(goals_rad)
         # On the way in from outside: the conversion would clip to the limit, so the tick is computed here.
-        for i in np.flatnonzero(~self._own.holds(goals_rad, _SLACK_RAD) & allowed):
+        for i in np.flatnonzero(~self.own.holds(goals_rad, _SLACK_RAD) & allowed):
             ticks[i] = round((goals_rad[i] - self._rad_at_zero[i]) / self.rad_per_tick[i])
         self._last_rad[sent] = in_force.nearest(goals_rad)[sent]
-        self._outside = not self._own.holds(self._last_rad).all()
+        self._outside = not self.own.holds(self._last_rad).all()
         return ticks
+
+
+def tick_ranges(servos: Sequence[BusServo], conversion: TickConversion) -> NDArray[np.int64]:
+    """Return the lowest and the highest goal of each joint: (2, J) ticks."""
+    ends = np.array([(servo.min_rad, servo.max_rad) for servo in servos]).T
+    return np.sort([conversion.to_ticks(end) for end in ends], axis=0)
 
 
 class WireBus(ABC, Generic[L]):
@@ -305,7 +311,7 @@ class AbsentBus:
         """Return the counters of the report."""
         faults = [f"{joint}: {LEFT_OUT}" for joint in self.joints]
         return {
-            **dict.fromkeys(("writes", "reads", "errors", "retries", "reconnects"), 0),
+            **dict.fromkeys(COUNTS, 0),
             "silent": [],
             "faults": faults,
         }

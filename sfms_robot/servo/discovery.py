@@ -1,7 +1,8 @@
 """Which serial ports there are, which processes hold them, how long their adapters hold bytes back; and `--port`.
 
-No port is opened. The list comes from pyserial, which knows macOS and Windows too, and from /dev; adapters, stable
-names and holders come from /dev, /sys and /proc, whose roots are arguments, so that tests can use trees of their own.
+No port is opened. The list and the USB adapters come from pyserial, which knows macOS and Windows too, and the ports of
+built-in UARTs from /dev; names, drivers and holders come from /dev, /sys and /proc. Tests pass a list and roots of
+their own.
 """
 
 from __future__ import annotations
@@ -77,17 +78,12 @@ def list_ports(
 ) -> list[SerialDevice]:
     """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware.
 
-    `listed`: returns pyserial's own list: ttyS and ttyUSB on Linux, cu. on macOS, COM on Windows.
+    `listed`: returns pyserial's `ListPortInfo` of each port, from which come the facts of USB adapters.
     """
-    paths = {os.path.realpath(path) for pattern in _PATTERNS for path in dev.glob(pattern)}
-    found = {path: describe(path, dev, sys) for path in paths}
-    for port in listed():
-        is_file = port.device.startswith("/")
-        path = os.path.realpath(port.device) if is_file else port.device
-        known = found.get(path) or (describe(path, dev, sys) if is_file else SerialDevice(path))
-        found[path] = _completed(known, port)
+    found: dict[str, Any] = {_real(str(path)): None for pattern in _PATTERNS for path in dev.glob(pattern)}
+    found |= {_real(port.device): port for port in listed()}
     return [
-        found[path]
+        _described(path, found[path], dev, sys)
         for path in sorted(found)
         if _line(sys / "class" / "tty" / os.path.basename(path) / "type") != _NO_UART
     ]
@@ -106,31 +102,37 @@ def ports_data() -> list[dict[str, Any]]:
     ]
 
 
-def describe(path: str, dev: Path = DEV, sys: Path = SYS) -> SerialDevice:
-    """Return what the system knows of a port; `path` may be a link to it. Without /sys that is little."""
-    if os.name != "posix":
-        return SerialDevice(path)
-    real = Path(os.path.realpath(path))
-    usb = _usb_folder(sys / "class" / "tty" / real.name / "device")
-    driver = sys / "class" / "tty" / real.name / "device" / "driver"
-    latency = sys / "bus" / "usb-serial" / "devices" / real.name / "latency_timer"
+def describe(
+    path: str, dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[Any]] = _pyserial_ports
+) -> SerialDevice:
+    """Return what the system knows of a port; `path` may be a link to it."""
+    real = _real(path)
+    return _described(real, next((port for port in listed() if _real(port.device) == real), None), dev, sys)
+
+
+def _described(path: str, port: Any, dev: Path, sys: Path) -> SerialDevice:
+    """Return a port with its names and driver, and what pyserial says of it; `port` None: it does not know it."""
+    name = os.path.basename(path)
+    driver = sys / "class" / "tty" / name / "device" / "driver"
+    latency = sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
     text = _line(latency)
-    vendor, product, serial, description = _usb_facts(usb)
-    return SerialDevice(
-        path=str(real),
-        by_id=_link_to(real, dev / "serial" / "by-id"),
-        by_path=_link_to(real, dev / "serial" / "by-path"),
-        vendor=vendor,
-        product=product,
-        serial=serial,
-        description=description,
+    known = SerialDevice(
+        path,
+        by_id=_link_to(path, dev / "serial" / "by-id"),
+        by_path=_link_to(path, dev / "serial" / "by-path"),
         driver=os.path.basename(os.path.realpath(driver)) if driver.exists() else None,
         latency_ms=int(text) if text is not None and text.isdigit() else None,
         latency_file=str(latency) if text is not None else None,
     )
+    if port is None:
+        return known
+    vendor, product = (None if number is None else f"{number:04x}" for number in (port.vid, port.pid))
+    said = None if port.description == "n/a" else port.description
+    description = port.product or said or None
+    return replace(known, vendor=vendor, product=product, serial=port.serial_number or None, description=description)
 
 
-def stable_name(device: str, dev: Path = DEV, sys: Path = SYS) -> str:
+def stable_name(device: str, dev: Path = DEV, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> str:
     """Return the name under which an adapter is found again after it was unplugged, or `device` itself.
 
     That is by serial number if the adapter has a unique one. Two CH340 have none, and two CP2102 both have 0001: their
@@ -138,28 +140,16 @@ def stable_name(device: str, dev: Path = DEV, sys: Path = SYS) -> str:
     """
     if not device.startswith((str(dev / "tty"), str(dev / "serial" / "by-id"))):
         return device
-    port = describe(device, dev, sys)
-    unique = port.serial is not None and not _has_double(port, sys)
-    return (port.by_id if unique else port.by_path) or (port.path if not unique else device)
-
-
-def _has_double(port: SerialDevice, sys: Path) -> bool:
-    """Return whether another adapter with the same numbers is plugged in; ports of one adapter share its folder."""
-    own = _usb_folder(sys / "class" / "tty" / os.path.basename(port.path) / "device")
-    others = {_usb_folder(tty / "device") for tty in (sys / "class" / "tty").glob("*")} - {own, None}
-    return (port.vendor, port.product, port.serial) in (_usb_facts(usb)[:3] for usb in others)
-
-
-def _completed(device: SerialDevice, port: Any) -> SerialDevice:
-    """Add what pyserial knows (its `ListPortInfo`) if /sys has nothing: macOS and Windows have no /sys."""
-    said = None if port.description == "n/a" else port.description or None
-    return replace(
-        device,
-        vendor=device.vendor or (None if port.vid is None else f"{port.vid:04x}"),
-        product=device.product or (None if port.pid is None else f"{port.pid:04x}"),
-        serial=device.serial or port.serial_number or None,
-        description=device.description or said,
-    )
+    real = _real(device)
+    sockets: dict[tuple[Any, ...], set[str]] = {}  # USB sockets by numbers; ports of one adapter share its socket
+    own: tuple[Any, ...] = ()
+    for port in listed():
+        numbers = port.vid, port.pid, port.serial_number
+        sockets.setdefault(numbers, set()).add((port.location or "").partition(":")[0])
+        own = numbers if _real(port.device) == real else own
+    if own and own[2] and len(sockets[own]) == 1:
+        return _link_to(real, dev / "serial" / "by-id") or device
+    return _link_to(real, dev / "serial" / "by-path") or real
 
 
 def holders(path: str, proc: Path = PROC) -> list[Holder]:
@@ -220,19 +210,13 @@ def group_of(path: str) -> str:
         return "dialout"
 
 
-def _usb_folder(device: Path) -> Path | None:
-    """Return the USB device that a tty belongs to: the first folder upwards that has an idVendor."""
-    real = Path(os.path.realpath(device))
-    return next((folder for folder in (real, *real.parents) if (folder / "idVendor").is_file()), None)
+def _real(device: str) -> str:
+    """Return a path without links; a COM port is not a path."""
+    return os.path.realpath(device) if os.name == "posix" else device
 
 
-def _usb_facts(usb: Path | None) -> tuple[str | None, ...]:
-    """Return vendor, product, serial number and description of a USB device."""
-    return tuple(_line(usb / key) if usb else None for key in ("idVendor", "idProduct", "serial", "product"))
-
-
-def _link_to(real: Path, folder: Path) -> str | None:
-    return next((str(link) for link in sorted(folder.glob("*")) if os.path.realpath(link) == str(real)), None)
+def _link_to(real: str, folder: Path) -> str | None:
+    return next((str(link) for link in sorted(folder.glob("*")) if os.path.realpath(link) == real), None)
 
 
 def _open_files(folder: Path) -> Iterator[str]:

@@ -70,7 +70,7 @@ class BusFamily:
 
 
 _CHAIN: Final = "sfms_robot.servo.chain"
-_BOARDS: Final = "sfms_robot.servo.pulse_bus"
+_BOARDS: Final = "sfms_robot.servo.pulse_bus:PulseBus"
 _OWN: Final = {
     "dynamixel2": BusFamily(
         "Dynamixel 2.0",
@@ -96,8 +96,8 @@ _OWN: Final = {
         bauds=(1_000_000, 115_200, 500_000, 57_600, 38_400, 250_000, 128_000, 76_800),
         broadcast=True,
     ),
-    "maestro": BusFamily("Pololu Maestro", f"{_BOARDS}:MaestroBus", ("maestro", None)),
-    "ssc32": BusFamily("Lynxmotion SSC-32", f"{_BOARDS}:Ssc32Bus", ("ssc32", None)),
+    "maestro": BusFamily("Pololu Maestro", _BOARDS, ("maestro", None)),
+    "ssc32": BusFamily("Lynxmotion SSC-32", _BOARDS, ("ssc32", None)),
 }
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from sfms_robot.config import Faults, FirmwareMap, LoadRule, Safety
-from sfms_robot.config.firmware import Role
+from sfms_robot.config import Faults, LoadRule, Safety
+from sfms_robot.servo.registers import Field, Table
 
 PINCH_SHARE: Final = 0.6  # of the servo's own current limit
 PINCH_S: Final = 0.5
@@ -27,7 +27,7 @@ class BusServo:
 
     joint: str
     id: int
-    map: FirmwareMap
+    table: Table
     min_rad: float
     max_rad: float
     safety: Safety = field(default_factory=Safety)
@@ -57,44 +57,35 @@ def counts(name: str, faults: Faults, measured: Mapping[str, float | None]) -> b
     return low or high
 
 
-def register_of(table: FirmwareMap, role: Role) -> str | None:
-    """Return the name of the register that plays a role; None if the model has none."""
-    name = table.roles.get(role, role)
-    return name if name in table.registers else None
-
-
-def tells_current(table: FirmwareMap) -> bool:
+def tells_current(table: Table) -> bool:
     """Return whether the model reports its present current in mA."""
-    name = register_of(table, "present_current")
-    return name is not None and table.registers[name].unit == "mA"
+    field = table.role("present_current")
+    return field is not None and field.unit == "mA"
 
 
-def torque_register(table: FirmwareMap) -> str | None:
-    """Return the name of the register, in percent, that bounds the torque; the PWM if the model has no other.
+def torque_register(table: Table) -> Field | None:
+    """Return the register, in percent, that bounds the torque; the PWM if the model has no other.
 
     Both bound the voltage at the motor, so the torque of a stalled servo falls in proportion.
     """
-    for name in (register_of(table, "torque_limit"), "goal_pwm"):
-        if name in table.registers and table.registers[name].unit == "percent":
-            return name
-    return None
+    fields = table.role("torque_limit"), table.fields.get("goal_pwm")
+    return next((field for field in fields if field is not None and field.unit == "percent"), None)
 
 
 def torque_limit(servo: BusServo) -> dict[str, int]:
     """Return the register and the raw value that keep `torque_limit_percent`; empty for a joint without that limit."""
-    percent, name = servo.safety.torque_limit_percent, torque_register(servo.map)
-    if percent is None or name is None:
+    percent, field = servo.safety.torque_limit_percent, torque_register(servo.table)
+    if percent is None or field is None:
         return {}
-    register = servo.map.registers[name]
-    return {name: min(register.high, round(percent / register.scale))}
+    return {field.name: min(field.high, round(percent / field.scale))}
 
 
 def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
     """Return the named load rules of a joint; none if its servo does not report its current."""
-    if not tells_current(servo.map):
+    if not tells_current(servo.table):
         return []
     rules = [("pinched", servo.safety.pinch), ("under load too long", servo.safety.strain)]
-    limit = servo.map.registers.get("current_limit")
+    limit = servo.table.fields.get("current_limit")
     if servo.safety.pinch is None and limit is not None and limit.initial:
         own = LoadRule(current_mA=PINCH_SHARE * limit.initial * limit.scale, for_s=PINCH_S, then="limp")
         rules[0] = ("pinched", own)

@@ -356,23 +356,17 @@ def _held(others: Sequence[Holder]) -> str:
 # --- input and output of an open device -----------------------------------------------------------------------------
 
 
-class SerialIO(Protocol):
-    """Bytes in and out of one open device. Raises one of `DEVICE_ERRORS` if the device is gone."""
-
-    def write(self, data: bytes) -> None:
-        """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
-
-    def read(self, n: int, timeout_s: float) -> bytes:
-        """Return 1 to `n` bytes as soon as there are any; empty if none came in `timeout_s`."""
-
-
 class DescriptorIO:
-    """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop."""
+    """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop.
+
+    Like the two classes below it raises one of `DEVICE_ERRORS` if the device is gone.
+    """
 
     def __init__(self, port: serial.Serial) -> None:
         self._fd = port.fileno()
 
     def write(self, data: bytes) -> None:
+        """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
         rest = memoryview(data)
         while rest:
             try:
@@ -382,6 +376,7 @@ class DescriptorIO:
                     raise OSError("it takes no more bytes") from None
 
     def read(self, n: int, timeout_s: float) -> bytes:
+        """Return 1 to `n` bytes as soon as there are any; empty if none came in `timeout_s`."""
         ready, _, _ = select.select([self._fd], [], [], timeout_s)
         data = os.read(self._fd, n) if ready else b""
         if ready and not data:
@@ -417,7 +412,7 @@ class RtsDirection:
     early: most of those switch the direction themselves and need no `rs485`.
     """
 
-    def __init__(self, inner: SerialIO, port: serial.Serial, name: str) -> None:
+    def __init__(self, inner: DescriptorIO | PolledIO, port: serial.Serial, name: str) -> None:
         self._port = port
         self._write = inner.write
         self.read = inner.read
@@ -435,7 +430,7 @@ class RtsDirection:
             self._port.rts = False
 
 
-def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> SerialIO:
+def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> DescriptorIO | PolledIO | RtsDirection:
     """Return the kind of this system and device. Raises PortError if it cannot switch the direction as `rs485` says."""
     if rs485 == "kernel":  # TIOCSRS485: the driver switches the direction between the last bit and the first answer
         from serial.rs485 import RS485Settings
@@ -449,5 +444,5 @@ def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> Ser
         has_descriptor = _termios is not None and port.fileno() >= 0
     except OSError:  # io.UnsupportedOperation
         has_descriptor = False
-    io: SerialIO = DescriptorIO(port) if has_descriptor else PolledIO(port)
+    io = DescriptorIO(port) if has_descriptor else PolledIO(port)
     return RtsDirection(io, port, name) if rs485 == "rts" else io

@@ -19,7 +19,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.servo.boards import Board, Maestro, Output, RateLimitedPort, Ssc32, board_of, pulses_beyond
+from sfms_robot.servo.boards import Maestro, Output, RateLimitedPort, Ssc32, board_of, pulses_beyond
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -48,7 +48,7 @@ _TORQUE_LOST: Final = "torque lost"
 
 
 class PulseBus(WireBus[RateLimitedPort]):
-    """A board, as `ports.Bus`; subclasses name its kind.
+    """A Pololu Maestro or a Lynxmotion SSC-32, as `ports.Bus`.
 
     Args:
         name, open_port, baud: see `WireBus`.
@@ -61,8 +61,6 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     Raises ConfigError for a channel or a pulse that the board does not have.
     """
-
-    kind: ClassVar[type[Board]]
 
     def __init__(
         self,
@@ -81,17 +79,16 @@ class PulseBus(WireBus[RateLimitedPort]):
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
         self._confirmed = confirmed
-        self._lowest = np.array([servo.min_rad for servo in servos])
-        self._highest = np.array([servo.max_rad for servo in servos])
         table = board_of(name, servos)
         self.model = table.model
-        self._board = self.kind(table, config is not None and config.crc)
+        crc = config is not None and config.crc
+        self._board: Maestro | Ssc32 = Maestro(table, crc) if table.family == "maestro" else Ssc32()
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us):
             raise ConfigError(f"bus {name!r}: a {self.model} does not make the pulses of {beyond}")
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):
             log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, wide)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
-        self._ticks = conversion.to_ticks(np.clip(rest, self._lowest, self._highest))  # goals; before any, the rest
+        self._ticks = conversion.to_ticks(self._goals.own.nearest(rest))  # goals; before any, the rest
         self._warned = False  # that servos jump
         self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
@@ -205,7 +202,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         if output.pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
             ticks = self._ticks.copy()
             ticks[index] = output.pulse
-            angles = np.clip(self._conversion.to_rad(ticks), self._lowest, self._highest)
+            angles = self._goals.own.nearest(self._conversion.to_rad(ticks))
             self._ticks = self._conversion.to_ticks(angles)
         self._send(wire, [output])
         if new and output.pulse != self._ticks[index]:
@@ -486,15 +483,3 @@ class PulseBus(WireBus[RateLimitedPort]):
         if outputs and named not in self._fault_log:
             log.warning("bus %r: the %s reports: %s", self.name, self.model, fault)
             self._fault_log[named] = None
-
-
-class MaestroBus(PulseBus):
-    """A Pololu Maestro as `ports.Bus`."""
-
-    kind = Maestro
-
-
-class Ssc32Bus(PulseBus):
-    """A Lynxmotion SSC-32 as `ports.Bus`."""
-
-    kind = Ssc32

@@ -21,45 +21,53 @@ if TYPE_CHECKING:
 ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
 ByteOrder = Literal["little", "big"]
 
+_FROM_ROW = ("address", "size", "access", "area", "unit", "scale", "low", "high", "signed")
 _EMPTY: Mapping[Any, Any] = MappingProxyType({})
 
 
 class Field(NamedTuple):
-    """A register. `low`..`high` are the values that may be written; `sign` is its rule, as in the map."""
+    """A register, as its row of the map. `low`..`high` are the values that may be written; `signed` is its rule."""
 
     name: str
     address: int
     size: int
-    signed: bool
-    writable: bool
-    eeprom: bool
+    access: str  # R or RW
+    area: str  # EEPROM or RAM
+    unit: str
     scale: float
     low: int
     high: int
+    signed: str
     initial: int
-    unit: str = ""
-    sign: str = "no"
-    byte_order: ByteOrder = "little"
+    byte_order: ByteOrder
+
+    @property
+    def writable(self) -> bool:
+        return self.access == "RW"
+
+    @property
+    def eeprom(self) -> bool:
+        return self.area == "EEPROM"
 
     def to_bytes(self, value: int) -> bytes:
         """Return the raw form. Raises OverflowError if `value` does not fit the size and sign rule of the register."""
         raw = value
-        if self.sign == "offset_2048":
+        if self.signed == "offset_2048":
             raw = value + 2048
-        elif self.sign.startswith("sign_bit_"):
-            bit = 1 << int(self.sign[9:])
+        elif self.signed.startswith("sign_bit_"):
+            bit = 1 << int(self.signed[9:])
             if abs(value) >= bit:
                 raise OverflowError(f"{self.name} = {value} does not fit below its sign bit ({1 - bit}..{bit - 1})")
             raw = bit - value if value < 0 else value
-        return raw.to_bytes(self.size, self.byte_order, signed=self.sign == "twos_complement")
+        return raw.to_bytes(self.size, self.byte_order, signed=self.signed == "twos_complement")
 
     def from_bytes(self, data: bytes | bytearray) -> int:
         """Return the value of the first `size` bytes."""
-        raw = int.from_bytes(data[: self.size], self.byte_order, signed=self.sign == "twos_complement")
-        if self.sign == "offset_2048":
+        raw = int.from_bytes(data[: self.size], self.byte_order, signed=self.signed == "twos_complement")
+        if self.signed == "offset_2048":
             return raw - 2048
-        if self.sign.startswith("sign_bit_"):
-            bit = 1 << int(self.sign[9:])
+        if self.signed.startswith("sign_bit_"):
+            bit = 1 << int(self.signed[9:])
             return -(raw & bit - 1) if raw & bit else raw & bit - 1
         return raw
 
@@ -120,7 +128,15 @@ class Table:
         speed, pulse = plain["no_load_speed_deg_s"] or ASSUMED_SPEED_DEG_S, plain["pulse_us"]
         unchanged = {name: plain[name] for name in cls.__dataclass_fields__ if name in plain}
         converted = {
-            "fields": {name: _field(name, row, plain["byte_order"]) for name, row in plain["registers"].items()},
+            "fields": {
+                name: Field(
+                    name=name,
+                    byte_order=plain["byte_order"],
+                    initial=row["initial"] or 0,
+                    **{key: row[key] for key in _FROM_ROW},
+                )
+                for name, row in plain["registers"].items()
+            },
             "top_speed_ticks_s": speed * (plain["ticks_per_revolution"] / 360.0),
             "firmware": (plain["firmware"]["min"], plain["firmware"]["max"]),
             "pulse_us": (pulse["min"], pulse["max"]) if pulse else None,
@@ -168,21 +184,3 @@ def span_of(fields: Sequence[Field]) -> tuple[int, int]:
     """Return (address, length) of the block that holds all of `fields`."""
     first = min(each.address for each in fields)
     return first, max(each.address + each.size for each in fields) - first
-
-
-def _field(name: str, row: Mapping[str, Any], byte_order: ByteOrder) -> Field:
-    return Field(
-        name=name,
-        address=row["address"],
-        size=row["size"],
-        signed=row["signed"] != "no",
-        writable=row["access"] == "RW",
-        eeprom=row["area"] == "EEPROM",
-        scale=row["scale"],
-        low=row["low"],
-        high=row["high"],
-        initial=row["initial"] or 0,
-        unit=row["unit"],
-        sign=row["signed"],
-        byte_order=byte_order,
-    )

@@ -28,22 +28,6 @@ def test_dynamixel_servos_are_found_driven_and_read(plugged_in, again):
     assert host.ping(2) and not host.ping(9)
 
 
-def test_alert_is_seen_where_it_is_asked_for(plugged_in):
-    chain = plugged_in([EmulatedServo(1)])
-    host = rustypot.Xl330PyController(chain.device, 1_000_000, 0.5)
-    chain.fault(1, 1 << 5)
-    assert host.read_raw_data_with_error(1, 70, 1)[1] & 0x80
-
-
-def test_silent_servo_is_an_error_of_the_client(plugged_in):
-    """What it does on real chains: one silent servo, no positions at all."""
-    chain = plugged_in([EmulatedServo(i) for i in IDS])
-    host = rustypot.Xl330PyController(chain.device, 1_000_000, 0.2)
-    chain.kill(2)
-    with pytest.raises(RuntimeError):
-        host.sync_read_present_position(IDS)
-
-
 @pytest.mark.parametrize(("model", "controller"), [("sts3215", "Sts3215PyController"), ("ax-12a", "AxPyController")])
 def test_older_protocols_are_read_and_driven(plugged_in, again, model, controller):
     center = 2048 if model == "sts3215" else 512

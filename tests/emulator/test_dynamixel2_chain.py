@@ -57,7 +57,8 @@ def host():
 def test_unknown_id_and_other_baud_are_silence(host):
     assert host.ask(9, dxl2.PING) == []
     assert host.ask(1, dxl2.PING, baud=57600) == []
-    assert host.ask(1, dxl2.PING, baud=None) == []
+    assert host.ask(1, dxl2.PING, baud=None) == host.ask(1, dxl2.PING, baud=921_600) == []
+    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1
 
 
 @pytest.mark.parametrize(
@@ -75,11 +76,6 @@ def test_write_is_checked(host, name, value, error):
     before = host.read(1, name)
     assert host.write(1, name, value) == error
     assert host.read(1, name) == (before if error else value)
-
-
-def test_part_of_a_register_cannot_be_written(host):
-    [status] = host.ask(1, dxl2.WRITE, words(116) + b"\x00\x08")
-    assert status.error == dxl2.DATA_LENGTH_ERROR
 
 
 def test_eeprom_is_locked_under_torque(host):
@@ -101,32 +97,9 @@ def test_status_return_level_decides_who_answers(host):
     assert len(host.ask(1, dxl2.PING)) == 1
 
 
-def test_without_torque_a_goal_moves_nothing(host):
-    host.write(1, "goal_position", 3000)
-    host.t = 2.0
-    assert host.read(1, "present_position") == 2001
-
-
 def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x01\x02")] == [3, 1, 2]
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
-
-
-def test_registered_write_waits_for_action(host):
-    host.ask(1, dxl2.REG_WRITE, words(65) + b"\x01")
-    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (0, 1)
-    assert host.ask(dxl2.BROADCAST, dxl2.ACTION) == []
-    assert (host.read(1, "led"), host.read(1, "registered_instruction")) == (1, 0)
-
-
-def test_reboot_restores_ram_and_keeps_eeprom(host):
-    host.write(1, "return_delay_time", 7)
-    host.write(1, "led", 1)
-    host.write(1, "torque_enable", 1)
-    assert len(host.ask(1, dxl2.REBOOT)) == 1
-    assert host.ask(1, dxl2.PING) == []  # it is busy starting
-    host.t = 0.5
-    assert [host.read(1, n) for n in ("led", "torque_enable", "return_delay_time")] == [0, 0, 7]
 
 
 def test_hardware_error_is_latched_until_reboot(host):
@@ -139,19 +112,6 @@ def test_hardware_error_is_latched_until_reboot(host):
     host.ask(2, dxl2.REBOOT)
     host.t = 0.5
     assert host.read(2, "hardware_error_status") == 0 and host.write(2, "torque_enable", 1) == 0
-
-
-def test_watchdog_stops_the_servo_when_the_host_is_gone(host):
-    host.write(1, "profile_velocity", 20)
-    host.write(1, "goal_position", 2001)
-    host.write(1, "torque_enable", 1)
-    host.write(1, "bus_watchdog", 5)
-    host.write(1, "goal_position", 4000)
-    host.t = 5.0
-    stopped = host.read(1, "present_position")
-    assert 2001 < stopped < 2060 and host.read(1, "bus_watchdog") == -1
-    assert host.write(1, "goal_position", 3000) == dxl2.DATA_RANGE_ERROR
-    assert host.write(1, "bus_watchdog", 0) == 0 and host.write(1, "goal_position", 3000) == 0
 
 
 def test_watchdog_is_fed_by_any_instruction(host):
@@ -251,7 +211,3 @@ def test_each_reply_waits_its_return_delay(host):
 
 def test_broadcast_ping_is_answered_in_slots(host):
     assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))
-
-
-def test_baud_may_be_a_little_off(host):
-    assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1 and host.ask(1, dxl2.PING, baud=921_600) == []

@@ -1,13 +1,13 @@
 """Devices, faults and the line between, without a terminal."""
 
 import pytest
-from emulated_devices import chain_of, device_of, servos_of
+from emulated_devices import device_of, servos_of
 
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import ConfigError
-from sfms_robot.servo.codecs import dxl2, protocol1
+from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
 
 BAUD = 1_000_000
@@ -34,12 +34,6 @@ def ids_in(outs) -> list[int]:
     while (packet := maybe_packet(buffer)) is not None:
         found.append(packet.servo)
     return found
-
-
-def test_instant_replies_are_due_at_once():
-    wire = wire_of(1, 2)
-    wire.receive(sync_read(1, 2), BAUD, 1.0)
-    assert ids_in(wire.take(1.0)) == [1, 2] and wire.take(9.0) == []
 
 
 def test_on_the_wire_a_byte_takes_ten_bits_and_a_servo_its_delay():
@@ -150,14 +144,6 @@ def test_overload_overheat_and_voltage_are_latched():
     assert wire.servo(3).supply_v == 5.0
 
 
-def test_clear_lets_a_stuck_joint_go():
-    wire = wire_of(1)
-    wire.inject("stuck:1", 0.0)
-    assert wire.servo(1).plant.stuck and wire.faults(0.0) == ["stuck:1"]
-    wire.clear(1.0)
-    assert not wire.servo(1).plant.stuck and wire.faults(1.0) == []
-
-
 def test_fault_that_concerns_nobody_is_refused():
     with pytest.raises(ConfigError, match="'drop:9' concerns no servo"):
         wire_of(1, faults=["drop:9"])
@@ -169,15 +155,6 @@ def test_unplugged_wire_hears_nothing_but_counts():
     assert wire.hung and wire.take(9.0) == [] and wire.digest()[1] == len(sync_read(1))
     wire.advance(2.0)
     assert not wire.hung
-
-
-def test_two_protocols_share_one_wire():
-    wire = EmulatedWire([xl330(1), device_of(*servos_of("ax-12a", 20))])
-    for _ in range(3):
-        wire.receive(encode_instruction(1, dxl2.PING), BAUD, 0.0)
-        assert ids_in(wire.take(0.0)) == [1]
-        wire.receive(protocol1.encode(20, protocol1.PING), BAUD, 0.0)
-        assert [out.servos for out in wire.take(0.0)] == [(20,)]
 
 
 def test_same_faults_and_requests_give_the_same_bytes():
@@ -207,14 +184,6 @@ def test_mute_servo_obeys_and_never_answers(chain_break):
         assert ids_in(wire.take(now_s)) == order
         wire.receive(encode_instruction(dxl2.BROADCAST, dxl2.PING), BAUD, now_s)
         assert ids_in(wire.take(now_s)) == [i for i in (1, 2, 3) if i != 2 or answers]
-
-
-def test_mute_servo_of_protocol_1_obeys_and_never_answers():
-    chain = chain_of("ax-12a")
-    wire = EmulatedWire([chain], "instant", [parse_fault("mute")], 0)
-    for request in ("ff ff 01 02 01 fb", "ff ff 01 04 02 24 02 d2", "ff ff 01 04 03 18 01 de"):  # ping, read, torque on
-        wire.receive(bytes.fromhex(request), BAUD, 0.0)
-    assert wire.take(1.0) == [] and chain.servo(1).state(0.0)["torque"]
 
 
 def test_board_is_mute_when_all_its_channels_are():

@@ -63,8 +63,15 @@ def test_any_text_is_a_fault_or_a_config_error(text):
         return
 
 
-def spoilt(*specs: str, servos=SENDER, now_s: float = 0.0, seed: int = 0):
-    return WireFaults([parse_fault(spec) for spec in specs], seed).spoil(servos, REPLY, now_s)
+def faults_of(*specs: str, seed: int = 0) -> WireFaults:
+    faults = WireFaults(seed)
+    for spec in specs:
+        faults.add(parse_fault(spec))
+    return faults
+
+
+def spoilt(*specs: str, servos=SENDER, now_s: float = 0.0):
+    return faults_of(*specs).spoil(servos, REPLY, now_s)
 
 
 def test_what_becomes_of_a_reply():
@@ -80,10 +87,10 @@ def test_what_becomes_of_a_reply():
 
 
 def test_faults_of_requests_and_of_replies_stay_apart():
-    faults = WireFaults(map(parse_fault, ("request-drop", "request-delay=0.01", "drop:3")))
+    faults = faults_of("request-drop", "request-delay=0.01", "drop:3")
     assert faults.spoil(SENDER, REPLY, 0.0) == [] and faults.spoil((4,), b"x", 0.0) == [(b"x", 0.0)]
     assert faults.spoil((), b"x", 0.0, TO_SERVOS) == []
-    late = WireFaults(map(parse_fault, ("request-delay=0.01", "request-corrupt", "delay", "drop")))
+    late = faults_of("request-delay=0.01", "request-corrupt", "delay", "drop")
     [(wrong, late_s)] = late.spoil(SENDER, REPLY, 0.0, TO_SERVOS)
     assert late_s == 0.01 and sum(a != b for a, b in zip(wrong, REPLY, strict=True)) == 1
 
@@ -95,7 +102,7 @@ def test_fault_is_only_there_in_its_time_and_for_its_ids():
 
 def test_one_seed_throws_the_same_dice():
     def run(seed):
-        faults = WireFaults([parse_fault("drop=0.5"), parse_fault("corrupt=0.5")], seed)
+        faults = faults_of("drop=0.5", "corrupt=0.5", seed=seed)
         return [faults.spoil(SENDER, REPLY, 0.01 * k) for k in range(200)]
 
     assert run(1) == run(1) != run(2)
@@ -103,7 +110,7 @@ def test_one_seed_throws_the_same_dice():
 
 
 def test_beginnings_and_ends_come_once_in_order():
-    faults = WireFaults([parse_fault("stuck:1@2-3"), parse_fault("overload:2@1")])
+    faults = faults_of("stuck:1@2-3", "overload:2@1")
     assert faults.next_s == 1.0
     assert [(t, f.kind, began) for t, f, began in faults.edges(2.5)] == [(1.0, "overload", True), (2.0, "stuck", True)]
     assert [(t, f.kind, began) for t, f, began in faults.edges(9.0)] == [(3.0, "stuck", False)]
@@ -111,7 +118,7 @@ def test_beginnings_and_ends_come_once_in_order():
 
 
 def test_clearing_lets_go_what_goes_on():
-    faults = WireFaults([parse_fault("stuck:1"), parse_fault("drop@5"), parse_fault("drop")])
+    faults = faults_of("stuck:1", "drop@5", "drop")
     assert len(list(faults.edges(1.0))) == 2
     faults.clear(1.0)
     assert [(f.kind, began) for _, f, began in faults.edges(1.0)] == [("stuck", False), ("drop", False)]

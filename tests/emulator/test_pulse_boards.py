@@ -79,14 +79,6 @@ def test_targets_are_held_inside_the_limits_of_a_channel():
     assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (992 * 4, 2000 * 4)
 
 
-def test_target_zero_and_going_home_end_the_pulses():
-    board = maestro_board()
-    board.receive(maestro.set_targets(0, [6000, 6000]) + maestro.set_target(0, maestro.OFF), 115200, 0.0)
-    assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (0, 6000)
-    board.receive(bytes([maestro.GO_HOME]), 115200, 0.0)
-    assert position(board, 1, 0.0) == 0
-
-
 def test_micro_maestro_knows_no_multiple_targets():
     board = maestro_board("maestro-6")
     board.receive(maestro.set_targets(0, [6000, 6000]), 115200, 0.0)
@@ -99,13 +91,6 @@ def test_nonsense_is_a_protocol_error_and_reading_it_clears_it(command):
     board.receive(command, 115200, 0.0)
     assert errors(board) == maestro.PROTOCOL_ERROR
     assert errors(board) == 0
-
-
-def test_mini_ssc_neutral_is_the_middle():
-    board = maestro_board()
-    board.receive(bytes([maestro.MINI_SSC, 3, 127, maestro.MINI_SSC, 4, 0]), 115200, 0.0)
-    assert position(board, 3, 0.0) == 6000
-    assert position(board, 4, 0.0) == pytest.approx((1500 - 476.25) * 4)
 
 
 def test_shaft_without_pulses_stays_where_it_is():
@@ -164,23 +149,11 @@ def test_group_starts_and_stops_together():
     assert board.receive(ssc32.query_moving(), 115200, 1.01) == ssc32.DONE
 
 
-def test_first_move_knows_no_speed():
-    board = ssc_board()
-    board.receive(ssc32.group_move({0: Move(2000, 100)}), 115200, 0.0)
-    assert pulses(board, [0], 0.0) == [200]
-
-
 def test_slower_of_speed_and_time_counts():
     board = ssc_board()
     board.receive(ssc32.group_move({0: Move(1000)}), 115200, 0.0)
     board.receive(ssc32.group_move({0: Move(2000, 500)}, 100), 115200, 0.0)
     assert pulses(board, [0], 1.0) == [150]
-
-
-def test_low_output_ends_the_pulses():
-    board = ssc_board()
-    board.receive(ssc32.group_move({0: Move(1500)}) + ssc32.outputs_low([0]), 115200, 0.0)
-    assert pulses(board, [0], 0.0) == [0]
 
 
 def test_ssc32_hears_no_other_baud_rate():

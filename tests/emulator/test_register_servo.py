@@ -136,16 +136,6 @@ def test_extended_mode_goes_past_a_turn_and_position_mode_does_not():
     assert ServoBench().put(goal_position=9000) == dxl2.DATA_LIMIT_ERROR
 
 
-def test_turns_are_forgotten_by_clear_and_by_reboot():
-    bench = ServoBench(operating_mode=4, start=9000)
-    assert bench.servo.clear(b"\x01\x44\x58\x4c\x22", 0.0) == 0
-    assert bench.get("present_position") == 9000 - 2 * 4096
-    assert bench.servo.clear(b"\x01\x00\x00\x00\x00", 0.0) == dxl2.DATA_RANGE_ERROR
-    bench = ServoBench(operating_mode=4, start=9000)
-    bench.servo.power_cycle(0.0)
-    assert bench.after(1.0) == 9000 - 2 * 4096
-
-
 def test_current_based_position_mode_gives_way_where_position_mode_overloads():
     weak, strong = ServoBench(operating_mode=5), ServoBench()
     weak.put(goal_current=200)

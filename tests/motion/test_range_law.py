@@ -15,6 +15,7 @@ from sfms_robot.motion.limits import JerkLimiter, JointLimits, curve_s
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
 from sfms_robot.servo.bus import Goals
 from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.registers import Table
 
 DT_S = 0.01
 HEADS = head_names()
@@ -52,7 +53,7 @@ class Law:
         joints = head.joints
         maps, calibration = firmware_maps(joints), calibration_of(joints)
         servos = [
-            BusServo(joint=name, id=j.id, map=maps[j.model], min_rad=j.min_rad, max_rad=j.max_rad)
+            BusServo(joint=name, id=j.id, table=Table.of(maps[j.model]), min_rad=j.min_rad, max_rad=j.max_rad)
             for name, j in joints.items()
         ]
         self.limits = JointLimits.of(head)

@@ -21,15 +21,15 @@ SILENCE_S = 0.003
 def bus_servo(joint, servo_id, firmware_map, limit_rad=1.0, **more):
     """A servo whose joint moves as far to both sides."""
     limits = {"min_rad": -limit_rad, "max_rad": limit_rad}
-    return BusServo(joint=joint, id=servo_id, map=firmware_map, **limits, **more)
+    return BusServo(joint=joint, id=servo_id, table=Table.of(firmware_map), **limits, **more)
 
 
 def startups_on(port, servos, conversion):
     """The startups of these servos over `port`, and what runs them all through."""
-    table = Table.of(servos[0].map)
+    table = servos[0].table
     link, kind = link_on(port, table), Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
     pairs = zip(servos, needs_of(servos, conversion), strict=True)
-    startups = [kind(servo, Table.of(servo.map), needs, {}) for servo, needs in pairs]
+    startups = [kind(servo, needs, {}) for servo, needs in pairs]
     for each in startups:
         each.attach(link)
     return startups, lambda: start_up("face", link, startups, port.baud)

@@ -35,25 +35,6 @@ def tick_rad(rig):
     return rig.conversion.rad
 
 
-def test_servos_are_identified_and_left_without_torque(rig):
-    rig.bus.connect()
-    readings = rig.bus.poll(0.0)
-    assert [round(r.position_rad / tick_rad(rig)) for r in readings.values()] == [-40, 0, 60, 20]
-    assert {"position", "velocity", "voltage", "temperature", "torque"} <= rig.bus.capabilities["joint1"]
-    assert rig.torques() == [0, 0, 0, 0]
-    with pytest.raises(ValueError, match="no joint is enabled"):
-        rig.bus.write(np.zeros(4), 0.0)
-
-
-def test_goal_is_reached_and_motion_is_seen_on_the_way(rig):
-    held = rig.hold()
-    moving = rig.ticks(held + 0.3, 5)
-    assert all(r.extra["velocity_rad_s"] > 0.1 for r in moving.values())
-    arrived = rig.ticks(held + 0.3, 60)
-    assert [r.position_rad for r in arrived.values()] == pytest.approx(held + 0.3, abs=tick_rad(rig))
-    assert all(r.fault is None and 20 < r.extra["temperature_C"] < 40 for r in arrived.values())
-
-
 def test_joint_outside_its_limits_is_held_and_may_only_come_in(model):
     per_rad = table_of(model).ticks_per_revolution / (2 * math.pi)
     rig = rig_of(model, starts(model, round(1.4 * per_rad)))
@@ -68,19 +49,6 @@ def test_joint_outside_its_limits_is_held_and_may_only_come_in(model):
         rig.bus.write(np.array([1.1]), rig.clock.t)
 
 
-def test_absent_servo_is_a_silent_member_that_comes_in_when_it_appears(rig):
-    rig.kill(2)
-    held = rig.hold()
-    assert held[1] == 0.0 and rig.torques() == [1, 0, 1, 1]
-    readings = rig.ticks(held, 20)
-    assert {joint: r.fault for joint, r in readings.items() if r.fault} == {"joint2": "no answer"}
-    assert readings["joint2"].position_rad is None
-    assert rig.bus.statistics()["silent"] == [2] and rig.bus.statistics()["faults"] == ["joint2: no answer"]
-    rig.revive(2)
-    assert rig.ticks(held, 250)["joint2"].fault is None
-    assert rig.rejoined == {"joint2"} and rig.torques() == [1, 1, 1, 1]
-
-
 def test_families_and_byte_orders_cannot_share_a_bus():
     with pytest.raises(
         ConfigError, match="scs0009 and sts3215 have present_position at different places or in different forms"
@@ -88,18 +56,6 @@ def test_families_and_byte_orders_cannot_share_a_bus():
         rig_of(["sts3215", "scs0009"], [2048, 512])
     with pytest.raises(ConfigError, match="sts3215 does not speak dynamixel protocol 1"):
         rig_of(["ax-12a", "sts3215"], [512, 2048])
-
-
-def test_silent_servo_is_probed_seldom_and_taken_back(rig):
-    held = rig.hold()
-    rig.kill(2)
-    rig.ticks(held, 300)
-    assert rig.bus.statistics()["retries"] < 12
-    rig.revive(2)
-    assert rig.ticks(held, 200)["joint2"].age_s == 0.0
-    after = rig.bus.statistics()
-    assert after["silent"] == [] and after["reconnects"] == 1
-    assert rig.torques() == [1, 1, 1, 1]
 
 
 def test_wire_that_is_wholly_quiet_blames_nobody_at_once(rig):
@@ -178,29 +134,6 @@ def test_one_lost_answer_is_not_an_absence(rig):
     assert rig.bus.statistics()["silent"] == []
 
 
-def test_late_answers_are_never_taken_for_fresh_ones(rig):
-    held = rig.hold()
-    rig.ticks(held, 2)
-    for round_ in range(12):
-        rig.port.late = 2 + round_ % 3
-        goals = held + 0.02 * (round_ + 1)
-        readings = rig.ticks(goals, 1)
-        for i, reading in enumerate(readings.values()):
-            if reading.age_s == 0.0 and not reading.rejoined:  # which tells the goal it holds
-                there = rig.servo(i + 1).plant.position
-                assert reading.position_rad == pytest.approx(
-                    (there - rig.conversion.center) * tick_rad(rig), abs=tick_rad(rig)
-                )
-    assert all(r.age_s == 0.0 for r in rig.ticks(goals, 100).values())
-
-
-def test_adapter_that_hears_itself_does_no_harm(rig):
-    rig.port.hears_itself = True
-    held = rig.hold()
-    assert all(r.age_s == 0.0 for r in rig.ticks(held, 5).values())
-    assert rig.bus.statistics()["errors"] == 0
-
-
 def test_joint_may_be_told_to_hold_at_the_end(model):
     rig = rig_of(model, starts(model, 0, 0), safety=Safety(stop="hold"))
     rig.hold()
@@ -222,17 +155,6 @@ def test_fault_is_met_by_the_policy_of_the_head(policy, torques, moves):
     assert (abs(rig.servo(2).plant.position - 2048) > 100) is moves
     assert rig.register(2, "torque_limit") == (500 if policy == "reduce" else 1000)
     assert rig.bus.statistics()["faults"] == ["joint2: motor encoder"]
-
-
-def test_servo_that_gave_way_comes_on_again_where_the_head_says_so():
-    rig = rig_of("sts3215", [2048], safety=Safety(on_fault="reboot_and_ease_in"))
-    rig.hold()
-    rig.ticks([0.0], 2)
-    rig.servo(1).fail(1 << 5, rig.clock.t)
-    rig.ticks([0.0], 100)
-    assert rig.torques() == [0]
-    readings = rig.ticks([0.0], 250)
-    assert rig.torques() == [1] and readings["joint1"].fault is None
 
 
 def test_pinched_joint_whose_cable_came_out_meanwhile_comes_back_all_the_same():
@@ -298,16 +220,6 @@ def test_answers_are_switched_on_before_anything_is_asked(model):
     assert rig.register(1, level) == rig.servo(1).table[level].high
 
 
-def test_mode_is_changed_through_the_lock():
-    rig = rig_of("sts3215", [2048])
-    for name, value in (("lock", 0), ("operating_mode", 1), ("lock", 1)):
-        rig.set(1, name, value)
-    rig.hold()
-    assert (rig.register(1, "operating_mode"), rig.register(1, "lock")) == (0, 1)
-    rig.servo(1).power_cycle(1.0)
-    assert rig.register(1, "operating_mode") == 0  # and it stays so
-
-
 def test_mode_that_cannot_be_changed_under_torque_is_an_error():
     rig = rig_of("sts3215", [2048])
     rig.set(1, "operating_mode", 1)
@@ -344,14 +256,6 @@ def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():
     ages = sorted(r.age_s for r in readings.values())
     assert ages[7] == 0.0 and ages[8] > 0.0  # eight of 28 in 6 ms at 1 Mbps
     assert ages[-1] == pytest.approx(0.03)  # and all of them within four ticks
-
-
-@pytest.mark.parametrize("model", OLDER)
-def test_one_sync_request_goes_out_per_tick_for_all_goals(rig):
-    held = rig.hold()
-    before = len(rig.port.sent)
-    rig.bus.write(held, 0.01)
-    assert [len(packet) for packet in rig.port.sent[before:]] == [8 + 4 * 3]
 
 
 def test_bus_of_unknown_model_number_is_not_checked():

@@ -15,6 +15,7 @@ from sfms_robot.servo.bus import AbsentBus
 from sfms_robot.servo.composite import CompositeBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import SerialPort
+from sfms_robot.servo.registers import Table
 
 
 def test_two_buses_answer_as_one_in_the_order_of_the_head(make_rig):
@@ -144,19 +145,6 @@ def test_joint_that_came_back_is_told_once_however_often_its_bus_ticks():
     assert told == 1
 
 
-def test_what_goes_wrong_in_a_thread_is_raised_once_by_a_later_poll():
-    slow = Gate()
-    slow.refuse = True
-    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
-    with pytest.raises(BusError, match="not in range"):
-        while True:
-            bus.write(np.zeros(1), 0.0)
-            bus.poll(0.0)
-    bus.write(np.zeros(1), 0.0)
-    assert bus.poll(0.0)["slow"].fault == "bus failed"
-    bus.close()
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_goal_that_is_not_finite_reaches_no_thread(bad):
     slow = Gate()
@@ -231,7 +219,7 @@ def test_bus_that_fails_in_its_thread_is_said_once_and_the_others_go_on():
 
 
 def test_joints_that_were_left_out_take_goals_and_say_so():
-    servo = BusServo(joint="jaw", id=4, map=load_firmware_map("xl330-m288"), min_rad=0.2, max_rad=1.0)
+    servo = BusServo(joint="jaw", id=4, table=Table.of(load_firmware_map("xl330-m288")), min_rad=0.2, max_rad=1.0)
     bus = CompositeBus({"out": AbsentBus([servo]), "rest": Steady("neck")}, ["jaw", "neck"])
     bus.connect()
     assert bus.enable(["jaw", "neck"]).tolist() == [0.2, 0.0]

@@ -22,6 +22,19 @@ from sfms_robot.servo.discovery import (
 )
 
 
+@dataclass
+class Listed:
+    """An entry of pyserial's list."""
+
+    device: str
+    vid: int | None = None
+    pid: int | None = None
+    serial_number: str | None = None
+    description: str | None = "n/a"
+    product: str | None = None
+    location: str | None = None
+
+
 @pytest.fixture
 def ftdi(tmp_path: Path) -> Path:
     """An FTDI adapter at ttyUSB0 and a bare port at ttyACM0, as Linux shows them."""
@@ -30,20 +43,20 @@ def ftdi(tmp_path: Path) -> Path:
     for name in ("ttyUSB0", "ttyACM0", "tty7"):
         (dev / name).touch()
     (dev / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0").symlink_to("../../ttyUSB0")
-    usb = sys / "devices" / "pci0" / "usb1" / "1-2"
-    tty = usb / "1-2:1.0" / "ttyUSB0"
-    tty.mkdir(parents=True)
-    for name, text in {"idVendor": "0403", "idProduct": "6014", "serial": "FT123", "product": "U2D2"}.items():
-        (usb / name).write_text(text + "\n")
-    (sys / "class" / "tty" / "ttyUSB0").mkdir(parents=True)
-    (sys / "class" / "tty" / "ttyUSB0" / "device").symlink_to(tty)
-    driver = sys / "bus" / "usb-serial" / "drivers" / "ftdi_sio"
+    driver, tty = sys / "bus" / "usb-serial" / "drivers" / "ftdi_sio", sys / "class" / "tty" / "ttyUSB0" / "device"
     driver.mkdir(parents=True)
+    tty.mkdir(parents=True)
     (tty / "driver").symlink_to(driver)
     timer = sys / "bus" / "usb-serial" / "devices" / "ttyUSB0" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")
     return tmp_path
+
+
+def listed(root: Path, *more: Listed):
+    """Return pyserial's list of these ports and the FTDI adapter."""
+    u2d2 = Listed(str(root / "dev" / "ttyUSB0"), 0x0403, 0x6014, "FT123", "U2D2 - U2D2", "U2D2", "1-2")
+    return lambda: [u2d2, *more]
 
 
 def process(proc: Path, pid: int, command: str, *targets: str) -> None:
@@ -53,21 +66,29 @@ def process(proc: Path, pid: int, command: str, *targets: str) -> None:
         (proc / str(pid) / "fd" / str(number)).symlink_to(target)
 
 
-def test_an_adapter_tells_numbers_driver_and_latency(ftdi):
-    usb, acm = sorted(list_ports(ftdi / "dev", ftdi / "sys", list), key=lambda each: each.path, reverse=True)
-    assert usb.path.endswith("ttyUSB0") and usb.by_id.endswith("usb-FTDI_U2D2_FT123-if00-port0")
+def test_an_adapter_is_described_by_numbers_driver_and_latency_also_through_a_link(ftdi):
+    (ftdi / "dev" / "serial0").symlink_to("ttyAMA0")
+    for name, kind in {"ttyS0": "0", "ttyS4": "4", "ttyAMA0": "4"}.items():  # PORT_UNKNOWN: no hardware
+        (ftdi / "dev" / name).touch()
+        (ftdi / "sys" / "class" / "tty" / name).mkdir(parents=True)
+        (ftdi / "sys" / "class" / "tty" / name / "type").write_text(kind + "\n")
+    more = listed(
+        ftdi,
+        Listed("/dev/COM3", 0x0403, 0x6014, "FT9", "USB Serial Port (COM3)"),
+        Listed("/dev/cu.usbserial-FT9", 0x0403, 0x6014, "FT9"),
+        Listed(str(ftdi / "dev" / "ttyS0")),
+    )
+    places = ftdi / "dev", ftdi / "sys", more
+    found = {os.path.basename(each.path): each for each in list_ports(*places)}
+    assert sorted(found) == ["COM3", "cu.usbserial-FT9", "ttyACM0", "ttyAMA0", "ttyS4", "ttyUSB0"]
+    usb, acm, com = found["ttyUSB0"], found["ttyACM0"], found["COM3"]
+    assert usb.by_id == str(ftdi / "dev" / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0")
     assert (usb.vendor, usb.product, usb.serial, usb.description) == ("0403", "6014", "FT123", "U2D2")
     assert usb.driver == "ftdi_sio" and usb.latency_ms == 16 and usb.latency_file.endswith("latency_timer")
     assert (acm.vendor, acm.latency_ms, acm.by_id) == (None, None, None)
-
-
-def test_a_link_is_described_as_what_it_points_to(ftdi):
-    link = ftdi / "dev" / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0"
-    assert describe(str(link), ftdi / "dev", ftdi / "sys").path == str(ftdi / "dev" / "ttyUSB0")
-
-
-def test_a_terminal_is_no_servo_port(ftdi):
-    assert not any("tty7" in each.path for each in list_ports(ftdi / "dev", ftdi / "sys", list))
+    assert (com.vendor, com.serial, com.description) == ("0403", "FT9", "USB Serial Port (COM3)")
+    assert found["cu.usbserial-FT9"].description is None
+    assert describe(usb.by_id, *places) == usb
 
 
 def test_holders_are_found_through_links_and_named(ftdi):
@@ -97,85 +118,40 @@ def test_what_is_no_serial_port_is_told_apart(tmp_path):
     assert "no such device" in access_problem(str(tmp_path / "nothing"))
 
 
-def adapter(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> str:
-    """A USB adapter at `tty`, plugged into `socket`; the link by-id goes to whoever came last, as udev leaves it."""
-    dev, sys = root / "dev", root / "sys"
-    for folder in ("by-id", "by-path"):
+def plug(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> Listed:
+    """A USB adapter at `tty`, plugged into `socket`; the link by-id goes to the last one, as udev leaves it."""
+    dev = root / "dev"
+    for folder, name in (("by-id", by_id), ("by-path", f"pci-usb-{socket}-port0")):
         (dev / "serial" / folder).mkdir(parents=True, exist_ok=True)
+        (dev / "serial" / folder / name).unlink(missing_ok=True)
+        (dev / "serial" / folder / name).symlink_to(f"../../{tty}")
     (dev / tty).touch()
-    (dev / "serial" / "by-id" / by_id).unlink(missing_ok=True)
-    (dev / "serial" / "by-id" / by_id).symlink_to(f"../../{tty}")
-    (dev / "serial" / "by-path" / f"pci-usb-{socket}-port0").symlink_to(f"../../{tty}")
-    usb = sys / "devices" / socket
-    (usb / tty).mkdir(parents=True)
-    facts = {"idVendor": "1a86", "idProduct": "7523", "product": "USB Serial", "serial": serial}
-    for name, text in facts.items():
-        if text is not None:
-            (usb / name).write_text(text + "\n")
-    (sys / "class" / "tty" / tty).mkdir(parents=True)
-    (sys / "class" / "tty" / tty / "device").symlink_to(usb / tty)
-    return str(dev / tty)
+    return Listed(str(dev / tty), 0x1A86, 0x7523, serial, product="USB Serial", location=f"{socket}:1.0")
 
 
-def names(root: Path, *devices: str) -> list[str]:
-    return [os.path.basename(stable_name(device, root / "dev", root / "sys")) for device in devices]
+def names(root: Path, ports: list[Listed], *devices: str) -> list[str]:
+    devices = devices or tuple(port.device for port in ports)
+    return [os.path.basename(stable_name(device, root / "dev", lambda: ports)) for device in devices]
 
 
 @pytest.mark.parametrize("serial", [None, "0001"])
-def test_two_adapters_that_cannot_be_told_apart_go_by_the_socket_they_are_in(tmp_path, serial):
-    one = adapter(tmp_path, "ttyUSB0", "1-1", serial, "usb-1a86_USB_Serial-if00-port0")
-    two = adapter(tmp_path, "ttyUSB1", "1-2", serial, "usb-1a86_USB_Serial-if00-port0")
-    assert names(tmp_path, one, two) == ["pci-usb-1-1-port0", "pci-usb-1-2-port0"]
+def test_two_adapters_with_equal_numbers_are_named_by_their_sockets(tmp_path, serial):
+    ports = [plug(tmp_path, f"ttyUSB{i}", f"1-{i}", serial, "usb-1a86_USB_Serial-if00-port0") for i in (1, 2)]
+    assert names(tmp_path, ports) == ["pci-usb-1-1-port0", "pci-usb-1-2-port0"]
     link = str(tmp_path / "dev" / "serial" / "by-id" / "usb-1a86_USB_Serial-if00-port0")
-    assert names(tmp_path, link) == ["pci-usb-1-2-port0"]  # what it means now, not after the next power cycle
+    assert names(tmp_path, ports, link) == ["pci-usb-1-2-port0"]  # what it means now, not after the next power cycle
 
 
 def test_an_adapter_with_a_serial_number_of_its_own_may_move_to_another_socket(tmp_path):
-    one = adapter(tmp_path, "ttyUSB0", "1-1", "A1", "usb-1a86_A1-if00-port0")
-    two = adapter(tmp_path, "ttyUSB1", "1-2", "A2", "usb-1a86_A2-if00-port0")
-    assert names(tmp_path, one, two) == ["usb-1a86_A1-if00-port0", "usb-1a86_A2-if00-port0"]
+    ports = [plug(tmp_path, f"ttyUSB{i}", f"1-{i}", f"A{i}", f"usb-1a86_A{i}-if00-port0") for i in (1, 2)]
+    ports.append(plug(tmp_path, "ttyUSB3", "1-1", "A1", "usb-1a86_A1-if01-port0"))  # its second port
+    assert names(tmp_path, ports)[:2] == ["usb-1a86_A1-if00-port0", "usb-1a86_A2-if00-port0"]
 
 
 def test_without_a_lasting_name_the_device_stays(tmp_path):
     (tmp_path / "dev").mkdir()
-    assert names(tmp_path, str(tmp_path / "dev" / "ttyS1"), "socket://robot:4000", "COM3") == [
-        "ttyS1",
-        "robot:4000",
-        "COM3",
-    ]
-
-
-@dataclass
-class Listed:
-    """An entry of pyserial's list."""
-
-    device: str
-    vid: int | None = None
-    pid: int | None = None
-    serial_number: str | None = None
-    description: str | None = "n/a"
-
-
-def test_pyserials_list_and_the_files_are_one_list(ftdi):
-    dev, sys = ftdi / "dev", ftdi / "sys"
-    (dev / "ttyS0").touch()
-    (dev / "ttyS4").touch()
-    (dev / "serial0").symlink_to("ttyAMA0")
-    (dev / "ttyAMA0").touch()
-    for name, kind in {"ttyS0": "0", "ttyS4": "4"}.items():  # PORT_UNKNOWN: nothing is soldered there
-        (sys / "class" / "tty" / name).mkdir(parents=True)
-        (sys / "class" / "tty" / name / "type").write_text(kind + "\n")
-    listed = [
-        Listed("COM3", 0x0403, 0x6014, "FT9", "USB Serial Port (COM3)"),
-        Listed("/dev/cu.usbserial-FT9", 0x0403, 0x6014, "FT9"),
-        Listed(str(dev / "ttyUSB0"), 0xFFFF),
-        Listed(str(dev / "ttyS0")),
-    ]
-    found = {os.path.basename(each.path): each for each in list_ports(dev, sys, lambda: listed)}
-    assert sorted(found) == ["COM3", "cu.usbserial-FT9", "ttyACM0", "ttyAMA0", "ttyS4", "ttyUSB0"]
-    assert found["ttyUSB0"].vendor == "0403" and found["ttyUSB0"].latency_ms == 16
-    assert (found["COM3"].vendor, found["COM3"].serial) == ("0403", "FT9")
-    assert found["cu.usbserial-FT9"].description is None
+    devices = str(tmp_path / "dev" / "ttyS1"), "socket://robot:4000", "COM3"
+    assert names(tmp_path, [], *devices) == ["ttyS1", "robot:4000", "COM3"]
 
 
 def test_the_ports_of_this_computer_can_be_told_as_json():

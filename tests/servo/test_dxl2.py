@@ -43,10 +43,6 @@ def test_packet_arriving_one_byte_at_a_time(wire):
     assert byte_by_byte(take, wire) == take(bytearray(wire))
 
 
-def test_alert_and_error_of_a_status_are_kept():
-    assert take(bytearray(encode_status(1, 0x87))) == Packet(1, dxl2.STATUS, b"", 0x87)
-
-
 @given(ids, st.sampled_from([dxl2.READ, dxl2.WRITE, dxl2.SYNC_WRITE]), params)
 def test_instruction_round_trip(servo, code, data):
     assert take(bytearray(encode_instruction(servo, code, data))) == Packet(servo, code, data)

@@ -1,7 +1,6 @@
 """Dynamixel 2.0: what was away comes back (a servo, the wire, the supply), watchdogs, modes."""
 
 import logging
-import math
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from emulated_port import BAUD
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import ServoError
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.port import SerialPort
 
@@ -23,41 +21,6 @@ def four(make_rig, **more):
 
 def goals_of(rig, radians):
     return np.full(rig.count, radians)
-
-
-def test_servo_that_was_away_holds_where_it_stands_until_goals_begin_there(make_rig):
-    rig = four(make_rig)
-    rig.hold()
-    rig.ticks(goals_of(rig, 0.0), 3)
-    rig.kill(2)
-    rig.ticks(goals_of(rig, 0.0), 30)
-    rig.ticks(goals_of(rig, 0.5), 100)  # the others go on without it
-    rig.revive(2)
-    _, readings = rig.until(goals_of(rig, 0.5), lambda r: r["joint2"].rejoined, 2.0)
-    stands = readings["joint2"].position_rad
-    assert stands == pytest.approx(0.0, abs=2 * RAD_PER_TICK)
-    later = rig.ticks(goals_of(rig, 0.5), 50)
-    assert later["joint2"].position_rad == pytest.approx(stands, abs=RAD_PER_TICK) and not later["joint2"].rejoined
-    near = goals_of(rig, 0.5)
-    near[1] = stands
-    rig.ticks(near, 1)
-    for step in np.linspace(0.0, 0.5, 50):
-        near[1] = stands + step
-        readings = rig.ticks(near, 1)
-    assert rig.ticks(near, 50)["joint2"].position_rad == pytest.approx(0.5, abs=2 * RAD_PER_TICK)
-    assert rig.bus.statistics()["silent"] == []
-
-
-def test_servo_that_restarted_on_its_own_is_noticed_and_brought_back(make_rig):
-    rig = four(make_rig)
-    held = rig.hold()
-    rig.ticks(held, 5)
-    rig.bus._link.reboot(3)  # nobody told the bus
-    seconds, readings = rig.until(held, lambda r: r["joint3"].rejoined, 2.0)
-    assert readings["joint3"].fault is None
-    assert "joint3: torque lost" in rig.bus.statistics()["faults"]
-    assert rig.ticks(held + 0.05, 1)["joint1"].age_s == 0.0
-    assert rig.state(3)["torque"]
 
 
 def test_other_servo_under_the_same_id_is_not_switched_on(make_rig, caplog):
@@ -77,25 +40,6 @@ def load_and_rename():
     from sfms_robot.servo.registers import Table
 
     return Table.of(load_firmware_map("xl330-m288").model_copy(update={"model": "other", "model_number": 77}))
-
-
-@pytest.mark.parametrize("watchdog_ms", [100, 200])
-def test_watchdog_is_armed_after_the_first_goal_and_off_after_the_run(make_rig, watchdog_ms):
-    rig = four(make_rig, watchdog_ms=watchdog_ms)
-    held = rig.hold()
-    assert registers(rig, "bus_watchdog") == [0, 0, 0, 0]
-    rig.ticks(held, 1)
-    assert registers(rig, "bus_watchdog") == [watchdog_ms // 20] * 4
-    rig.bus.stop("hold")
-    assert registers(rig, "bus_watchdog") == [0, 0, 0, 0]
-    assert registers(rig, "torque_enable") == [1, 1, 1, 1]
-
-
-def test_watchdog_that_cannot_stop_the_motor_is_left_alone(make_rig):
-    weak = load_firmware_map("xl330-m288").model_copy(update={"watchdog": "flags_only"})
-    rig = four(make_rig, firmware_map=weak)
-    rig.ticks(rig.hold(), 3)
-    assert registers(rig, "bus_watchdog") == [0, 0, 0, 0]
 
 
 def test_host_that_stood_still_brings_its_servos_back(make_rig):
@@ -135,16 +79,6 @@ def test_stop_opens_a_port_that_is_back_to_release_the_head(make_rig):
     rig.come_back()
     rig.bus.stop("release")
     assert [rig.state(i)["torque"] for i in (1, 2, 3, 4)] == [0, 0, 0, 0]
-
-
-RAD_PER_TICK = 2 * math.pi / 4096
-
-
-def test_servo_in_shutdown_is_named_at_torque_on(rig):
-    rig.bus.connect()
-    rig.fault(2, 1 << 2)
-    with pytest.raises(ServoError, match=r"joint2 \(id 2\) refuses torque_enable := 1.*hardware error"):
-        rig.bus.enable(rig.bus.joints)
 
 
 def test_mode_and_drive_mode_are_set_before_the_first_goal(rig):

@@ -65,18 +65,6 @@ def test_a_silent_servo_is_named_and_costs_a_bounded_time(model, tries):
     assert port.clock.t <= 3 * tries * (SILENCE_S + 0.0005)  # a write, a read back, and what the link asks to be sure
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_a_running_bus_is_told_to_end_its_tick_after_a_silence(model):
-    table, _, port, link = rig(model, ["answer", "request"])
-    began_s, waits = 0.0, []
-    steps = verified_write(link, 1, table.role("goal_position"), table.center_ticks)
-    for wait_s in steps:
-        waits.append((port.clock.t - began_s >= SILENCE_S, wait_s > 0))
-        began_s = port.clock.t
-    assert len(waits) >= 3
-    assert all(silent == told for silent, told in waits)
-
-
 def test_a_value_that_is_not_taken_is_told_with_both():
     """A servo of the old frame acknowledges what it does not take: torque after a shutdown."""
     table, servo, port, link = rig("sts3215")

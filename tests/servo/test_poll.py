@@ -1,7 +1,6 @@
 """Who is asked for what in a tick, and which answers count. In virtual time, over real ports."""
 
 import logging
-from itertools import pairwise
 
 import pytest
 from chain_rig import bus_of
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.poll import Rotation, blocks_per_tick
 from sfms_robot.servo.chain.protocol1 import FeetechLink
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.codecs import dxl2
@@ -58,24 +56,6 @@ def test_slow_wire_brings_positions_every_tick_and_the_rest_in_turn(make_rig):
     assert 0 < seen[0] < 14 and seen[-1] == 28
 
 
-@given(st.integers(1, 60), st.floats(1e-5, 1e-3), st.floats(0.001, 0.05))
-def test_blocks_fit_in_what_goals_and_positions_leave(count, block_s, spare_s):
-    positions_s = count * block_s / 4
-    blocks = blocks_per_tick(count, spare_s, positions_s, lambda servos: servos * block_s)
-    assert 1 <= blocks <= count
-    assert blocks == 1 or positions_s * (blocks < count) + blocks * block_s <= spare_s
-
-
-@given(st.integers(1, 30), st.integers(1, 30))
-def test_everybody_has_a_turn(count, at_once):
-    rotation, ids = Rotation(), list(range(count))
-    turns = [rotation.take(ids, at_once) for _ in range(2 * count)]
-    assert all(turn == sorted(turn) and len(turn) == min(count, at_once) for turn in turns)
-    for servo in ids:
-        at = [k for k, turn in enumerate(turns) if servo in turn]
-        assert max(b - a for a, b in pairwise([-1, *at])) <= -(-count // at_once) + 1
-
-
 REPLIES = [(1, 0, b"\x01\x02\xff\xff"), (7, 0x80, b"\xfd\x00\xff\xff"), (9, 0, b"\xfd\xfd\x00\x55")]
 
 
@@ -85,10 +65,6 @@ def test_fast_answer_that_stops_short_gives_those_in_front_of_the_gap(cut):
     got = dxl2.split_fast_status(whole[:cut], 4)
     assert got == REPLIES[: len(got)]
     assert len(got) == sum(8 + 8 * (k + 1) <= min(cut, len(whole)) for k in range(3))
-
-
-def test_fast_answer_of_another_length_is_none():
-    assert dxl2.split_fast_status(dxl2.encode_fast_status(REPLIES), 5) == []
 
 
 @pytest.mark.parametrize(

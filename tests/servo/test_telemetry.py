@@ -9,10 +9,7 @@ from virtual_time import Time
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import ConfigError
-from sfms_robot.servo.chain.telemetry import common
 from sfms_robot.servo.port import VirtualTimePort
-from sfms_robot.servo.registers import Table
 
 
 @contextmanager
@@ -56,12 +53,6 @@ def test_servos_of_these_models_share_a_bus_and_follow(models):
         assert reading.position_rad == pytest.approx(0.3, abs=0.01) and reading.age_s == 0.0
         assert ("current_mA" in reading.extra) == ("current" in bus.capabilities[joint])
         assert "current" not in bus.capabilities[joint] or "present_current" in each.registers
-
-
-def test_models_with_other_tables_cannot_share_a_bus():
-    tables = [Table.of(load_firmware_map(model)) for model in ("xl330-m288", "xl-320")]
-    with pytest.raises(ConfigError, match="xl-320 and xl330-m288 have goal_position at different places"):
-        common("face", tables, "goal_position")
 
 
 def test_firmware_picks_the_layout_that_the_bus_goes_by():

@@ -217,7 +217,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
         BusServo(
             joint=name,
             id=joint.id,
-            map=maps[joint.model],
+            table=Table.of(maps[joint.model]),
             min_rad=joint.min_rad,
             max_rad=joint.max_rad,
             safety=head.safety_of(name),
@@ -228,7 +228,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
         servo.id: Wanted(
             joint=servo.joint,
             model=joints[servo.joint].model,
-            model_number=servo.map.model_number,
+            model_number=servo.table.model_number,
             faults=head.faults,
             needs=needs,
         )

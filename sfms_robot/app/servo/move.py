@@ -84,9 +84,8 @@ def _startup(seen: FoundServo) -> Startup:
     """Return the startup of a servo that no head's file describes; it needs nothing beyond one turn."""
     table, wire = seen.registers(), seen.wire
     kind = Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
-    firmware_map = load_firmware_map(wire.model or table.model)
-    servo = BusServo(joint="servo", id=seen.id, map=firmware_map, min_rad=0.0, max_rad=0.0)
-    startup = kind(servo, table, JointNeeds(0, 0), {})
+    servo = BusServo(joint="servo", id=seen.id, table=table, min_rad=0.0, max_rad=0.0)
+    startup = kind(servo, JointNeeds(0, 0), {})
     wire.link.tries = TRIES
     startup.attach(wire.link)
     return startup

@@ -193,8 +193,8 @@ class Value:
             "unit": field.unit,
             "address": field.address,
             "size": field.size,
-            "access": "RW" if field.writable else "R",
-            "area": "EEPROM" if field.eeprom else "RAM",
+            "access": field.access,
+            "area": field.area,
             "min": field.low if field.writable else None,
             "max": field.high if field.writable else None,
         }

@@ -216,10 +216,10 @@ def _reading(head: Head, device: str, where: tuple[int, int]) -> Iterator[Host]:
     port = SerialPort(device, config.baud, RealClock())
     link = Dynamixel2Link(port, config.baud, DEADLINE_MS / 1e3)
     ids = _ids(head)
-    data = np.full(len(ids), 2048, "<i4").tobytes()
+    goals = dict.fromkeys(ids, (2048).to_bytes(_GOAL[1], "little"))
 
     def write() -> None:
-        link.sync_write_block(_GOAL[0], tuple(ids), _GOAL[1], data)
+        link.sync_write(_GOAL[0], goals)
 
     def tick() -> None:
         write()

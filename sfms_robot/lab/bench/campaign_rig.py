@@ -21,6 +21,7 @@ from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
 RATE_HZ: Final = 100.0
 LIMIT_DEG: Final = 40.0
@@ -231,7 +232,7 @@ def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: 
     [(name, config)] = head.buses.items()
     maps = firmware_maps(head.joints)
     servos = [
-        BusServo(joint=key, id=j.id, map=maps[j.model], min_rad=j.min_rad, max_rad=j.max_rad)
+        BusServo(joint=key, id=j.id, table=Table.of(maps[j.model]), min_rad=j.min_rad, max_rad=j.max_rad)
         for key, j in head.joints.items()
     ]
     open_port, family = port_of(chains[name], config, clock), family_named(config.family)

@@ -40,7 +40,7 @@ from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, ne
 from sfms_robot.servo.chain.telemetry import Telemetry
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
 
@@ -90,14 +90,13 @@ class ChainBus(WireBus[RegisterLink]):
         config = config or BusConfig(family="dynamixel2", baud=baud)
         self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
-        tables = [Table.of(servo.map) for servo in servos]
         self._ids = np.array([servo.id for servo in servos])
-        self._telemetry = Telemetry(name, *self.maps, tables, conversion)
+        self._telemetry = Telemetry(name, *self.maps, [servo.table for servo in servos], conversion)
         self._faults: dict[str, None] = {}  # reported so far, for the statistics
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._startups = [
-            self.startup(servo, table, needs, self._warnings, self._coming_back)
-            for servo, table, needs in zip(servos, tables, needs_of(servos, conversion), strict=True)
+            self.startup(servo, needs, self._warnings, self._coming_back)
+            for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)
         ]
         self._members = [Member(i, each, faults or Faults(), self._faults) for i, each in enumerate(self._startups)]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
@@ -115,9 +114,9 @@ class ChainBus(WireBus[RegisterLink]):
         self._sending = RLock()
         goal = self._telemetry.goal
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
-        simple = self.maps[1] == 2 and goal.sign in ("no", "twos_complement")
-        self._goal_type = np.dtype(f"<{'i' if goal.signed else 'u'}{goal.size}") if simple else None
-        self._streamed: tuple[NDArray[np.intp], tuple[int, ...]] = (self._places, ())  # places, and their ids
+        simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
+        kind = f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}"
+        self._goal_type = np.dtype([("id", np.uint8), ("goal", kind)]) if simple else None
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed
@@ -374,19 +373,21 @@ class ChainBus(WireBus[RegisterLink]):
     def _send(self, link: RegisterLink, places: NDArray[np.intp], ticks: NDArray[np.int64]) -> None:
         """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
         goal, now_s = self._telemetry.goal, link.port.now_s()
-        if places is not self._streamed[0]:
-            self._streamed = places, tuple(self._ids[places].tolist())
+        ids = self._ids[places]
         if now_s - self._wrote_s > _STALL * self._watchdog * _WATCHDOG_TICK_S:
             self._settings.look_for_trips()
         self._wrote_s = now_s
         if self._goal_type is not None:
-            data = ticks.astype(self._goal_type).tobytes()
+            rows = np.empty(len(ids), self._goal_type)
+            rows["id"], rows["goal"] = ids, ticks
+            data = rows.tobytes()
         else:
-            data = b"".join(map(goal.to_bytes, ticks.tolist()))
-        link.sync_write_block(goal.address, self._streamed[1], goal.size, data)
+            pairs = zip(ids.tolist(), ticks.tolist(), strict=True)
+            data = b"".join(bytes([servo]) + goal.to_bytes(tick) for servo, tick in pairs)
+        link.sync_write_rows(goal.address, goal.size, data)
         if self._watchdog and places is not self._fed:
             self._fed = places
-            self._settings.arm(self._streamed[1], self._watchdog)
+            self._settings.arm(ids.tolist(), self._watchdog)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
         """Return whether a rejoining member gets goals from now on."""

@@ -13,6 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import ClassVar, Final, NamedTuple, TypeVar
 
 from sfms_robot.config.wire_time import BITS, Framing
@@ -77,6 +78,7 @@ class RegisterLink(ABC):
         self.silence_s = silence_s
         self.tries = 1
         self.judged = True
+        self._sent = b""  # the last request
         self._byte_s = BITS / baud
         self._end_s = math.inf
         self._left_s = math.inf
@@ -105,14 +107,10 @@ class RegisterLink(ABC):
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
         """Write to one servo; return the acknowledgement. Without one the servo may still have taken the data."""
 
-    @abstractmethod
-    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
-        """Write `length` bytes to each of `servos`, `data` in their order, in one packet. Nothing answers."""
-
     @staticmethod
     @abstractmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        """Return the packet of `sync_write`, to be written from any thread."""
+    def sync_packet(address: int, length: int, rows: bytes) -> bytes:
+        """Return the packet of `sync_write_rows`."""
 
     @abstractmethod
     def refusal(self, answer: Answer) -> str:
@@ -126,17 +124,32 @@ class RegisterLink(ABC):
     def factory_reset(self, servo: int, option: int) -> Answer | None:
         """Reset everything (0xFF); Protocol 2.0 also all but the id (1), all but id and baud (2)."""
 
+    @classmethod
+    def sync_write_packet(cls, address: int, values: Mapping[int, bytes]) -> bytes:
+        """Return the packet of `sync_write`, to be written from any thread."""
+        length = len(next(iter(values.values())))
+        return cls.sync_packet(address, length, b"".join(bytes([servo]) + data for servo, data in values.items()))
+
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write to several servos in one packet; all values have one length. Nothing answers."""
-        length = len(next(iter(values.values())))
-        self.sync_write_block(address, tuple(values), length, b"".join(values.values()))
+        self._send(self.sync_write_packet(address, values))
+
+    def sync_write_rows(self, address: int, length: int, rows: bytes) -> None:
+        """Do as `sync_write`; `rows` are the id and the `length` bytes of each servo."""
+        self._send(self.sync_packet(address, length, rows))
+
+    def _send(self, packet: bytes) -> None:
+        """Send a packet; drop what came before it."""
+        self.port.discard_input()
+        self.port.write(packet)
+        self._sent = packet
 
     # --- time ---------------------------------------------------------------------------------------------------
 
     @contextmanager
     def patient(self, silence_s: float, tries: int = 1) -> Iterator[None]:
         """Wait at least `silence_s` for answers inside the block, and let a startup ask `tries` times."""
-        usual = self.silence_s, self.tries
+        usual = self.silence_s, self.tries  # also restored after an error
         self.silence_s, self.tries = max(self.silence_s, silence_s), tries
         try:
             yield
@@ -275,7 +288,7 @@ def verified_write(
     BusError if the port is gone.
     """
     name = about or f"id {servo_id}"
-    if lock is None or not field.eeprom:
+    if lock is None or not field.eeprom:  # RAM, or an EEPROM without a lock (Dynamixel 2.0)
         yield from _write(link, servo_id, field, value, tries, name)
         return
     yield from _write(link, servo_id, lock, 0, tries, name)
@@ -364,14 +377,10 @@ def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> Pin
         data += part
     if data.startswith(sent):  # an adapter that receives its own bytes
         del data[: len(sent)]
-    total, answers, known = len(data), 0, 0
+    total = len(data)
     if protocol == 2:
-        while (packet := dxl2.maybe_packet(data)) is not None:
-            if packet.instruction == dxl2.STATUS:
-                known += dxl2.STATUS_OVERHEAD + len(packet.params)
-                answers += packet.servo == servo
+        packets = [each for each in iter(partial(dxl2.maybe_packet, data), None) if each.instruction == dxl2.STATUS]
+        found = [(each.servo, dxl2.STATUS_OVERHEAD + len(each.params)) for each in packets]
     else:
-        for frame in protocol1.salvage(data):
-            known += protocol1.OVERHEAD + len(frame.params)
-            answers += frame.servo == servo
-    return PingReplies(answers, total - known)
+        found = [(frame.servo, protocol1.OVERHEAD + len(frame.params)) for frame in protocol1.salvage(data)]
+    return PingReplies(sum(each == servo for each, _ in found), total - sum(size for _, size in found))

@@ -288,14 +288,14 @@ class Member:
                 self._ignored.add(name)
                 log.info("%s reports %s, which this head's configuration allows", self.servo, name)
         new = set(names) - set(self._named)
-        if names or self.state not in _LIMP | {
-            MemberState.FAULTY
-        }:  # one that stays out keeps its reason, also a past one
+        # One that stays out keeps its reason, also a past one.
+        if names or self.state not in _LIMP | {MemberState.FAULTY}:
             self._named = names
         if new:
             self._report(", ".join(names))
             if self.state in POWERED:
-                self._act(self.servo.safety.on_fault, now_s, LIMP_S if self._eases_in else math.inf)
+                policy = self.servo.safety.on_fault
+                self._act(policy, now_s, LIMP_S if policy == "reboot_and_ease_in" else math.inf)
 
     def take_current(self, current_mA: float, now_s: float) -> None:
         """Compare a present current with the load rules."""
@@ -396,17 +396,12 @@ class Member:
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    @property
-    def _eases_in(self) -> bool:
-        return self.servo.safety.on_fault == "reboot_and_ease_in"
-
     def _act(self, policy: str, now_s: float, limp_s: float) -> None:
         if policy == "hold":
             self.state = MemberState.FAULTY
         elif policy == "reduce":
-            if (
-                self.state is not MemberState.FAULTY
-            ):  # one that holds got no goals: the next may be far from where it stands
+            # One that holds got no goals: the next may be far from where it stands.
+            if self.state is not MemberState.FAULTY:
                 self.state = MemberState.REDUCED
         elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)

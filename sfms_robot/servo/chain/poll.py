@@ -33,9 +33,8 @@ a second nevertheless (`grants`), and the poll is that much longer.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Final
 
 from sfms_robot.config import BusConfig
@@ -162,8 +161,9 @@ class StatusPoll:
             return self._framing.reads(servos, length, way) * byte_s + TURN_S
 
         self._blocks = count
-        if telemetry.error is not None:  # the other families are always asked for the block
-            self._blocks = blocks_per_tick(count, spare_s, read_s(count, position), partial(read_s, length=block))
+        if telemetry.error is not None and read_s(count, block) > spare_s:  # others are always asked for the block
+            left_s = spare_s - read_s(count, position)
+            self._blocks = max((few for few in range(2, count + 1) if read_s(few, block) <= left_s), default=1)
         single_s = self._framing.reads(1, block, "one by one") * byte_s + _TURNAROUND_S
         self._many = max(1, int(_IN_TURN_SHARE / config.rate_hz / single_s))
         first_s = read_s(count if self._grouped else 1, position if self._blocks < count else block)
@@ -442,18 +442,6 @@ class StatusPoll:
                 if telemetry.error is not None:
                     member.take_bits(bits, telemetry.measured(member.index), now_s)
                 member.take_torque(torque, now_s)
-
-
-def blocks_per_tick(servos: int, spare_s: float, positions_s: float, blocks_s: Callable[[int], float]) -> int:
-    """Return how many servos' blocks fit in `spare_s` besides all positions; all if one read does for both.
-
-    Args:
-        positions_s: time of reading all positions.
-        blocks_s: returns the time of reading so many blocks.
-    """
-    if blocks_s(servos) <= spare_s:
-        return servos
-    return max((count for count in range(2, servos + 1) if positions_s + blocks_s(count) <= spare_s), default=1)
 
 
 class Rotation:

@@ -1,6 +1,7 @@
 """Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
 
-The vendor's SDK builds the Dynamixel packets (`sdk_packets`), our codec those of Feetech, which has other instructions.
+The vendor's SDK builds requests to Dynamixel servos (`sdk_packets`); our codec builds sync writes, and all of Feetech,
+which has other instructions.
 
 The frame does not say what an answer answers, so a late answer could pass for the next one. Three rules prevent that:
 an answer counts only from an id that was asked and with the number of bytes that was asked for; what came before a
@@ -22,7 +23,7 @@ from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import PacketError, ServoError
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
-from sfms_robot.servo.chain.sdk_packets import SdkPackets1
+from sfms_robot.servo.chain.sdk_packets import instruction1
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, Frame, encode, maybe_frame, salvage
@@ -44,13 +45,13 @@ class Protocol1Link(RegisterLink):
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
-        self._sent = b""
         self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
         self._echoed = False
 
-    @abstractmethod
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
+    @staticmethod
+    def _packet(servo: int, code: int, params: bytes) -> bytes:
         """Return a request."""
+        return encode(servo, code, params)
 
     @abstractmethod
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
@@ -101,18 +102,12 @@ class Protocol1Link(RegisterLink):
     def _ask(self, servo: int, code: int, params: bytes, length: int) -> Answer | None:
         if self._owes(servo, length) and not self._fence(servo):
             return None
-        self._send(servo, code, params)
+        self._send(self._packet(servo, code, params))
         return self._answers([servo], length).get(servo)
 
     # --- several servos -----------------------------------------------------------------------------------------
 
-    @staticmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        return encode(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
-
-    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
-        values = {servo: data[i * length : (i + 1) * length] for i, servo in enumerate(servos)}
-        self._send(BROADCAST, protocol1.SYNC_WRITE, protocol1.sync_write_params(address, values))
+    sync_packet = staticmethod(protocol1.encode_sync_write)
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         late = [servo for servo in servos if self._owes(servo, length)]
@@ -132,7 +127,7 @@ class Protocol1Link(RegisterLink):
         if not asked:
             self.judged = judged  # by one of them: the last may have had no time left
             return {}
-        self._send(BROADCAST, *self._group_request(address, length, asked))
+        self._send(self._packet(BROADCAST, *self._group_request(address, length, asked)))
         return self._answers(asked, length)
 
     # --- the wire -----------------------------------------------------------------------------------------------
@@ -149,16 +144,9 @@ class Protocol1Link(RegisterLink):
     def _fence(self, servo: int) -> bool:
         """Ask for data of a length that no owed answer has; return whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
-        if size == 0:
-            self._send(servo, protocol1.PING, b"")
-        else:
-            self._send(servo, protocol1.READ, bytes([0, size]))
+        request = (protocol1.READ, bytes([0, size])) if size else (protocol1.PING, b"")
+        self._send(self._packet(servo, *request))
         return servo in self._answers([servo], size)
-
-    def _send(self, servo: int, code: int, params: bytes) -> None:
-        self.port.discard_input()
-        self._sent = self._packet(servo, code, params)
-        self.port.write(self._sent)
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
         """Return answers of `servos` with `length` bytes of data, or with a refusal and none.
@@ -202,12 +190,9 @@ class Dynamixel1Link(Protocol1Link):
     who_length = 3
     refusal_bits = protocol1.REFUSAL_BITS
 
-    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
-        super().__init__(port, baud, silence_s)
-        self._sdk = SdkPackets1()
-
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
-        return self._sdk.instruction(servo, code, params)
+    @staticmethod
+    def _packet(servo: int, code: int, params: bytes) -> bytes:
+        return instruction1(servo, code, params)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.BULK_READ, protocol1.bulk_read_params((servo, address, length) for servo in servos)
@@ -232,9 +217,6 @@ class FeetechLink(Protocol1Link):
     framing = FRAMINGS["feetech"]
     who_length = 5
 
-    def _packet(self, servo: int, code: int, params: bytes) -> bytes:
-        return encode(servo, code, params)
-
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)
 
@@ -243,7 +225,7 @@ class FeetechLink(Protocol1Link):
 
     def broadcast_ping(self) -> dict[int, Found]:
         ids = range(protocol1.MAX_ID + 1)
-        self._send(BROADCAST, protocol1.PING, b"")
+        self._send(encode(BROADCAST, protocol1.PING))
         with self.patient(_STAGGER_S * len(ids)):
             there = sorted(self._answers(ids, 0))
         self._owed.clear()  # no servo owes an answer to a broadcast

@@ -1,7 +1,6 @@
 """Dynamixel servos of Protocol 2.0: requests and answers over a port, their startup, and their bus.
 
-The vendor's SDK builds what is sent on every tick (`sdk_packets`). A request that is sent again is not built again:
-reads are sent unchanged, and of a sync write only data and crc are new. Single writes are built by our own codec,
+The vendor's SDK builds reads (`sdk_packets`), each once: they are sent again unchanged. Our own codec builds writes,
 because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
 
 Answers are found in the byte stream by id and length, so that a late or foreign reply is never taken for another one.
@@ -10,17 +9,15 @@ Answers are found in the byte stream by id and length, so that a late or foreign
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, cast
-
-import numpy as np
+from collections.abc import Mapping, Sequence
+from typing import Final, cast
 
 from sfms_robot.config import variant
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
-from sfms_robot.servo.chain.sdk_packets import SdkPackets2
+from sfms_robot.servo.chain.sdk_packets import read2, sync_read2
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import STATUS, maybe_packet
@@ -30,12 +27,9 @@ from sfms_robot.servo.stored_settings import contradictions
 
 log = logging.getLogger(__name__)
 
-_KEPT: Final = 512  # requests
 _PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
 _LENGTHS: Final = 4  # of a read of several servos, one byte apart
 _HEADER: Final = b"\xff\xff\xfd"
-_BODY: Final = 7  # index of the instruction in a packet
-_SYNC_DATA: Final = 12  # index of the first id in a sync write
 _LONGEST_FAST: Final = dxl2.MAX_PACKET + 4096  # bytes after which a fast answer is given up
 
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
@@ -50,14 +44,12 @@ class Dynamixel2Link(RegisterLink):
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
-        self._sdk = SdkPackets2()
-        self._built: dict[tuple[object, ...], Any] = {}
-        self._sent = 0
         self._extra = 0  # bytes that reads of several servos ask for besides what is wanted
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
     def ping(self, servo: int) -> Found | None:
+        # The status of a ping holds 3 bytes: model number (2), firmware (1).
         self._send(dxl2.encode_instruction(servo, dxl2.PING))
         return _found(self._answers([servo], 3)).get(servo)
 
@@ -78,7 +70,7 @@ class Dynamixel2Link(RegisterLink):
         return self._instruct(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22")
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
-        self._send(self._once((servo, address, length), self._sdk.read, servo, address, length))
+        self._send(read2(servo, address, length))
         return self._answers([servo], length).get(servo)
 
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
@@ -86,9 +78,10 @@ class Dynamixel2Link(RegisterLink):
 
     def refusal(self, answer: Answer) -> str:
         """Return the error number in bits 0..6 in words; bit 7 only says that register 70 is worth a look."""
-        if not answer.error & ~dxl2.ALERT:
+        if not (number := answer.error & ~dxl2.ALERT):
             return ""
-        return dxl2.error_text(answer.error) + (", and reports a hardware error" if answer.error & dxl2.ALERT else "")
+        text = dxl2.ERRORS.get(number, f"error {number}")
+        return text + ", and reports a hardware error" * bool(answer.error & dxl2.ALERT)
 
     def _instruct(self, servo: int, instruction: int, params: bytes = b"") -> Answer | None:
         self._send(dxl2.encode_instruction(servo, instruction, params))
@@ -96,22 +89,11 @@ class Dynamixel2Link(RegisterLink):
 
     # --- many servos --------------------------------------------------------------------------------------------
 
-    @staticmethod
-    def sync_write_packet(address: int, values: Mapping[int, bytes]) -> bytes:
-        length = len(next(iter(values.values())))
-        params = address.to_bytes(2, "little") + length.to_bytes(2, "little")
-        params += b"".join(bytes([servo]) + data for servo, data in values.items())
-        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, params)
-
-    def sync_write_block(self, address: int, servos: tuple[int, ...], length: int, data: bytes) -> None:
-        key = address, length, servos
-        write: _SyncWrite = self._once(key, _SyncWrite, self._sdk, address, length, servos)
-        self._send(write.packet(data))
+    sync_packet = staticmethod(dxl2.encode_sync_write)
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         longer = length + self._extra
-        key = address, longer, fast, *servos
-        self._send(self._once(key, self._sdk.sync_read, address, longer, servos, fast))
+        self._send(sync_read2(address, longer, tuple(servos), fast))
         answers = self._fast_answers(servos, longer) if fast else self._answers(servos, longer)
         if self._extra:
             answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
@@ -123,20 +105,6 @@ class Dynamixel2Link(RegisterLink):
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _once(self, key: tuple[object, ...], build: Callable[..., Any], *arguments: object) -> Any:
-        """Return what `build` made of these arguments before, or makes now; `key` stands for them."""
-        built = self._built.get(key)
-        if built is None:
-            if len(self._built) >= _KEPT:
-                self._built.clear()
-            built = self._built[key] = build(*arguments)
-        return built
-
-    def _send(self, packet: bytes) -> None:
-        self.port.discard_input()
-        self.port.write(packet)
-        self._sent = len(packet)
-
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
         """Return status packets of `servos` with `length` bytes of data, or with an error and none.
 
@@ -144,7 +112,7 @@ class Dynamixel2Link(RegisterLink):
         """
         buffer, answers, pending = bytearray(), dict[int, Answer](), set(servos)
         size = self.framing.answer + length
-        for data in self._incoming(self._sent + size, (len(servos) - 1) * size):
+        for data in self._incoming(len(self._sent) + size, (len(servos) - 1) * size):
             buffer += data
             while (packet := maybe_packet(buffer)) is not None:
                 servo, instruction, params, error = packet
@@ -160,31 +128,14 @@ class Dynamixel2Link(RegisterLink):
         """Return the answers in one packet of all: FF FF FD 00 FE ... ERROR ID data CRC, ERROR ID data CRC, ..."""
         size = self.framing.answers(len(servos), length, fast=True)
         buffer, start = bytearray(), -1
-        for data in self._incoming(self._sent + size):
+        for data in self._incoming(len(self._sent) + size):
             buffer += data
-            if start < 0:
+            if start < 0:  # noise may come before the header; FE is the id of the one packet of all
                 start = buffer.find(_HEADER + b"\x00\xfe")
             if len(buffer) >= max(start, 0) + size or len(buffer) > _LONGEST_FAST:
                 break
         found = dxl2.split_fast_status(buffer[max(start, 0) :], length)
         return {servo: Answer(error, data) for servo, error, data in found if servo in servos}
-
-
-class _SyncWrite:
-    """A sync write as the SDK built it, with data and crc to be filled in."""
-
-    def __init__(self, sdk: SdkPackets2, address: int, length: int, servos: Sequence[int]) -> None:
-        self._packet = np.frombuffer(sdk.sync_write(address, length, servos), np.uint8).copy()
-        self._data = self._packet[_SYNC_DATA:-2].reshape(-1, length + 1)[:, 1:]  # behind each id
-
-    def packet(self, data: bytes) -> bytes:
-        """Return the packet with the values `data`, one behind the other."""
-        self._data[:] = np.frombuffer(data, np.uint8).reshape(self._data.shape)
-        body = self._packet[:-2].tobytes()
-        if body.find(_HEADER, _BODY) < 0:
-            return body + dxl2.crc16(body).to_bytes(2, "little")
-        # Data that look like a header have to be stuffed: the SDK's own stuffing (4.1.0) works on a copy it drops.
-        return dxl2.encode_instruction(dxl2.BROADCAST, dxl2.SYNC_WRITE, body[_BODY + 1 :])
 
 
 def _found(answers: Mapping[int, Answer]) -> dict[int, Found]:
@@ -199,7 +150,7 @@ def _found(answers: Mapping[int, Answer]) -> dict[int, Found]:
 class Dynamixel2Startup(Startup):
     """Startup of servos that report their firmware, which decides the addresses of their registers."""
 
-    can_reboot = True
+    can_reboot = True  # instruction 08
     unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
 
     def recognise(self, found: Found) -> None:
@@ -208,7 +159,7 @@ class Dynamixel2Startup(Startup):
         low, high = self.table.firmware
         if found.firmware is not None and not low <= found.firmware <= high:
             try:
-                self.table = Table.of(variant(self.servo.map.model, found.firmware))
+                self.table = Table.of(variant(self.servo.table.model, found.firmware))
             except ConfigError as error:
                 raise self._error(f"has firmware {found.firmware}: {error}") from error
 

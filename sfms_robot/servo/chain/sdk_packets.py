@@ -1,24 +1,30 @@
 """Packets as the vendor's SDK (dynamixel_sdk) builds them. The only file of the servo layer that imports it.
 
 The SDK builds a packet while it sends it, so it is given a port that keeps the bytes. It is not used for answers: it
-would wait at least 34 ms for each, spin meanwhile and stop at the first failure.
+would wait at least 34 ms for each, spin meanwhile and stop at the first failure. All functions raise PacketError for
+packets that the SDK refuses to send.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, Final
 
 from dynamixel_sdk import COMM_SUCCESS, Protocol1PacketHandler, Protocol2PacketHandler
 
 from sfms_robot.errors import PacketError
 
+_SDK1: Final = Protocol1PacketHandler()
+_SDK2: Final = Protocol2PacketHandler()
+_KEPT: Final = 512  # requests, which are sent again unchanged
+
 
 class _Draft:
     """A port, as the SDK's packet builders use one, that keeps what they send."""
 
-    def __init__(self) -> None:
-        self.is_using = False
-        self.packet = b""
+    is_using = False
+    packet = b""
 
     def clearPort(self) -> None:
         """Do nothing; sending discards input."""
@@ -31,42 +37,25 @@ class _Draft:
         """Do nothing; the SDK calls it after each request, and links have their own deadlines."""
 
 
-class SdkPackets1:
-    """Packets of Protocol 1.0. Raises PacketError for what the SDK refuses to send."""
-
-    def __init__(self) -> None:
-        self._sdk = Protocol1PacketHandler()
-
-    def instruction(self, servo: int, code: int, params: bytes) -> bytes:
-        """Return a request to one servo, or to all."""
-        draft = _Draft()
-        result = self._sdk.txPacket(draft, [0, 0, servo, len(params) + 2, code, *params, 0])
-        return _built(self._sdk, draft, result)
+def instruction1(servo: int, code: int, params: bytes) -> bytes:
+    """Return a request of Protocol 1.0 to one servo, or to all."""
+    return _built(_SDK1.txPacket, [0, 0, servo, len(params) + 2, code, *params, 0])
 
 
-class SdkPackets2:
-    """Packets of Protocol 2.0. Raises PacketError for what the SDK refuses to send."""
-
-    def __init__(self) -> None:
-        self._sdk = Protocol2PacketHandler()
-
-    def read(self, servo: int, address: int, length: int) -> bytes:
-        """Return a read of one servo."""
-        draft = _Draft()
-        return _built(self._sdk, draft, self._sdk.readTx(draft, servo, address, length))
-
-    def sync_read(self, address: int, length: int, servos: Sequence[int], fast: bool) -> bytes:
-        """Return a read of several servos."""
-        draft = _Draft()
-        return _built(self._sdk, draft, self._sdk.syncReadTx(draft, address, length, servos, len(servos), fast))
-
-    def sync_write(self, address: int, length: int, servos: Sequence[int]) -> bytes:
-        """Return a write to several servos, with zeros for the data of each."""
-        draft, blank = _Draft(), [byte for servo in servos for byte in (servo, *[0] * length)]
-        return _built(self._sdk, draft, self._sdk.syncWriteTxOnly(draft, address, length, blank, len(blank)))
+@lru_cache(_KEPT)
+def read2(servo: int, address: int, length: int) -> bytes:
+    """Return a read of one servo of Protocol 2.0."""
+    return _built(_SDK2.readTx, servo, address, length)
 
 
-def _built(sdk: Protocol1PacketHandler | Protocol2PacketHandler, draft: _Draft, result: int) -> bytes:
-    if result != COMM_SUCCESS:
-        raise PacketError(f"the request cannot be built: {sdk.getTxRxResult(result)}")
+@lru_cache(_KEPT)
+def sync_read2(address: int, length: int, servos: tuple[int, ...], fast: bool) -> bytes:
+    """Return a read of several servos of Protocol 2.0."""
+    return _built(_SDK2.syncReadTx, address, length, servos, len(servos), fast)
+
+
+def _built(send: Callable[..., int], *arguments: Any) -> bytes:
+    draft = _Draft()
+    if (result := send(draft, *arguments)) != COMM_SUCCESS:
+        raise PacketError(f"the request cannot be built: {_SDK2.getTxRxResult(result)}")
     return draft.packet

@@ -12,6 +12,7 @@ and at most one request in a poll. A register that differs is a named fault.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Final
 
 from sfms_robot.servo.chain.link import RegisterLink
@@ -43,7 +44,7 @@ class Settings:
         self._read_first: set[tuple[int, str]] = set()  # of them, those that are not written before they are read
         self._changed: dict[int, dict[str, int]] = {}  # values other than those of startup
         self._differing: dict[int, dict[str, tuple[int, int]]] = {}  # (seen, wanted) by name
-        self._round: list[tuple[Block, list[int]]] = []  # reads still to be made in this round, and of which servos
+        self._round: list[tuple[Block, int]] = []  # reads of one servo each, still to be made in this round
         self._part_s = _ROUND_S  # of a round that one servo's block takes
         self._due_s = 0.0
 
@@ -130,9 +131,9 @@ class Settings:
         """Halve the force that startup gave a servo: one value, however often this is called."""
         fields = member.startup.table.fields
         bounded = member.servo.safety.current_limit_mA is not None and "goal_current" in fields
-        name = "goal_current" if bounded else torque_register(member.servo.map)
-        if name is not None and name in fields and name not in self._changed.get(member.id, ()):
-            self._change(member.id, name, self.wanted(member.id).get(name, fields[name].high) // 2)
+        field = fields["goal_current"] if bounded else torque_register(member.startup.table)
+        if field is not None and field.name not in self._changed.get(member.id, ()):
+            self._change(member.id, field.name, self.wanted(member.id).get(field.name, field.high) // 2)
 
     def _change(self, servo: int, name: str, value: int) -> None:
         """Give a register another value than startup did, from now on."""
@@ -146,29 +147,32 @@ class Settings:
         if now_s < self._due_s:
             return
         if not self._round:
-            self._begin_round()
+            blocks = [(where, servo) for servo in self._members for where in self._compared_blocks(servo)]
+            self._round = sorted(blocks, key=itemgetter(0))
+            self._part_s = _ROUND_S / max(1, len(blocks))
         if not self._round:
             return
-        where, servos = self._round[0]
-        count = poll.fitting(link, "settings", where[1], min(_TOGETHER, len(servos)))
-        asked, self._round[0] = servos[:count], (where, servos[count:])
-        self._due_s = now_s + self._part_s * count
-        if count == len(servos):
-            del self._round[0]
+        where = self._round[0][0]
+        servos = [servo for block, servo in self._round[:_TOGETHER] if block == where]
+        asked = servos[: poll.fitting(link, "settings", where[1], len(servos))]
+        del self._round[: len(asked)]
+        self._due_s = now_s + self._part_s * len(asked)
         there = [servo for servo in asked if _compared(self._members[servo])]
         for servo, answer in poll.read_some(link, "settings", where, there).items():
             if len(answer.data) == where[1]:
                 self._judge(servo, where[0], answer.data)
 
-    def _begin_round(self) -> None:
-        blocks: dict[Block, list[int]] = {}
-        for servo, member in self._members.items():
-            if _compared(member):
-                fields = member.startup.table.fields
-                for where in _blocks(fields[name] for name in self.wanted(servo) if name in fields):
-                    blocks.setdefault(where, []).append(servo)
-        self._round = list(blocks.items())
-        self._part_s = _ROUND_S / max(1, sum(map(len, blocks.values())))
+    def _compared_blocks(self, servo: int) -> list[Block]:
+        """Return the blocks in which the registers of a servo are read: those close enough together are one."""
+        groups: list[list[Field]] = []
+        fields = self._members[servo].startup.table.fields
+        names = self.wanted(servo) if _compared(self._members[servo]) else ()
+        for field in sorted((fields[name] for name in names if name in fields), key=lambda each: each.address):
+            if groups and field.address + field.size - groups[-1][0].address <= _BLOCK:
+                groups[-1].append(field)
+            else:
+                groups.append([field])
+        return [span_of(group) for group in groups]
 
     def _judge(self, servo: int, start: int, data: bytes) -> None:
         """Compare the registers of a member; one that was changed while the bus runs is written once more."""
@@ -189,14 +193,3 @@ class Settings:
 
 def _compared(member: Member) -> bool:
     return member.gets_goals and member.listed
-
-
-def _blocks(fields: Iterable[Field]) -> list[Block]:
-    """Return the blocks in which to read registers of one servo: those close enough together are read at once."""
-    groups: list[list[Field]] = []
-    for field in sorted(fields, key=lambda each: each.address):
-        if groups and field.address + field.size - groups[-1][0].address <= _BLOCK:
-            groups[-1].append(field)
-        else:
-            groups.append([field])
-    return [span_of(group) for group in groups]

@@ -34,10 +34,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import ClassVar, Final, NamedTuple
 
-import numpy as np
-
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.ports import TickConversion
+from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Steps, finish, verified_write
 from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Field, Table, span_of
@@ -83,6 +82,7 @@ def way_inside(present: int, limits: tuple[int, int], turn_ticks: float) -> WayI
     """
     low, high = limits
     outside = max(low - present, present - high)
+    # The other way round is as long as what the turn has left beside the limits and this gap.
     if 2 * outside > turn_ticks - (high - low):
         return None
     margin = min(round(INSIDE_DEG / 360.0 * turn_ticks), (high - low) // 2)
@@ -105,6 +105,7 @@ def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Mapping[
         return profile if acceleration is None else {acceleration.name: round(1e3 * _RAMP_S / 2.0), **profile}
     profile = {speed.name: max(1, int(SPEED_DEG_S / (speed.scale * _DEG_S[speed.unit])))}
     if acceleration is not None:
+        # Reach the speed in `_RAMP_S`, in units of the register.
         raw = SPEED_DEG_S / _RAMP_S / (acceleration.scale * _DEG_S2[acceleration.unit])
         profile[acceleration.name] = max(1, int(raw))
     return profile
@@ -114,8 +115,7 @@ class Startup(ABC):
     """Requests that start up one servo. The link is set by `attach`.
 
     Args:
-        servo: its joint, id, limits and safety.
-        table: of its model.
+        servo: its joint, id, control table, limits and safety.
         needs: of its joint.
         warnings: joints by what their servos store that only weakens protection; filled here.
         others: returns the startups of known servos that are being started up too.
@@ -133,13 +133,12 @@ class Startup(ABC):
     def __init__(
         self,
         servo: BusServo,
-        table: Table,
         needs: JointNeeds,
         warnings: dict[str, list[str]],
         others: Callable[[], list[Startup]] = list,
     ) -> None:
         self.servo = servo
-        self.table = table
+        self.table = servo.table
         self._needs = needs
         self._warnings = warnings
         self._others = others
@@ -453,15 +452,14 @@ def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: in
 
 def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[JointNeeds]:
     """Return what each joint of a bus requires of its servo."""
-    ends = [conversion.to_ticks(np.array([getattr(servo, end) for servo in servos])) for end in ("min_rad", "max_rad")]
     ids = frozenset(servo.id for servo in servos)
     return [
         JointNeeds(
-            int(min(a, b)),
-            int(max(a, b)),
+            low,
+            high,
             stored=servo.safety.stored,
             other_ids=ids - {servo.id},
             bounded_current=servo.safety.current_limit_mA is not None,
         )
-        for servo, a, b in zip(servos, *ends, strict=True)
+        for servo, low, high in zip(servos, *tick_ranges(servos, conversion).tolist(), strict=True)
     ]

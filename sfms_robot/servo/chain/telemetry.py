@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Reading
+from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.registers import Field, Table, span_of
 
 Block = tuple[int, int]  # address, length
 
 _NEEDED: Final = ("present_position", "goal_position", "torque_enable")
-_ROLES: Final = {"velocity": "present_speed", "voltage": "voltage", "temperature": "temperature"}
 _REACH: Final = 8  # bytes by which a block grows for the present current: fewer than a request for it takes
 _EXTRA: Final = ("current_mA", "load_percent", "velocity_rad_s", "voltage_V", "temperature_C")
 _CURRENT, _PERCENT, _VELOCITY, _VOLTAGE, _TEMPERATURE = range(5)  # rows of `Telemetry.extra`
+_CAPABILITIES: Final = {_CURRENT: "current", _VELOCITY: "velocity", _VOLTAGE: "voltage", _TEMPERATURE: "temperature"}
 
 
 class Telemetry:
@@ -58,53 +58,47 @@ class Telemetry:
                 raise ConfigError(
                     f"bus {bus!r}: {table.model} does not speak {family} protocol {protocol} and cannot be on it"
                 )
-        present, self.goal, self.torque = (_needed(bus, tables, role) for role in _NEEDED)
+        needed = []
+        for role in _NEEDED:
+            if (field := common(bus, tables, role)) is None:
+                raise ConfigError(f"bus {bus!r}: {tables[0].model} has no register for {role}, which every tick needs")
+            needed.append(field)
+        present, self.goal, self.torque = needed
         self.error = common(bus, tables, "error_status") if protocol == 2 else None
         common(bus, tables, "bus_watchdog")
+        # Angles are affine in ticks, so two conversions give the angle of one tick.
+        zero, one = (conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
         loads = [_load(table) for table in tables]
-        shared = {"load": _shared(loads)}
-        shared |= {key: _shared([table.role(role) for table in tables]) for key, role in _ROLES.items()}
-        self._fields = {"position": present} | {key: field for key, field in shared.items() if field is not None}
+        speeds, voltages, temperatures = (
+            [table.role(role) for table in tables] for role in ("present_speed", "voltage", "temperature")
+        )
+        sources = {  # row of `extra` -> register of each servo, and what its raw value is multiplied with
+            _CURRENT: (loads, _scales(loads, "mA")),
+            _PERCENT: (loads, _scales(loads, "percent")),
+            _VELOCITY: (speeds, (one - zero) * np.array([_ticks_s(table) for table in tables])),
+            _VOLTAGE: (voltages, _scales(voltages)),
+            _TEMPERATURE: (temperatures, _scales(temperatures)),
+        }
+        shared = {row: field for row, (fields, _) in sources.items() if (field := _shared(fields)) is not None}
+        self._present = present, _raw_type(present)
         self.position: Block = (present.address, present.size)
-        self.block = span_of([*self._fields.values()])
-        self.currents = [_apart(table, shared["load"]) for table in tables]
+        self.block = span_of([present, *shared.values()])
+        self.currents = [_apart(table, shared.get(_CURRENT)) for table in tables]
+        if self.currents.count(None) < len(tables):
+            shared.pop(_CURRENT, None)  # read servo by servo
         if (current := _shared(self.currents)) is not None:
-            wider = span_of([*self._fields.values(), current])
+            wider = span_of([present, *shared.values(), current])
             if wider[1] - self.block[1] <= _REACH:
-                self._fields["current"], self.block = current, wider
+                shared[_CURRENT], self.block = current, wider
+                sources[_CURRENT] = self.currents, _scales(self.currents)
                 self.currents = [None] * len(tables)
+        columns = [(field, _raw_type(field), row, sources[row][1]) for row, field in shared.items()]
+        self._columns = [column for column in columns if np.isfinite(column[3]).any()]
         self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
-        self._layouts = {where: self._layout(where) for where in (self.position, self.block)}
         self._conversion = conversion
-        self._columns = self._columns_of(tables, loads)
         self.ticks: NDArray[np.int64] = np.zeros(len(tables), np.int64)
         self.seen_s = np.full(len(tables), -np.inf)
         self.extra = np.full((len(_EXTRA), len(tables)), np.nan)
-
-    def _columns_of(
-        self, tables: Sequence[Table], loads: Sequence[Field | None]
-    ) -> list[tuple[str, int, NDArray[np.float64]]]:
-        """Return what the registers of the block give: (register, row of `extra`, (J,) unit of a raw value)."""
-
-        def units(unit: str) -> NDArray[np.float64]:
-            return np.array([load.scale if load is not None and load.unit == unit else math.nan for load in loads])
-
-        zero, one = (self._conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
-        columns = {
-            _VELOCITY: ("velocity", (one - zero) * np.array([_ticks_s(table) for table in tables])),
-            _CURRENT: ("load", units("mA")),
-            _PERCENT: ("load", units("percent")),
-        }
-        plain = {_VOLTAGE: "voltage", _TEMPERATURE: "temperature"}
-        if "current" in self._fields:
-            plain[_CURRENT] = "current"
-        elif self.currents.count(None) < len(tables):
-            del columns[_CURRENT]  # read servo by servo
-        for row, key in plain.items():
-            if key in self._fields:
-                columns[row] = key, np.full(len(tables), self._fields[key].scale)
-        known = [(key, row, unit) for row, (key, unit) in columns.items() if key in self._fields]
-        return [column for column in known if np.isfinite(column[2]).any()]
 
     def forget(self) -> None:
         """Forget all reports: another connection."""
@@ -113,20 +107,22 @@ class Telemetry:
 
     def capabilities(self, index: int) -> frozenset[str]:
         """Return what a servo reports or does, as `ports.Bus`."""
-        known = {"position", "torque"} | (set(self._fields) & {*_ROLES, "current"})
-        in_block = any(row == _CURRENT and math.isfinite(unit[index]) for _, row, unit in self._columns)
-        current = in_block or self.currents[index] is not None
-        return frozenset(known | ({"current"} if current else set()))
+        known = {
+            name
+            for _, _, row, scales in self._columns
+            if (name := _CAPABILITIES.get(row)) is not None and math.isfinite(scales[index])
+        }
+        return frozenset({"position", "torque", *known} | ({"current"} if self.currents[index] is not None else set()))
 
     def take(self, where: Block, indices: Sequence[int], data: Sequence[bytes], now_s: float) -> None:
         """Decode answers to a read of `where`, `position` or `block`; `data` hold its whole length."""
-        rows = np.frombuffer(b"".join(data), self._layouts[where])
+        rows = b"".join(data)
         at = np.asarray(indices, np.intp)
-        self.ticks[at] = _signed(self._fields["position"], rows["position"])
+        self.ticks[at] = _values(*self._present, rows, where)
         self.seen_s[at] = now_s
-        if where == self.block:
-            for key, row, unit in self._columns:
-                self.extra[row][at] = _signed(self._fields[key], rows[key]) * unit[at]
+        if where == self.block:  # the position alone brings nothing else
+            for field, raw_type, row, scales in self._columns:
+                self.extra[row][at] = _values(field, raw_type, rows, where) * scales[at]
 
     def take_current(self, index: int, field: Field, data: bytes) -> None:
         """Decode an answer to a read of `currents[index]`."""
@@ -168,22 +164,6 @@ class Telemetry:
             out[joint] = Reading(angles[index], ages[index], faults[index], known, index in rejoined)
         return out
 
-    def _layout(self, where: Block) -> np.dtype[np.void]:
-        address, length = where
-        inside = {
-            key: field
-            for key, field in self._fields.items()
-            if address <= field.address and field.address + field.size <= address + length
-        }
-        return np.dtype(
-            {
-                "names": list(inside),
-                "formats": [_format(field) for field in inside.values()],
-                "offsets": [field.address - address for field in inside.values()],
-                "itemsize": length,
-            }
-        )
-
 
 def common(bus: str, tables: Sequence[Table], role: str) -> Field | None:
     """Return the register of a role, the same for all servos of a bus, since one request has one address.
@@ -200,18 +180,10 @@ def common(bus: str, tables: Sequence[Table], role: str) -> Field | None:
     return first
 
 
-def _needed(bus: str, tables: Sequence[Table], role: str) -> Field:
-    field = common(bus, tables, role)
-    if field is None:
-        raise ConfigError(f"bus {bus!r}: {tables[0].model} has no register for {role}, which every tick needs")
-    return field
-
-
 def _alike(field: Field | None, other: Field | None) -> bool:
     """Return whether two registers have the same address and form."""
-    return (field and (field[1:4], field.sign, field.byte_order)) == (
-        other and (other[1:4], other.sign, other.byte_order)
-    )
+    first, second = (each and (each.address, each.size, each.signed, each.byte_order) for each in (field, other))
+    return first == second
 
 
 def _shared(fields: Sequence[Field | None]) -> Field | None:
@@ -230,17 +202,25 @@ def _apart(table: Table, load: Field | None) -> Field | None:
     return current if apart and current != load else None
 
 
-def _format(field: Field) -> str:
-    order = ">" if field.byte_order == "big" else "<"
-    return f"{order}{'i' if field.sign == 'twos_complement' else 'u'}{field.size}"
+def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:
+    """Return the scale of each register; NaN for one that is missing, or has another unit."""
+    return np.array([field.scale if field and unit in (None, field.unit) else math.nan for field in fields])
 
 
-def _signed(field: Field, raw: NDArray[Any]) -> NDArray[Any]:
-    """Return the values of raw registers, as `Field.from_bytes` does for one."""
-    if field.sign == "offset_2048":
+def _raw_type(field: Field) -> np.dtype[Any]:
+    kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.signed == "twos_complement"]
+    return np.dtype(f"{kind}{field.size}")
+
+
+def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) -> NDArray[Any]:
+    """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` of one."""
+    start, length = where
+    raw: NDArray[Any] = np.ndarray(len(rows) // length, raw_type, rows, field.address - start, strides=(length,))
+    if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)
         return np.asarray(raw.astype(np.int64) - 2048)
-    if field.sign.startswith("sign_bit_"):
-        wide, bit = raw.astype(np.int64), 1 << int(field.sign[9:])
+    if field.signed.startswith("sign_bit_"):
+        # A bit above the magnitude is the sign (AX speed and load, Feetech).
+        wide, bit = raw.astype(np.int64), 1 << int(field.signed[9:])
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)
     return raw

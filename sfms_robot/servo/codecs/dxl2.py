@@ -37,18 +37,18 @@ from sfms_robot.errors import PacketError
 
 # Instructions, e-manual "Instruction"; 55 marks what a servo sends.
 PING: Final = 0x01
-READ: Final = 0x02
-WRITE: Final = 0x03
+READ: Final = 0x02  # address (2), length (2)
+WRITE: Final = 0x03  # address (2), data
 REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05
+ACTION: Final = 0x05  # carries out what REG_WRITE has left
 FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
 CLEAR: Final = 0x10  # with the key 44 58 4C 22
 STATUS: Final = 0x55
-SYNC_READ: Final = 0x82
-SYNC_WRITE: Final = 0x83
+SYNC_READ: Final = 0x82  # one block of several ids; each sends its own status
+SYNC_WRITE: Final = 0x83  # one address, other data for each id
 FAST_SYNC_READ: Final = 0x8A  # from a firmware on that differs by model
-BULK_READ: Final = 0x92
+BULK_READ: Final = 0x92  # another block of each id
 BULK_WRITE: Final = 0x93
 
 # Error byte of a status packet (byte 8): e-manual "Status Packet: Error".
@@ -93,6 +93,13 @@ crc16: Final = umts  # CRC-16/BUYPASS: 0x8005, start 0, not reflected. A second 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
     """Return an instruction packet. Raises PacketError if it would be longer than `MAX_PACKET`."""
     return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
+
+
+def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as above."""
+    # address (2), length (2), then id and data of each: e-manual "Sync Write"
+    head = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+    return encode_instruction(BROADCAST, SYNC_WRITE, head + rows)
 
 
 def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
@@ -157,10 +164,11 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
     while True:
         start = buffer.find(_HEADER)
         if start < 0:
-            del buffer[: len(buffer) - _header_begun(buffer)]
+            begun = next((size for size in (3, 2, 1) if buffer.endswith(_HEADER[:size])), 0)
+            del buffer[: len(buffer) - begun]
             return None
         del buffer[:start]
-        if len(buffer) < 7:
+        if len(buffer) < 7:  # LEN_H, the last byte that says how long the packet is
             return None
         servo, length = buffer[4], buffer[5] | buffer[6] << 8
         total = length + 7  # LEN counts what is behind byte 6
@@ -186,16 +194,3 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
         if body[0] == STATUS:
             return Packet(servo, STATUS, body[2:], body[1])
         return Packet(servo, body[0], body[1:])
-
-
-def _header_begun(buffer: bytearray) -> int:
-    """Return how many bytes at the end of `buffer` may be the beginning of a header."""
-    for size in (3, 2, 1):
-        if buffer.endswith(_HEADER[:size]):
-            return size
-    return 0
-
-
-def error_text(error: int) -> str:
-    """Return the error number in the low bits of an error byte, in words."""
-    return ERRORS.get(error & ~ALERT, f"error {error & ~ALERT}")

@@ -75,7 +75,7 @@ def word(value: int) -> bytes:
 
 def from_word(data: bytes) -> int:
     """Return the value of two data bytes, the inverse of `word`."""
-    return data[0] | data[1] << 7
+    return data[0] | data[1] << 7  # low seven bits first
 
 
 def set_target(channel: int, quarter_us: int) -> bytes:
@@ -143,13 +143,13 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
             if len(buffer) < 3:
                 return None
             code, start = buffer[2] | 0x80, 3
-            if buffer[2] >= 0x80:
+            if buffer[2] >= 0x80:  # the command behind AA and device has its top bit cleared
                 del buffer[:2]
                 return MaestroCommand(BAUD_INDICATION, error=PROTOCOL_ERROR)
         end = _end(buffer, code, start)
         if end is None:
             return None
-        if end < 0:
+        if end < 0:  # no command of the guide
             del buffer[:start]
             return MaestroCommand(code, error=PROTOCOL_ERROR)
         checked = crc and code != MINI_SSC
@@ -162,7 +162,7 @@ def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = F
             return None
         whole, other = bytes(buffer[:end]), start == 3 and buffer[1] != device
         del buffer[:end]
-        if other:
+        if other:  # daisy chain: every board reads every command
             continue
         if checked and crc7(whole):
             return MaestroCommand(code, error=CRC_ERROR)

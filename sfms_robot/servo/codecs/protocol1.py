@@ -34,17 +34,17 @@ Sources: ROBOTIS e-manual, docs/en/dxl/protocol1.md; Feetech communication proto
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from sfms_robot.errors import PacketError
 
 # Instructions: e-manual "Instruction"; the last three are Feetech's.
 PING: Final = 0x01
-READ: Final = 0x02
-WRITE: Final = 0x03
+READ: Final = 0x02  # address, length
+WRITE: Final = 0x03  # address, data
 REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05
+ACTION: Final = 0x05  # carries out what REG WRITE has left
 FACTORY_RESET: Final = 0x06
 SYNC_WRITE: Final = 0x83
 BULK_READ: Final = 0x92  # Dynamixel MX
@@ -110,7 +110,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
             del buffer[: len(buffer) - buffer.endswith(_HEADER[:1])]
             return None
         del buffer[:start]
-        if len(buffer) < 4:
+        if len(buffer) < 4:  # LENGTH is byte 3
             if len(buffer) == 3 and buffer[2] == 0xFF:
                 del buffer[0]
             return None
@@ -124,6 +124,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
         if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:
             del buffer[0]
             continue
+        # byte 4 is the code, the parameters follow
         frame = Frame(servo, buffer[4], bytes(buffer[5 : total - 1]))
         del buffer[:total]
         return frame
@@ -146,20 +147,10 @@ def refusal_text(error: int) -> str:
     return ", ".join(text for bit, text in REFUSALS.items() if error & bit)
 
 
-def sync_write_params(address: int, values: Mapping[int, bytes]) -> bytes:
-    """Return the parameters of a sync write; all data have one length."""
-    length = len(next(iter(values.values())))
-    return bytes([address, length]) + b"".join(bytes([servo]) + data for servo, data in values.items())
-
-
-def sync_write_parts(params: bytes) -> tuple[int, Iterator[tuple[int, bytes]]]:
-    """Return (address, (id, data) of each servo); bytes behind the last whole part are ignored.
-
-    Raises IndexError if address or length are missing.
-    """
-    address, length = params[0], params[1]
-    starts = range(2, len(params) - length, length + 1)
-    return address, ((params[i], params[i + 1 : i + 1 + length]) for i in starts)
+def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as `encode`."""
+    # start address, L, then id and L bytes of each: e-manual "Sync Write"
+    return encode(BROADCAST, SYNC_WRITE, bytes([address, length]) + rows)
 
 
 def bulk_read_params(requests: Iterable[tuple[int, int, int]]) -> bytes:
@@ -167,17 +158,6 @@ def bulk_read_params(requests: Iterable[tuple[int, int, int]]) -> bytes:
     return b"\x00" + b"".join(bytes([length, servo, address]) for servo, address, length in requests)
 
 
-def bulk_read_parts(params: bytes) -> Sequence[tuple[int, int, int]]:
-    """Return (id, address, length) of each servo asked."""
-    body = params[1:]  # behind the 00
-    return [(body[i + 1], body[i + 2], body[i]) for i in range(0, len(body) - 2, 3)]
-
-
 def sync_read_params(address: int, length: int, servos: Sequence[int]) -> bytes:
     """Return the parameters of a Feetech sync read; one answer per id comes back, in this order."""
     return bytes([address, length, *servos])
-
-
-def sync_read_parts(params: bytes) -> tuple[int, int, bytes]:
-    """Return (address, length, ids). Raises IndexError if address or length are missing."""
-    return params[0], params[1], params[2:]

@@ -38,8 +38,8 @@ _QUERY: Final = re.compile(r"QP\s*\d{1,2}(?:\s+\d{1,2})*")
 class Move(NamedTuple):
     """A pulse width, and the speed towards it, us/s; 0 = as fast as the servo can."""
 
-    pulse_us: int
-    speed_us_s: int = 0
+    pulse_us: int  # <pw>
+    speed_us_s: int = 0  # <spd>
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Group:
     """A group of channels that move together within `time_ms` (0 = at once), and outputs set high or low."""
 
     moves: Mapping[int, Move]
-    time_ms: int = 0
+    time_ms: int = 0  # <time>
     levels: Mapping[int, bool] = field(default_factory=dict)
 
 
@@ -76,6 +76,7 @@ def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
             raise ValueError(
                 f"channel {channel}: {move.pulse_us} us is outside {MIN_PULSE_US}..{MAX_PULSE_US} us of an SSC-32"
             )
+    # #<ch>P<pw>S<spd> of each channel, then T<time> and <cr>
     text = "".join(
         f"#{channel}P{move.pulse_us}" + (f"S{move.speed_us_s}" if move.speed_us_s else "")
         for channel, move in moves.items()
@@ -114,7 +115,7 @@ def maybe_command(buffer: bytearray) -> Group | Query | Unknown | None:
 
 def _parsed(line: bytes) -> Group | Query | Unknown:
     spaced = line.decode("ascii", "replace").upper().strip()
-    text = re.sub(r"\s+", "", spaced)
+    text = re.sub(r"\s+", "", spaced)  # "spaces anywhere"
     if text in ("Q", "VER"):
         return Query(text)
     if _QUERY.fullmatch(spaced):

@@ -342,23 +342,6 @@ def test_reduce_is_half_whatever_acknowledgements_are_lost(family):
     assert rig.register(2, strength) == full // 2
 
 
-@pytest.mark.parametrize(("family", "count"), [*((name, 4) for name in CHAINS), ("dynamixel2", 28)])
-def test_setting_that_is_not_what_was_asked_for_is_a_named_fault(family, count):
-    rig = timed(family, count)
-    held = rig.hold()
-    rig.ticks(held, 60)
-    table = rig.family.table
-    name = "profile_velocity" if family == "dynamixel2" else None
-    name = name or next(each for each in ("moving_speed", "goal_velocity") if each in table.fields)
-    servo = rig.port.device.servo(3)
-    servo.write(table[name].address, table[name].to_bytes(77), rig.clock.t)
-    readings = rig.ticks(held, 220)
-    assert readings["joint3"].fault == f"{name} reads 77, set to 0"
-    assert f"joint3: {name} reads 77, set to 0" in rig.bus.statistics()["faults"]
-    servo.write(table[name].address, table[name].to_bytes(0), rig.clock.t)
-    assert rig.ticks(held, 220)["joint3"].fault is None
-
-
 def test_torque_that_is_lost_is_noticed_where_a_tick_has_no_time_for_everything_of_everybody():
     rig = timed("dynamixel2", 28)
     held = rig.hold()
