@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from drill_rig import CHECKOUT, HEAD, LOOK_S, LOOKS, START
 
-from sfms_robot.app.replay.run_file import _records, states_of
+from sfms_robot.app.replay.run_file import _records, read_recording
 from sfms_robot.frames import FRAME_S
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
@@ -214,7 +214,7 @@ def test_50_ms_with_jitter_and_loss_leave_no_gap_and_an_outage_is_over_in_a_seco
         assert 90 < report["listener_state"]["link"]["round_trip_ms"]["p50"] < 180
     assert reports[0]["listener_state"]["link"]["outages"] == 1 and reports[1]["listener_state"]["link"]["outages"] == 0
     assert back_s <= BACK_S
-    states = [(at_s, name, why) for at_s, name, why in states_of(a.recording)]
+    states = read_recording(a.recording).states
     lost_s = next(at_s for at_s, _, why in states if why == ("listener",))
     found_s = next(at_s for at_s, name, why in states if at_s > lost_s and not why)
     steady = [gap for at_s, gap in gaps(a.recording) if SETTLED_S < at_s < lost_s - 2.0 or at_s > found_s + BACK_S]
