@@ -16,7 +16,7 @@ import pytest
 import yaml
 from emulated_devices import device_of, servos_of
 
-from sfms_robot.app.head.calibrate import CalibrationOutcome, calibrate, calibrate_on
+from sfms_robot.app.head.calibrate import CalibrationOutcome, Guide, calibrate, calibrate_on
 from sfms_robot.app.open_head import calibrated_head, identify, open_head
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.wiring import emulated
@@ -103,7 +103,8 @@ def hand(chain: Chain, servo: int, ticks: int) -> Callable[[], str]:
 
 
 def led(name: str, chain: Chain, person: Person, **more) -> CalibrationOutcome:
-    return calibrate_on(name, {"main": chain}, VirtualClock(), person, overlay_file("two"), DAY, **more)
+    guide = Guide(person.say, person.ask, DAY)
+    return calibrate_on(name, {"main": chain}, VirtualClock(), guide, overlay_file("two"), **more)
 
 
 def by_hand(chain: Chain) -> list[Answer]:
@@ -262,7 +263,8 @@ def test_every_family_tells_who_it_is(tmp_path, family, model, zero):
 
 
 def test_practice_on_emulated_servos_is_kept_apart(name):
-    outcome = calibrate(name, "sim", Person("k", "5", "", "20", "", "n"), ["jaw"])
+    person = Person("k", "5", "", "20", "", "n")
+    outcome = calibrate(name, "sim", person.say, person.ask, ["jaw"])
     assert outcome.measured == ["jaw"] and outcome.file == overlay_file("two", practice=True)
     assert outcome.file.exists() and not overlay_file("two").exists()
 

@@ -39,12 +39,12 @@ def deca(tmp_path):
 
 
 def test_the_shipped_listener_shows_everything():
-    assert limitation("sfms-small") is None and check("op3_head", listener="sfms-small").limitation is None
+    assert limitation("sfms-small") is None and check("op3_head", listener="sfms-small")["limitation"] is None
 
 
 def test_deca56_without_a_matrix_says_pose_and_jaw_only(deca):
     assert "pose and jaw only" in limitation(str(deca))
-    assert "pose and jaw only" in check("op3_head", listener=str(deca)).limitation
+    assert "pose and jaw only" in check("op3_head", listener=str(deca))["limitation"]
 
 
 def test_with_a_matrix_beside_it_nothing_is_missing(deca):

@@ -11,14 +11,13 @@ import pytest
 from websockets.sync.client import connect
 
 from sfms_robot.app.listen.knobs import turned
-from sfms_robot.app.listen.page_observer import NAMED_EXPRESSIONS
 from sfms_robot.app.listen.page_session import LEFT_S, EndsAlone, PageReach, PageSession, page_session
 from sfms_robot.app.options import RunOptions, begin_page
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, RobotError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS
+from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -234,9 +233,3 @@ def test_what_cannot_be_is_refused_in_one_line(name, values, problem):
     with pytest.raises(RobotError, match=problem) as refused:
         Run().does(name, **values)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("name", NAMED_EXPRESSIONS)
-def test_every_named_expression_is_a_face(name):
-    assert set(NAMED_EXPRESSIONS[name]) <= set(CHANNELS)
-    Puppet().show(NAMED_EXPRESSIONS[name], 1.0)

@@ -17,7 +17,7 @@ from sfms_robot.app.open_head import OpenHead, open_head
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.errors import ConfigError, TorqueError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.log import RunLog
@@ -34,13 +34,20 @@ def _both(**values: float) -> dict[str, float]:
     return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
 
 
+# Faces by name, for words of `head pose` and buttons of the page; the page leaves all other channels to the listener.
 EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
     "smile": _both(mouthSmile=0.9, cheekSquint=0.4, eyeSquint=0.2),
-    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "laugh": {**_both(mouthSmile=1.0, cheekSquint=0.8, eyeSquint=0.5), "jawOpen": 0.35, "pitch": -0.08},
     "surprise": {**_both(browOuterUp=0.8, eyeWide=0.8), "browInnerUp": 0.9, "jawOpen": 0.4},
+    "doubt": {"browDownLeft": 0.6, "browOuterUpRight": 0.8, "mouthLeft": 0.4, "roll": 0.12},
+    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "sad": {**_both(mouthFrown=0.8), "browInnerUp": 0.8, "mouthShrugLower": 0.4, "pitch": 0.15},
     "anger": _both(browDown=1.0, noseSneer=0.6, mouthPress=0.5),
-    "blink": _both(eyeBlink=1.0),
+    "disgust": _both(noseSneer=0.9, mouthUpperUp=0.6, browDown=0.5, eyeSquint=0.4),
     "kiss": {"mouthPucker": 1.0, "mouthFunnel": 0.2},
+    "wink": {"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.6, "mouthSmileLeft": 0.5},
+    "blink": _both(eyeBlink=1.0),
+    "eyes closed": _both(eyeBlink=1.0),
     "nod": {"pitch": 0.2},
     "look_left": {"eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3},
     "look_right": {"eyeLookInLeft": 0.7, "eyeLookOutRight": 0.7, "yaw": -0.3},
@@ -61,19 +68,16 @@ def parse_face(words: Sequence[str]) -> Floats:
             continue
         if name not in CHANNEL_INDEX:
             raise ConfigError.at("head pose", "CHANNEL", name, "is not a channel", CHANNEL_INDEX)
-        motion[CHANNEL_INDEX[name]] = _value(name, text)
+        high = _BOUNDS.get(name, 1.0)
+        low = -high if name in _BOUNDS else 0.0
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise ConfigError.at("head pose", name, text, "is not a number in its range", [f"{low:g}..{high:g}"])
+        motion[CHANNEL_INDEX[name]] = value
     return motion
-
-
-def _value(channel: str, text: str) -> float:
-    low, high = (-_BOUNDS[channel], _BOUNDS[channel]) if channel in POSE_CHANNELS else (0.0, 1.0)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise ConfigError.at("head pose", channel, text, "is not a number in its range", [f"{low:g}..{high:g}"])
-    return value
 
 
 def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
@@ -82,11 +86,10 @@ def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -
     Blocks until then. Raises any other RobotError, the head at rest.
     """
     face = parse_face(words)
-    timeline = held_face(face, hold_s)
     with open_head(options) as opened:
         motion = opened.motion
         furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        drove = timeline.play(opened, furthest)
+        drove = held_face(face, hold_s).play(opened, furthest)
     if drove.error is not None and not isinstance(drove.error, TorqueError):
         raise drove.error
     shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]

@@ -20,9 +20,9 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
+from sfms_robot.app.head.pose import EXPRESSIONS
 from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
 from sfms_robot.app.listen.page_observer import (
-    NAMED_EXPRESSIONS,
     PageObserver,
     PageRecorder,
     page_facts,
@@ -84,9 +84,9 @@ class PageReach:
             case "show":
                 self.puppet.show(values["channels"], values["seconds"])
             case "expression":
-                if values["name"] not in NAMED_EXPRESSIONS:
-                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(NAMED_EXPRESSIONS)})")
-                self.puppet.show(NAMED_EXPRESSIONS[values["name"]], values["seconds"])
+                if values["name"] not in EXPRESSIONS:
+                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(EXPRESSIONS)})")
+                self.puppet.show(EXPRESSIONS[values["name"]], values["seconds"])
             case "look_at":
                 self.puppet.look_at(**values)
             case "knobs":
