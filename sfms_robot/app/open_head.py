@@ -290,12 +290,13 @@ def build_bus(
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
-        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}, doctor))
+        buses[LEFT_OUT] = AbsentBus(bus_servos(head, {joint: head.joints[joint] for joint in without}, doctor))
         rates = rates and {**rates, LEFT_OUT: max(rates.values())}
     return CompositeBus(buses, list(head.joints), rates)
 
 
-def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[BusServo]:
+def bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str = BusServo.doctor) -> list[BusServo]:
+    """Return the servos of joints; `doctor`: see `BusServo`."""
     maps = firmware_maps(joints)
     return [
         BusServo(
@@ -325,7 +326,7 @@ def build_one(
     """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
     check_safety(head, joints)
-    servos = _bus_servos(head, joints, doctor)
+    servos = bus_servos(head, joints, doctor)
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])

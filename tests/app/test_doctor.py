@@ -9,11 +9,8 @@ from dataclasses import replace
 import pytest
 import typer
 
-from sfms_robot.app.servo.diagnosis import (
-    Command,
-    Wanted,
-)
-from sfms_robot.app.servo.doctor import Line, examine, examine_line
+from sfms_robot.app.servo.diagnosis import Line, Wanted
+from sfms_robot.app.servo.doctor import examine, examine_line
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.servo.single_servo import checked_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
@@ -26,7 +23,6 @@ from sfms_robot.servo.port import SerialPort, VirtualTimePort
 from sfms_robot.servo.stored_settings import JointNeeds
 
 BAUD = 1_000_000
-COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
 
 
 class Patient:

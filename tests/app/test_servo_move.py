@@ -303,7 +303,7 @@ def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, name
 
         def settings(servo):
             values = read_registers(wire.find(servo), ["all"])
-            return {value.field.name: value.raw for value in values if not value.field.name.startswith(live)}
+            return {value["register"]: value["raw"] for value in values if not value["register"].startswith(live)}
 
         before = settings(1)
         assert release_chain(wire, dict.fromkeys((1, 2), Table.of(load_firmware_map(named)))) == {1: "", 2: ""}

@@ -6,16 +6,15 @@ another rate, of another model or not in the file, and whether the bus reaches t
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any, Final, cast
 
 from sfms_robot.app.servo.diagnosis import (
     Budget,
-    Command,
     Finding,
+    Line,
     Wanted,
     grouped,
     judge_adapter,
@@ -53,12 +52,10 @@ from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import family_named, servo_families
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
-DEFAULT_RATE_HZ: Final = 100.0
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
 DEFAULT_FAMILY: Final = "dynamixel2"
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
@@ -67,36 +64,6 @@ _READ: Final = ("present_position", "present_speed", "present_load", "present_cu
 
 OpenPort = Callable[[str, int], Port]
 Found = Mapping[int, FoundServo]  # by id
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """One port to look at, and what is expected on it.
-
-    Attributes:
-        shown: Its name in commands.
-        ports: The ports of the whole head, as `--port` named them.
-    """
-
-    device: str
-    shown: str
-    family: str
-    baud: int | None
-    rate_hz: float
-    wanted: dict[int, Wanted]
-    bus: str | None = None
-    head: str | None = None
-    ports: str | None = None
-    crc: bool = False
-
-    @property
-    def first_baud(self) -> int:
-        return self.baud or servo_families()[self.family].bauds[0]
-
-    @property
-    def is_terminal(self) -> bool:
-        """It is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
-        return os.path.realpath(self.device).startswith("/dev/pts/")
 
 
 def examine(
@@ -182,7 +149,7 @@ def _finished(report: dict[str, Any], findings: Sequence[Finding], failed: int =
 def _lines(port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack) -> Iterator[Line]:
     if head is None:
         device = port or only_port()
-        yield Line(device=device, shown=device, family=family, baud=baud, rate_hz=DEFAULT_RATE_HZ, wanted={})
+        yield Line(device=device, shown=device, family=family, baud=baud)
         return
     from sfms_robot.app.options import HeadOptions  # slow to load, and only a head needs it
     from sfms_robot.app.wiring import open_wires
@@ -209,25 +176,15 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     """Return the servos of a bus as the head's file describes them, by id."""
-    from sfms_robot.app.wiring import calibration_of, firmware_maps
+    from sfms_robot.app.open_head import bus_servos
+    from sfms_robot.app.wiring import calibration_of
 
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    maps = firmware_maps(joints)
-    servos = [
-        BusServo(
-            joint=name,
-            id=joint.id,
-            map=maps[joint.model],
-            min_rad=joint.min_rad,
-            max_rad=joint.max_rad,
-            safety=head.safety_of(name),
-        )
-        for name, joint in joints.items()
-    ]
+    servos = bus_servos(head, joints)
     return {
         servo.id: Wanted(
             joint=servo.joint,
-            model=joints[servo.joint].model,
+            model=servo.map.model,
             model_number=servo.map.model_number,
             faults=head.faults,
             needs=needs,
@@ -243,11 +200,10 @@ def _look(
     line: Line, wire: Wire, adapter: SerialDevice, progress: Progress, fix: Confirm | None
 ) -> tuple[list[Finding], dict[str, Any]]:
     """Return findings and facts that need the open port."""
-    command = Command(line.shown, line.family, line.head, line.ports)
     here, elsewhere = _present(wire, line, progress)
     baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
     hint = "" if here or elsewhere else protocol_hint(wire)
-    findings = list(judge_presence(line.wanted, here, elsewhere, baud, command, hint))
+    findings = list(judge_presence(line, here, elsewhere, baud, hint))
     fixed: list[str] = []
     states: list[ServoState] = []
     double: list[int] = []
@@ -263,19 +219,19 @@ def _look(
             states.append(state)
         except ServoError as error:
             level = seen.table.role("status_level") if seen.table else None
-            cure = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
+            cure = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
             findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
     findings += judge_duplicate_ids(double)
     for state in states:
-        findings += judge_servo(state, line.wanted.get(state.seen.id), command)
+        findings += judge_servo(state, line)
     members = [state for state in states if state.seen.id in here and state.seen.table is not None]
     wire.at(baud)
     fast = _fast_read_works(wire, members)
     budget = _budget(line, baud, members, adapter)
     if budget is not None:
-        findings += judge_rate(budget, line.rate_hz, fast, command)
+        findings += judge_rate(budget, line, fast)
     facts = {"baud": baud, "rate_hz": line.rate_hz, "servos": [_servo_row(state, line) for state in states]}
-    return findings, facts | {"fixed": fixed, "fast_sync_read": fast, "budget": budget and asdict(budget)}
+    return findings, facts | {"fixed": fixed, "fast_sync_read": fast, "budget": budget}
 
 
 def _present(wire: Wire, line: Line, progress: Progress) -> tuple[Found, Found]:
@@ -400,8 +356,8 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
     budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)
     answers = _board_answers(line, port)
     found = judge_board(line.family, len(line.wanted), answers, adapter)
-    findings = [*found, *judge_rate(budget, line.rate_hz, None, Command(line.shown, line.family))]
-    facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": asdict(budget)}
+    findings = [*found, *judge_rate(budget, line)]
+    facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
     return findings, facts
 
 
