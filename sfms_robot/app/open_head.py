@@ -83,6 +83,11 @@ class OpenHead:
         """Rate of the loop: that of the head's fastest bus."""
         return fastest_hz(self.config)
 
+    def readings(self) -> dict[str, Any]:
+        """Return what the servos report, torque untouched."""
+        polled = self.bus.poll(self.clock.now_s()).items()
+        return {joint: {"position_rad": each.position_rad, "fault": each.fault} for joint, each in polled}
+
     def digests(self) -> dict[str, Any]:
         """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
         digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}

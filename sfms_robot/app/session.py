@@ -12,13 +12,13 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
@@ -50,9 +50,6 @@ from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
 from sfms_robot.viewer.web_server import status_server
-
-if TYPE_CHECKING:
-    pass
 
 logger = logging.getLogger(__name__)
 
@@ -180,27 +177,37 @@ def run(
         logger.warning("%s: %s", Path(options.listener).name, limited)
     interrupt, halt = interrupt or Interrupt(), halt or HaltLatch()
     facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
-    with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
+    with ExitStack() as stack:  # until all is closed again
         if signals:
+            stack.enter_context(signals_to(interrupt))
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
-        begin_status = _status_server(options, stack)  # a port that is in use is found before a listener is loaded
-        begin_status(RunStatus((), facts).document)
+        server = None
+        if options.status is not None:  # a port that is in use is found before a listener is loaded
+            server = stack.enter_context(closing(status_server(options.status)))
+            logger.warning("status: %s%s", server.url, server.note)
+            server.begin(RunStatus((), facts).document)
         opened, person, feed = _open(options, source, feed, stack)
         if feed is None:
-            return {"version": 1, **facts, "exit": "done", "readings": _readings(opened)}
+            return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
         live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
-        log = run_log(opened)
+        log, joints = run_log(opened), list(opened.config.joints)
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
         figures = partial(_figures, opened, log, person, feed, live, more)
-        status = RunStatus(list(opened.config.joints), {**facts, "duration_s": duration_s}, figures)
-        recorder = _recorder(options, opened, stack)
+        status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
+        watchers: list[Observer] = [status, *observers]
+        recorder = None
+        if options.record is not None:
+            about = run_facts(opened.config, options)
+            recorder = Recorder(options.record, joints, "wait" if options.fast else "drop", about)
+            watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
             stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
-        outlets = [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
-        begin_status(status.document)
-        watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
+        watchers += [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
+        if server is not None:
+            server.begin(status.document)
+        watchers += _notified(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
         parts = run_parts(
             opened,
             person,
@@ -210,14 +217,13 @@ def run(
             overlay=overlay,
             answers=True,
             halt=halt,
-            observers=[status, *watchers, *observers, *outlets, *([] if recorder is None else [recorder])],
+            observers=watchers,
         )
         drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
         status.ended(log.states[-1][1])
         report = run_report(opened, drove, feed, facts["listener"], options.seed)
         report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
-        if options.fast:
-            report["wire"] = opened.digests()
+        report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
@@ -243,16 +249,6 @@ def _check(options: RunOptions) -> None:
             raise ConfigError(f"--{flag} {value}: {why} takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
-
-
-def _status_server(options: RunOptions, stack: ExitStack) -> Callable[[Document], None]:
-    """Bind the port of `--status`, if wanted; return the function that serves a document there from now on."""
-    if options.status is None:
-        return lambda document: None
-
-    server = stack.enter_context(closing(status_server(options.status)))
-    logger.warning("status: %s%s", server.url, server.note)
-    return server.begin
 
 
 def _open(
@@ -303,10 +299,13 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     return feed
 
 
-def _readings(opened: OpenHead) -> dict[str, Any]:
-    """Return what the servos report, torque untouched."""
-    readings = opened.bus.poll(opened.clock.now_s())
-    return {name: {"position_rad": each.position_rad, "fault": each.fault} for name, each in readings.items()}
+def _notified(options: RunOptions, status: RunStatus, controls: FleetControls, stack: ExitStack) -> Iterator[Observer]:
+    """Yield observers that report state changes to systemd and to the fleet, where there are any."""
+    if (manager := ServiceManager()).wanted:
+        yield NotifyingObserver(manager)
+    if options.fleet is not None:
+        head = FleetHead(options.fleet, status.document, controls, options.router, fleet_key(options.fleet_key))
+        yield stack.enter_context(closing(head))
 
 
 def _figures(
@@ -325,28 +324,3 @@ def _figures(
         "intensity": live.values["intensity"],
         **more(),
     }
-
-
-def _recorder(options: RunOptions, opened: OpenHead, stack: ExitStack) -> Recorder | None:
-    if options.record is None:
-        return None
-    recorder = Recorder(
-        options.record,
-        list(opened.config.joints),
-        when_full="wait" if options.fast else "drop",
-        about=run_facts(opened.config, options),
-    )
-    return stack.enter_context(closing(recorder))
-
-
-def _watchers(options: RunOptions, status: RunStatus, controls: FleetControls, stack: ExitStack) -> list[Observer]:
-    """Return observers that report state changes to systemd and to the fleet, where there are any."""
-    watchers: list[Observer] = []
-    manager = ServiceManager()
-    if manager.wanted:
-        watchers.append(NotifyingObserver(manager))
-    if options.fleet is not None:
-        head = FleetHead(options.fleet, status.document, controls, options.router, fleet_key(options.fleet_key))
-        stack.callback(head.close)
-        watchers.append(head)
-    return watchers

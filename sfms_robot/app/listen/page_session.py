@@ -21,7 +21,7 @@ import numpy as np
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.head.pose import EXPRESSIONS
-from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
+from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.page_observer import (
     PageObserver,
     PageRecorder,
@@ -29,12 +29,12 @@ from sfms_robot.app.listen.page_observer import (
     people_per_minute,
 )
 from sfms_robot.app.listen.report import run_facts
-from sfms_robot.app.options import RunOptions
+from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.config import Calmness, load_head, parse
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.listeners.remote import NamedFeed, open_feed
+from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
@@ -90,9 +90,7 @@ class PageReach:
             case "look_at":
                 self.puppet.look_at(**values)
             case "knobs":
-                for kind in KNOB_KINDS:
-                    for region, value in values[kind].items():
-                        setattr(self.knobs[region], kind, value)
+                self.knobs.turn(values["intensity"], values["style"])
             case "calm":
                 self.calmness = parse(Calmness, {**self.calmness.model_dump(), **values["rates"]}, "calm")
                 self.calm(self.calmness)
@@ -135,39 +133,53 @@ class PageSession:
 
         `feed`: a listener of these options that loads already; None: it is started here, and ended.
         """
-        options = self.options
-        head = load_head(options.head)
-        knobs = turned(head, options.intensity, options.style)
-        calmness = options.calmness or Calmness()
-        watcher = PageObserver(self.page, list(head.joints))
-        self._interrupt = interrupt = Interrupt()
+        options, head = self.options, load_head(self.options.head)
+        joints, by_visitor = list(head.joints), _taken_of_visitors(options)
+        knobs, calmness = turned(head, options.intensity, options.style), options.calmness or Calmness()
+        watcher, interrupt = PageObserver(self.page, joints), Interrupt()
+        self._interrupt, self.released = interrupt, False
         self._chosen.clear()
-        self.released = False
+
+        def shown(document: session.Document, *rest: Any) -> Any:
+            watcher.document = document
+            return nullcontext() if panel is None else panel(document, *rest)
+
         with ExitStack() as stack:
             if feed is None:
-                listened = options.listener, options.seed, options.calmness, options.router, options.engine
-                feed = stack.enter_context(closing(open_feed(*listened)))
+                feed = stack.enter_context(closing(begin_listening(options)))
             halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out if scene else ():
                 logger.warning("%s; the page leaves it out", line)
-            facts = self._facts(head, knobs, calmness)
+            speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
+            facts = page_facts(
+                head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
+                speaker=speaker if speaker in speaker_names() else None, people=people_per_minute(options.listener),
+                knobs=knobs, source={name: self._choices or by for name, by in by_visitor.items()},
+                choices=self._choices,
+            )  # fmt: skip
             self.page.say("begin", scene=str(options.head), packages=options.packages, **facts)
-            recorder = PageRecorder(self.page, self._folder, list(head.joints), run_facts(head, options))
-            lonely = self._lonely(interrupt)
+            recorder = PageRecorder(self.page, self._folder, joints, run_facts(head, options))
             stack.callback(recorder.close)
             self.reach = PageReach(
                 halt=halt, puppet=puppet, knobs=knobs, calmness=calmness, calm=feed.calm, record=recorder.record,
                 release=self._release,
             )  # fmt: skip
-            stack.callback(self._ended, knobs)
+            stack.callback(self._ended)
+            source, lonely = None, EndsAlone(self.page, interrupt)
+            watchers: list[Observer] = [watcher, recorder, *observers]
+            if any(by_visitor.values()):
+                source = stack.enter_context(closing(open_source(
+                    options.hears, options.face, options.duration_s, agent_audio=options.agent_audio,
+                    play=options.play, visitor=self._visitor,
+                )))  # fmt: skip
+                if self._choices:  # nothing else would end it
+                    watchers.append(lonely)
             report = session.run(
-                options, _with_status(watcher, panel), source=self._source(stack), feed=feed,
-                observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
-                overlay=puppet.overlay, interrupt=interrupt, halt=halt,
-                more=lambda: {"page": self.page.statistics()},
+                options, shown, source=source, feed=feed, observers=watchers, knobs=knobs, overlay=puppet.overlay,
+                interrupt=interrupt, halt=halt, more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
-        if report["exit"] == "interrupted" and any(each.ended for each in lonely):  # its proper end
+        if report["exit"] == "interrupted" and lonely.ended:  # its proper end
             report |= {"exit": "done", "exit_code": 0}
         if self._wanted is None:
             self.page.say("end", report=report)
@@ -178,49 +190,22 @@ class PageSession:
 
         `stay`: wait for a choice while there are visitors. Blocks until then, or until there are none for `AWAY_S`.
         """
-        alone_s = 0.0
-        while self._wanted is None and stay and self.page.visited.is_set() and alone_s < AWAY_S:
-            self._chosen.wait(_LOOK_S)
-            alone_s = 0.0 if self.page.visitors else alone_s + _LOOK_S
+        if stay and self.page.visited.is_set():
+            stay_for_visitors(self.page, self._chosen)
         if self._wanted is None:
             return False
         self.options, self._wanted = replace(self._wanted, **self._set), None
         return True
 
-    def _lonely(self, interrupt: Interrupt) -> list[EndsAlone]:
-        """Return what ends a demo of which a visitor is the person: nothing else would end it."""
-        endless = self._choices and any(_taken_of_visitors(self.options).values())
-        return [EndsAlone(self.page, interrupt)] if endless else []
-
-    def _ended(self, knobs: LiveKnobs) -> None:
+    def _ended(self) -> None:
         """Take the run out of reach, and keep what visitors turned in it."""
         reach, self.reach = self.reach, None
         assert reach is not None
         turned_to = {
-            kind: tuple(f"{name}={value}" for name, value in knobs.values[kind].items()) for kind in KNOB_KINDS
+            kind: tuple(f"{name}={value}" for name, value in values.items())
+            for kind, values in reach.knobs.values.items()
         }
         self._set = {**turned_to, "calmness": reach.calmness}
-
-    def _source(self, stack: ExitStack) -> Any:
-        """Return the source of a run whose person is a visitor; None: the run opens what its options name."""
-        options = self.options
-        if not any(_taken_of_visitors(options).values()):
-            return None
-        source = open_source(
-            options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play,
-            visitor=self._visitor,
-        )  # fmt: skip
-        return stack.enter_context(closing(source))
-
-    def _facts(self, head: Any, knobs: Any, calmness: Calmness) -> dict[str, Any]:
-        options = self.options
-        by_visitor = _taken_of_visitors(options)
-        speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
-        return page_facts(
-            head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
-            speaker=speaker if speaker in speaker_names() else None, people=people_per_minute(options.listener),
-            knobs=knobs, source={feed: self._choices or by for feed, by in by_visitor.items()}, choices=self._choices,
-        )  # fmt: skip
 
     # --- from visitors; in the page's thread ---
 
@@ -302,6 +287,13 @@ class EndsAlone(Observer):
             self._interrupt.ask()
 
 
+def stay_for_visitors(page: PageProcess, over: threading.Event) -> None:
+    """Block until `over` is set, or the page has had no visitors for `AWAY_S`."""
+    alone_s = 0.0
+    while alone_s < AWAY_S and not over.wait(_LOOK_S):
+        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+
+
 @contextmanager
 def page_session(page: PageProcess, options: RunOptions, choices: bool = False) -> Iterator[PageSession]:
     """Run behind a page whose process has begun, while inside. Blocks until the page can be opened.
@@ -317,13 +309,3 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
 def _taken_of_visitors(options: RunOptions) -> dict[str, bool]:
     """Return which of voice and face a visitor brings."""
     return {"voice": split_kind(options.hears)[0] == BROWSER, "face": split_kind(options.face)[0] == BROWSER}
-
-
-def _with_status(watcher: PageObserver, panel: session.Panel | None) -> session.Panel:
-    """Return a panel that gives the page the status document, and shows `panel` too."""
-
-    def shown(document: session.Document, interrupt: Interrupt, halt: HaltLatch, turn: Callable[[float], None]) -> Any:
-        watcher.document = document
-        return nullcontext() if panel is None else panel(document, interrupt, halt, turn)
-
-    return shown

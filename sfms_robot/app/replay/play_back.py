@@ -18,6 +18,7 @@ import numpy as np
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
+from sfms_robot.app.listen.page_session import stay_for_visitors
 from sfms_robot.app.listen.report import figures_so_far, outcome
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
@@ -34,8 +35,6 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-LEFT_S: Final = 5.0  # without a visitor, after which the page ends
-_LOOK_S: Final = 0.5
 FAULTY: Final = "faulty"  # the name of every fault: a recording has only whether there was one
 
 
@@ -108,12 +107,9 @@ def show_recording(folder: Path, page: PageProcess) -> None:
 
 
 def wait_for_visitors(page: PageProcess) -> None:
-    """Block until a visitor has come, and all have been away for `LEFT_S`. Ctrl-C ends it."""
-    alone_s, pause = 0.0, threading.Event()
+    """Block until a visitor has come, and all have been away for some seconds. Ctrl-C ends it."""
     page.visited.wait()
-    while alone_s < LEFT_S:
-        pause.wait(_LOOK_S)
-        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+    stay_for_visitors(page, threading.Event())
 
 
 def pictures(recording: RunRecording) -> Iterator[bytes]:
