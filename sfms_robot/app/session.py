@@ -38,7 +38,7 @@ from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Observer, PlanFeed, Source
+from sfms_robot.ports import Observer, PlanFeed, Source, Timeline
 from sfms_robot.processes import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed
@@ -147,6 +147,7 @@ def run(
     source: Source | None = None,
     feed: PlanFeed | None = None,
     observers: Sequence[Observer] = (),
+    timeline: Timeline | None = None,
     knobs: LiveKnobs | None = None,
     overlay: Callable[[Floats, Doubles], Floats] | None = None,
     interrupt: Interrupt | None = None,
@@ -163,6 +164,7 @@ def run(
         panel: a context manager of (status document, interrupt, halt latch, function that turns the intensity up),
             which shows the run and takes keys.
         source, feed, knobs: instead of those that the options name.
+        timeline: what is played instead of the listener's plans; nothing is added to it.
         observers, overlay: see `Parts`; the caller closes the observers.
         interrupt: ends the run from another thread.
         halt: closed and opened from other threads.
@@ -208,17 +210,12 @@ def run(
         if server is not None:
             server.begin(status.document)
         watchers += _notified(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
-        parts = run_parts(
-            opened,
-            person,
-            feed,
-            life=HeadLife(opened.config.life, options.seed, opened.config.camera),
-            knobs=lambda: live.now,
-            overlay=overlay,
-            answers=True,
-            halt=halt,
-            observers=watchers,
-        )
+        parts = run_parts(opened, person, feed, knobs=lambda: live.now, overlay=overlay, halt=halt, observers=watchers)
+        if timeline is None:
+            life = HeadLife(opened.config.life, options.seed, opened.config.camera)
+            parts = replace(parts, life=life, answers=True)
+        else:
+            parts = replace(parts, timeline=timeline)
         drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
         status.ended(log.states[-1][1])
         report = run_report(opened, drove, feed, facts["listener"], options.seed)

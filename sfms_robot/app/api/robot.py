@@ -8,20 +8,19 @@ rates   ->  calm                how often it does them
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.servos import Background, Progress, Report, head_name
+from sfms_robot.app.api.servos import Background, Driven, Progress, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.options import SIM, RunOptions, begin_listening
 from sfms_robot.app.session import run
 from sfms_robot.config import Calmness, Head, load_head, parse
-from sfms_robot.errors import ConfigError, InputError, RobotError
+from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.remote import NamedFeed
@@ -37,25 +36,11 @@ from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
 from sfms_robot.sources.registry import open_source, split_kind
 
-log = logging.getLogger(__name__)
-
 PUSH: Final = "push"
 EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
 
 
-class _PushedPerson:
-    """The sound and faces that a program hands over, and the robot's own speech."""
-
-    def __init__(self) -> None:
-        self.voice, self.sight, self.speech = PushedVoice(), PushedSight(), PushedSpeech()
-
-    def source(self, play: str | None) -> Source:
-        """Return them as a source. `play`: the device that plays the speech; None: the program does."""
-        own = self.speech if play is None else open_playback(play, self.speech)
-        return PairedSource(self.voice, self.sight, own)
-
-
-class Robot:
+class Robot(Driven):
     """A run of `sfms-robot run`, with its options by name, in its own thread.
 
     `with Robot(...) as robot:` or `Robot(...).start()` and `stop()`: from then on the head moves, until `stop`. In a
@@ -140,28 +125,17 @@ class Robot:
         config = load_head(self._options.head)
         self._listener = own
         self._feed: ListenerThread | NamedFeed | None = None
-        self._person = _PushedPerson() if pushed else None
-        self._speech = self._person.speech if self._person is not None else None
-        if source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none":
-            self._speech = PushedSpeech()
+        self._person = (PushedVoice(), PushedSight()) if pushed else None
+        hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
+        self._speech = PushedSpeech() if pushed or hears else None
         self._source = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
         self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
         self._knobs = LiveKnobs(config, intensity or {}, style or {})
-        self._run: Background | None = None
 
     def __enter__(self) -> Self:
         return self.start()
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """Stop. An error of it does not replace an exception that is being raised."""
-        try:
-            self.stop()
-        except RobotError as failure:
-            if error is None:
-                raise
-            log.error("%s", failure)
 
     def start(self) -> Self:
         """Open the head, torque on, listen. Blocks until the first tick, a second or three. Raises RobotError."""
@@ -183,15 +157,10 @@ class Robot:
         """
         if self._run is not None:
             try:
-                self._run.stop()
+                super().stop()
             finally:
                 self._events.close()
                 self._events.join(EVENTS_LIMIT_S)
-
-    def release(self) -> None:
-        """Switch torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
-        if self._run is not None:
-            self._run.release()
 
     def halt(self) -> None:
         """Stop in an emergency: from the next tick on every joint brakes as fast as its limits allow.
@@ -219,14 +188,14 @@ class Robot:
         this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
         kept. Raises ConfigError for another type, shape or rate.
         """
-        self._pushed("hear").voice.hear(pcm, rate_hz)
+        self._pushed("hear")[0].hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | None) -> None:
         """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
 
         Never blocks. Raises ConfigError for another shape.
         """
-        self._pushed("see").sight.see(face)
+        self._pushed("see")[1].see(face)
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """Hand over the robot's own speech, as `hear`: the lips follow it, and it is not taken for the person.
@@ -250,7 +219,7 @@ class Robot:
             raise InputError(f'{what}() needs audio="push" or "mic"; this robot listens to {self._hears!r}')
         return self._speech
 
-    def _pushed(self, what: str) -> _PushedPerson:
+    def _pushed(self, what: str) -> tuple[PushedVoice, PushedSight]:
         if self._person is None:
             raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
         return self._person
@@ -325,22 +294,20 @@ class Robot:
             "callbacks_detached": dict(self._events.detached),
         }
 
-    def _begin_listening(self) -> ListenerThread | NamedFeed | None:
-        """Return the listener of a run in real time; in virtual time the run steps one inline."""
-        if self._listener is not None:
-            return ListenerThread(self._listener, self._options.seed)
-        return None if self._options.fast else begin_listening(replace(self._options, calmness=self._calmness))
-
     def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
         options = self._options
         source: Source | None = self._source
         with ExitStack() as stack:
-            self._feed = self._begin_listening()
+            if self._listener is not None:
+                self._feed = ListenerThread(self._listener, options.seed)
+            elif not options.fast:  # in virtual time the run steps one inline
+                self._feed = begin_listening(replace(options, calmness=self._calmness))
             if self._feed is not None:
                 stack.callback(self._feed.close)
             if source is None and self._speech is not None:
                 if self._person is not None:
-                    source = self._person.source(options.play)
+                    own = self._speech if options.play is None else open_playback(options.play, self._speech)
+                    source = PairedSource(*self._person, own)
                 else:
                     source = open_source(
                         options.hears, options.face, options.duration_s, agent=self._speech, play=options.play

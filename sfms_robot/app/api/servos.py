@@ -162,6 +162,36 @@ class Background:
             self.progress.came.set()
 
 
+class Driven:
+    """An object whose `Background` run drives a head; leaving its `with` block stops it.
+
+    An error of the run does not replace an exception that is being raised.
+    """
+
+    _run: Background | None = None
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        try:
+            self.stop()
+        except RobotError as failure:
+            if error is None:
+                raise
+            log.error("%s", failure)
+
+    def stop(self) -> None:
+        """Ease to rest, torque off. Block until then; raise an error of the run once, as RobotError.
+
+        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
+        """
+        if self._run is not None:
+            self._run.stop()
+
+    def release(self) -> None:
+        """Torque off now, without coming to rest, for emergencies. From any thread; does not wait. Raises nothing."""
+        if self._run is not None:
+            self._run.release()
+
+
 def head_name(head: Head | str) -> str:
     """Return the name or folder of a head that a program loaded, as a run opens it.
 
@@ -194,7 +224,7 @@ def open_bus(head: Head | str, port: str = SIM, *, yes: bool = False, without: S
     return Servos(HeadOptions(head=head_name(head), port=port, yes=yes, without=tuple(without)))
 
 
-class Servos:
+class Servos(Driven):
     """Joints by their angle. Entering the `with` block connects; leaving it comes to rest and takes torque off.
 
     Every angle passes the limits of position, speed, acceleration and jerk of the head's file. Methods may be called
@@ -209,7 +239,6 @@ class Servos:
     def __init__(self, options: HeadOptions) -> None:
         self._options = options
         self._stack = ExitStack()
-        self._run: Background | None = None
         self._target = _Target(np.zeros(0))
 
     def __enter__(self) -> Self:
@@ -223,14 +252,9 @@ class Servos:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """Stop, and close the ports. An error of it does not replace an exception that is being raised."""
+        """Stop, and close the ports."""
         with self._stack:
-            try:
-                self.stop()
-            except RobotError as failure:
-                if error is None:
-                    raise
-                log.error("%s", failure)
+            super().__exit__(kind, error, trace)
 
     def enable(self) -> None:
         """Torque on, each joint held where it stands; one outside its range comes in. Blocks until all are on.
@@ -274,19 +298,6 @@ class Servos:
             return self._opened.bus.poll(self._opened.clock.now_s())
         seen = self._running().progress.seen
         return {} if seen is None else seen.readings
-
-    def stop(self) -> None:
-        """Ease to rest, torque off. Block until then; raise an error of the run once.
-
-        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
-        """
-        if self._run is not None:
-            self._run.stop()
-
-    def release(self) -> None:
-        """Torque off now, without coming to rest. From any thread; does not wait. Raises nothing."""
-        if self._run is not None:
-            self._run.release()
 
     def report(self) -> Report | None:
         """Return the report after `stop`, with the keys of `run --json`; None before."""

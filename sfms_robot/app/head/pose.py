@@ -178,27 +178,25 @@ class Furthest(Observer):
 
     def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
         self._joints, self._rest_rad = tuple(joints), rest_rad
-        self._sent = np.zeros(len(rest_rad))
-        self._reached: dict[str, float] = {}
+        self._sent, self._reached = np.zeros(len(rest_rad)), np.full(len(rest_rad), np.nan)
 
     def tick(self, seen: Tick) -> None:
         if seen.time_s < EASE_S:
             return
-        sent = seen.goals_rad - self._rest_rad
-        self._sent = np.where(np.abs(sent) > np.abs(self._sent), sent, self._sent)
-        for joint, rest in zip(self._joints, self._rest_rad, strict=True):
-            at = seen.readings[joint].position_rad if joint in seen.readings else None
-            if at is not None and abs(at - rest) >= abs(self._reached.get(joint, 0.0)):
-                self._reached[joint] = float(at - rest)
+        places = [each and each.position_rad for each in map(seen.readings.get, self._joints)]
+        self._sent = _further(self._sent, seen.goals_rad - self._rest_rad)
+        self._reached = _further(self._reached, np.array(places, np.float64) - self._rest_rad)  # None becomes NaN
 
     def moved(self) -> dict[str, dict[str, float | None]]:
         """Return the joints that were sent away from rest, in degrees; None where a servo reports no position."""
-        rows: dict[str, dict[str, float | None]] = {}
-        for joint, sent in zip(self._joints, np.degrees(self._sent), strict=True):
-            if abs(sent) >= MOVED_DEG:
-                reached = self._reached.get(joint)
-                rows[joint] = {
-                    "sent_deg": round(float(sent), 2),
-                    "reached_deg": None if reached is None else round(math.degrees(reached), 2),
-                }
-        return rows
+        rows = zip(self._joints, np.degrees(self._sent).round(2), np.degrees(self._reached).round(2), strict=True)
+        return {
+            joint: {"sent_deg": float(sent), "reached_deg": None if np.isnan(reached) else float(reached)}
+            for joint, sent, reached in rows
+            if abs(sent) >= MOVED_DEG
+        }
+
+
+def _further(furthest: Doubles, now: Doubles) -> Doubles:
+    """Return whichever is further from 0, joint by joint; NaN counts as not known."""
+    return np.where((np.abs(now) > np.abs(furthest)) | np.isnan(furthest), now, furthest)
