@@ -70,27 +70,18 @@ def put(wire: Wire, servo: int, register: str, value: int) -> None:
 # --- finding ----------------------------------------------------------------------------------------------------
 
 
-def test_a_scan_finds_every_servo_at_its_own_rate(three):
-    wire, _ = three
+def test_a_scan_finds_every_servo_at_its_own_rate_and_two_with_one_id(three):
+    wire, chain = three
     steps = []
     found = scan(wire, progress=lambda done, total, what: steps.append((done, total, what)))
     assert sorted((each.id, each.baud, each.model, each.firmware) for each in found) == [
         (1, 1_000_000, "xl330-m288", 53), (2, 57_600, "xl330-m288", 53), (7, 1_000_000, "xl330-m288", 53),
     ]  # fmt: skip
     assert steps[0][0] == 0 and steps[-1][0] == steps[-1][1] and "3 found" in steps[-1][2]
-
-
-def test_asking_id_by_id_finds_the_same(three):
-    wire, _ = three
-    one_by_one = scan(wire, ids=range(10))
-    assert sorted(each.id for each in one_by_one) == [1, 2, 7]
-    assert one_by_one == scan(wire)
-
-
-def test_a_servo_is_found_at_whatever_rate_it_has(three):
-    wire, _ = three
-    assert wire.find(2).baud == 57_600 and wire.baud == 57_600
-    assert wire.find(7).baud == 1_000_000
+    assert scan(wire, ids=range(10)) == found
+    assert wire.find(2).baud == 57_600 == wire.baud
+    chain.inject("duplicate:7=1")
+    assert {each.id for each in scan(wire) if each.twice} == {7}
 
 
 def test_a_fixed_rate_is_the_only_one_looked_at():
@@ -149,12 +140,6 @@ def test_the_whole_table_read_at_once_says_the_same_as_register_by_register(thre
             assert state.value(each["register"]) == each["raw"]
 
 
-def test_an_unknown_register_lists_those_there_are(three):
-    wire, _ = three
-    with pytest.raises(ConfigError, match=r"goal_postion.*goal_position"):
-        read_registers(wire.find(1), ["goal_postion"])
-
-
 def test_a_ram_register_is_written_unasked_and_read_back(three):
     wire, _ = three
     written = write_register(wire.find(1), "led", "1", no)
@@ -181,6 +166,7 @@ def test_a_value_may_carry_the_unit_of_the_register():
         ("return_delay_time", "255", r"0\.\.254"),
         ("id", "5", "set-id"),
         ("baud_rate", "3", "set-baud"),
+        ("goal_postion", "3", "goal_postion.*goal_position"),
     ],
 )
 def test_what_may_not_be_written_is_refused_before_anything_is_sent(three, register, value, problem):
@@ -258,12 +244,6 @@ def test_an_id_that_two_servos_seem_to_have_is_left_alone(three):
     chain.inject("duplicate:1=1")
     with pytest.raises(ServoError, match="two servos seem to answer"):
         set_id(wire.find(1), 5, yes, in_chain=True)
-
-
-def test_a_scan_says_where_two_servos_seem_to_have_one_id(three):
-    wire, chain = three
-    chain.inject("duplicate:7=1")
-    assert {each.id for each in scan(wire) if each.twice} == {7}
 
 
 def test_a_wire_that_loses_answers_now_and_then_only_needs_patience(three):

@@ -7,7 +7,7 @@ good to know or is corrected by the run itself.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from itertools import chain
 from shlex import quote
@@ -140,17 +140,15 @@ class Line:
 # --- the port ---------------------------------------------------------------------------------------------------
 
 
-def judge_port(path: str, problem: str | None, group: str, ports: Sequence[SerialDevice]) -> Iterator[Finding]:
-    """Yield the problem of a path that cannot be opened as a port."""
-    if problem is None:
-        return
+def judge_port(path: str, problem: str, group: str, ports: Sequence[SerialDevice]) -> Finding:
+    """Return the problem of a path that cannot be opened as a port, with its cure."""
     there = ", ".join(each.by_id or each.path for each in ports)
     fix = f"use one of: {there}" if there else "plug the adapter in; `dmesg | tail` says whether it was recognised"
     if is_address(path):
         fix = "correct --port"
     elif "permission" in problem:
         fix = f"sudo usermod -aG {group} $USER, then log out and in again"
-    yield Finding("error", path, problem, fix)
+    return Finding("error", path, problem, fix)
 
 
 def judge_opening(path: str, failure: str, held_by: Sequence[Holder]) -> Iterator[Finding]:
@@ -437,7 +435,7 @@ def judge_board(family: str, channels: int, answers: bool, device: SerialDevice)
 # --- all together -----------------------------------------------------------------------------------------------
 
 
-def grouped(findings: Sequence[Finding]) -> list[Finding]:
+def grouped(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings, worst first; the same problem of several servos is one finding, and its fix one command."""
     same: dict[object, list[Finding]] = {}
     for finding in findings:
@@ -460,8 +458,3 @@ def ids_text(ids: Sequence[int]) -> str:
         else:
             runs.append([servo])
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
-
-
-def summary(findings: Sequence[Finding]) -> dict[str, int]:
-    """Return the number of findings of each severity."""
-    return {name: sum(each.severity == name for each in findings) for name in SEVERITIES}

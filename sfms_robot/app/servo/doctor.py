@@ -6,12 +6,13 @@ another rate, of another model or not in the file, and whether the bus reaches t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from typing import Any, Final, cast
 
 from sfms_robot.app.servo.diagnosis import (
+    SEVERITIES,
     Budget,
     Finding,
     Line,
@@ -26,7 +27,6 @@ from sfms_robot.app.servo.diagnosis import (
     judge_rate,
     judge_servo,
     stored_contradictions,
-    summary,
     udev_rule,
     wire_budget,
 )
@@ -38,10 +38,9 @@ from sfms_robot.app.servo.serial_line import (
     check_baud,
     only_port,
     protocol_hint,
-    table_of,
 )
 from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
-from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config import Head, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
@@ -51,9 +50,8 @@ from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import family_named, servo_families
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
-from sfms_robot.servo.registers import Table
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
@@ -86,9 +84,7 @@ def examine(
     for key, value in (("--family", family), ("--baud", baud)):
         if head is not None and value is not None:
             raise ConfigError(f"{key} {value}: head {head!r} says that of each of its buses; leave out one of the two")
-    family = DEFAULT_FAMILY if family is None else family
-    if family not in servo_families():
-        raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
+    family = family or DEFAULT_FAMILY
     check_baud(family, baud)
     clock = RealClock()
     with ExitStack() as stack:
@@ -112,17 +108,15 @@ def examine_line(
     path, problem = line.device, access_problem(line.device)
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
-    findings = list(judge_port(path, problem, group_of(path), list_ports()))
     if problem is not None:
-        return _finished(report, findings, PORT_FAILED)
+        return _finished(report, [judge_port(path, problem, group_of(path), list_ports())], PORT_FAILED)
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port(path, line.first_baud)
     except PortError as error:
-        return _finished(report, [*findings, *judge_opening(path, str(error), held_by)], PORT_FAILED)
+        return _finished(report, judge_opening(path, str(error), held_by), PORT_FAILED)
     with closing(port):
         adapter = describe(path)  # after opening, which may have set the latency
-        findings += judge_adapter(adapter, held_by)
         report["adapter"] = asdict(adapter)
         try:
             if family_named(line.family).board:
@@ -133,12 +127,12 @@ def examine_line(
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
         else:
             report |= {**facts, "udev_rule": udev_rule(adapter)}
-    return _finished(report, [*findings, *found])
+    return _finished(report, [*judge_adapter(adapter, held_by), *found])
 
 
-def _finished(report: dict[str, Any], findings: Sequence[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
+def _finished(report: dict[str, Any], findings: Iterable[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
     together = grouped(findings)
-    counts = summary(together)
+    counts = {name: sum(each.severity == name for each in together) for name in SEVERITIES}
     found = [each.plain() for each in together]
     return {**report, "findings": found, "counts": counts, "exit_code": failed if counts["error"] else FINE}
 
@@ -262,17 +256,8 @@ def _at_this_rate(wire: Wire, line: Line, ids: Sequence[int]) -> dict[int, Found
         for servo in ids:
             if servo not in found and (seen := wire.ping(servo)) is not None:
                 found[servo] = seen
-    return {servo: _as_wanted(seen, line) for servo, seen in found.items()}
-
-
-def _as_wanted(seen: FoundServo, line: Line) -> FoundServo:
-    """Return a servo with the map of the head's file: some models have no number of their own, or share one."""
-    want = line.wanted.get(seen.id)
-    if want is None or want.model_number not in (None, seen.model_number):
-        return seen
-    if want.model_number is None:
-        return replace(seen, table=Table.of(load_firmware_map(want.model)))
-    return replace(seen, table=table_of(line.family, seen.model_number, seen.firmware, want.model))
+    wanted = line.wanted
+    return {id_: seen.taken_for(wanted[id_].model) if id_ in wanted else seen for id_, seen in found.items()}
 
 
 def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
@@ -341,10 +326,8 @@ def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: Seria
 
 def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
     want = line.wanted.get(state.seen.id)
-    units = {"voltage_V": "voltage", "temperature_degC": "temperature", "return_delay_us": "return_delay"}
-    measured = {key: None if (x := state.in_unit(role)) is None else round(x, 1) for key, role in units.items()}
-    joint = want.joint if want else None
-    return {**state.seen.row(), "joint": joint, **measured, "torque": state.torque(), "faults": state.faults()}
+    measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
+    return {**state.seen.row(), "joint": want and want.joint, **measured, **state.health()}
 
 
 # --- a board of hobby servos ----------------------------------------------------------------------------------------

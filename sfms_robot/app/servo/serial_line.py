@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final
 
@@ -59,6 +59,17 @@ class FoundServo:
             known = [*sorted(file.stem for file in map_files()), "or --model MODEL"]
             raise ConfigError.at(f"servo {self.id}", "model number", self.model_number, "has no firmware map", known)
         return self.table
+
+    def taken_for(self, model: str) -> FoundServo:
+        """Return it with the map of `model`, unless its model number is of another one.
+
+        Some models have no number of their own, or share one.
+        """
+        number = load_firmware_map(model).model_number
+        if number is not None and self.model_number not in (None, number):
+            return self
+        table = number and table_of(self.wire.family, self.model_number, self.firmware, model)
+        return replace(self, table=table or Table.of(load_firmware_map(model)))
 
     def named(self, name: str) -> Field:
         """Return a register by its name or its role. Raises ConfigError with the names there are."""

@@ -125,18 +125,25 @@ class ServoState:
         value = self.value("torque_enable")
         return None if value is None else bool(value)
 
-    def row(self, faults: str | None = None) -> dict[str, Any]:
-        """Return the row of `servo monitor`, with other `faults` for a servo that was not read."""
-        units = {
-            "position_deg": "present_position",
-            "current_mA": "present_current",
-            "load_percent": "present_load",
-            "voltage_V": "voltage",
-            "temperature_degC": "temperature",
-        }
-        measured = {key: None if (x := self.in_unit(role)) is None else round(x, 2) for key, role in units.items()}
+    def measured(self, digits: int, **roles: str) -> dict[str, float | None]:
+        """Return values in their units, each under the name of its argument; None for one that was not read."""
+        return {key: None if (x := self.in_unit(role)) is None else round(x, digits) for key, role in roles.items()}
+
+    def health(self) -> dict[str, Any]:
+        return {"torque": self.torque(), "faults": self.faults()}
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of `servo monitor`."""
+        measured = self.measured(
+            2,
+            position_deg="present_position",
+            current_mA="present_current",
+            load_percent="present_load",
+            voltage_V="voltage",
+            temperature_degC="temperature",
+        )
         who = {"id": self.seen.id, "model": self.seen.model, "position": self.value("present_position")}
-        return {**who, **measured, "torque": self.torque(), "faults": self.faults() if faults is None else faults}
+        return {**who, **measured, **self.health()}
 
 
 def read_all(seen: FoundServo) -> ServoState:
@@ -165,11 +172,11 @@ def watched(seen: FoundServo) -> dict[str, Any]:
     """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
     names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
     if seen.table is None or not names:
-        return ServoState(seen, {}).row("no firmware map")
+        return ServoState(seen, {}).row() | {"faults": "no firmware map"}
     start, length = seen.table.span(names)
     answer = seen.wire.at(seen.baud).read(seen.id, start, length)
     if answer is None or seen.wire.link.refusal(answer):
-        return ServoState(seen, {}).row("silent")
+        return ServoState(seen, {}).row() | {"faults": "silent"}
     return ServoState.of(seen, start, answer.data, answer.error).row()
 
 
