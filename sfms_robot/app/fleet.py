@@ -353,26 +353,6 @@ class Fleet:
             log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
 
 
-class FleetBoard:
-    """The newest document of every head, and which heads are away. From any thread."""
-
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s = now_s
-        self._heads: dict[str, tuple[float, Document]] = {}
-        self._lock = threading.Lock()
-
-    def put(self, document: Document) -> None:
-        """Take a document in."""
-        with self._lock:
-            self._heads[str(document.get("name", "?"))] = (self._now_s(), document)
-
-    def tiles(self) -> list[dict[str, Any]]:
-        """Return what a page shows of each head, by name."""
-        with self._lock:
-            heads = sorted(self._heads.items())
-        return [tile(name, document, self._now_s() - at_s) for name, (at_s, document) in heads]
-
-
 def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
     """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
     state = str(document.get("state", "?"))
@@ -399,17 +379,22 @@ def fleet_page(fleet: Fleet, port: int = PORT) -> LocalServer:
 
     from sfms_robot.viewer.web_server import LocalServer, json_body
 
-    board = FleetBoard()
+    newest: dict[str, tuple[float, Document]] = {}  # of each head, and when it came
+
+    def put(document: Document) -> None:
+        newest[str(document.get("name", "?"))] = time.monotonic(), document
+
     for document in fleet.states():
-        board.put(document)
-    fleet.follow(board.put)
+        put(document)
+    fleet.follow(put)
 
     def page(request: Request) -> Response:
         inline = "default-src 'self' data: 'unsafe-inline'; frame-ancestors 'none'"
         return HTMLResponse(PAGE.read_bytes(), headers={"content-security-policy": inline})
 
     def tiles(request: Request) -> Response:
-        return JSONResponse({"heads": board.tiles()})
+        heads, now_s = sorted(newest.copy().items()), time.monotonic()
+        return JSONResponse({"heads": [tile(name, document, now_s - came_s) for name, (came_s, document) in heads]})
 
     async def order(request: Request) -> Response:
         heads = (await json_body(request)).get("heads", [])

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
-PAGE: Final = "sfms_robot.app.listen.page_scene:main"
+PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
 
@@ -122,10 +122,9 @@ def check_names(options: RunOptions) -> None:
 
 def engine_named(name: str) -> EngineName:
     """Return the engine of that name. Raises ConfigError."""
-    for known in ENGINES:
-        if name == known:
-            return known
-    raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    if name not in ENGINES:
+        raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    return name
 
 
 def begin_listening(options: RunOptions) -> NamedFeed:

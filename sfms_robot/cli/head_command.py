@@ -252,14 +252,14 @@ def fit(
     with tempfile.TemporaryDirectory() as spare:
         folder = record if record is not None else Path(spare)
         servos = HeadOptions(head=name, port=port, fast=port == "sim", yes=yes)
-        head, drove = move(servos, folder, minutes=minutes, seed=seed)
-        if port == "sim" and drove.outcome == "done":
-            see_virtual_face(head, folder)
+        report = move(servos, folder, minutes=minutes, seed=seed)
+        if port == "sim" and report["exit"] == "done":
+            see_virtual_face(name, folder)
             show(fit_head(name, folder, practice=True), json)
             return
-    seconds = round(drove.log.listened_s, 1)
-    moved = {"head": head.name, "exit": drove.outcome, "seconds": seconds, "record": str(record)}
-    show(moved, json, lambda _: say(f"{drove.outcome}: {folder}/run.mcap; put the face track beside it"))
+    seconds = round(report["duration_s"], 1)
+    moved = {"head": report["head"], "exit": report["exit"], "seconds": seconds, "record": str(record)}
+    show(moved, json, lambda _: say(f"{report['exit']}: {folder}/run.mcap; put the face track beside it"))
 
 
 @app.command("solve")

@@ -46,6 +46,18 @@ class Nodder:
         return sr.Plan(speaker.time_s, times, frames), memory + 1
 
 
+class Still(Nodder):
+    """A listener whose face stands still."""
+
+    def __init__(self, face):
+        super().__init__()
+        self._face = face
+
+    def step(self, speaker, memory):
+        plan, memory = super().step(speaker, memory)
+        return sr.Plan(plan.made_at_s, plan.times_s, np.full((2, MOTION_DIM), self._face, np.float32)), memory
+
+
 def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end():
     told = []
     with sr.Robot(HEAD, listener=(nodder := Nodder())) as robot:
@@ -104,30 +116,18 @@ def test_it_runs_in_any_thread_and_stops_from_another():
     assert robot.state == "stopped"
 
 
-def test_virtual_time_a_source_by_name_and_the_end_by_itself():
-    with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Nodder()) as robot:
-        robot.show({"pitch": -0.2}, seconds=0.5)
-        robot.look_at(1.0, 0.2, 0.0, seconds=0.5)
-        assert robot.wait()
-    report = robot.report()
-    assert (report["exit"], report["frames"], report["limits"]["violations"]) == ("done", 75, 0)
-
-
 def test_show_reaches_the_servos_and_intensity_zero_keeps_them_still():
     travels = []
     for intensity in (1.0, 0.0):
-        with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Still(), seed=1) as robot:
+        with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Still(0.1), seed=1) as robot:
             for region in robot.knobs:
                 robot.knobs[region].intensity = intensity
-            robot.wait()
-        travels.append(sum(joint["travel_rad"] for joint in robot.report()["joints"].values()))
+            robot.look_at(1.0, 0.2, 0.0, seconds=0.5)
+            assert robot.wait()
+        report = robot.report()
+        assert (report["exit"], report["frames"], report["limits"]["violations"]) == ("done", 75, 0)
+        travels.append(sum(joint["travel_rad"] for joint in report["joints"].values()))
     assert travels[0] > 2 * travels[1]
-
-
-class Still(Nodder):
-    def step(self, speaker, memory):
-        plan, memory = super().step(speaker, memory)
-        return sr.Plan(plan.made_at_s, plan.times_s, np.full((2, 58), 0.1, np.float32)), memory
 
 
 class BadSource(sr.Source):
@@ -300,14 +300,6 @@ def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report
 # --- speech that is played ---
 
 
-class Resting(Nodder):
-    """A listener whose face rests."""
-
-    def step(self, speaker, memory):
-        plan, memory = super().step(speaker, memory)
-        return sr.Plan(plan.made_at_s, plan.times_s, np.zeros((2, MOTION_DIM), np.float32)), memory
-
-
 def until(robot, state):
     for _ in range(round(LIMIT_S / LOOK_S)):
         if robot.state == state:
@@ -319,7 +311,7 @@ def until(robot, state):
 @pytest.mark.slow
 def test_what_it_says_is_played_and_it_speaks_until_it_is_hushed(sound_server):
     noise = (0.3 * np.random.default_rng(0).uniform(-1, 1, 60 * 24_000)).astype(np.float32)
-    with sr.Robot("interbotix_wxxms", listener=Resting(), play="person") as robot:
+    with sr.Robot("interbotix_wxxms", listener=Still(0.0), play="person") as robot:
         until(robot, "idle")
         robot.say(noise, 24_000)
         until(robot, "speaking")
@@ -336,6 +328,6 @@ def test_what_is_said_elsewhere_is_not_played(sound_server):
 
     with pytest.raises(sr.InputError, match="play='person': what a source of your own says is not played"):
         sr.Robot("interbotix_wxxms", source=Nobody(), play="person")
-    robot = sr.Robot("interbotix_wxxms", listener=Resting(), audio="katie", play="person")
+    robot = sr.Robot("interbotix_wxxms", listener=Still(0.0), audio="katie", play="person")
     with pytest.raises(sr.ConfigError, match="^--play person: nothing is played of --agent-audio none"):
         robot.start()

@@ -30,6 +30,8 @@ def with_nan(values):
 
 
 FACE = "data/train/coefficients/listener/session0/take_0.npy"
+VOICE = "data/train/audio/speaker/session0/take_0.wav"
+MOOD = "data/train/facial-attributes/listener/session0/take_0.npy"
 
 
 @pytest.mark.parametrize(
@@ -41,28 +43,10 @@ FACE = "data/train/coefficients/listener/session0/take_0.npy"
         (lambda root: broken_npy(root / FACE, lambda x: x[..., :50]), "wrong dims", "listener/session0/take_0.npy"),
         (lambda root: broken_npy(root / FACE, lambda x: x[:20]), "lengths differ", "session0+take_0"),
         (lambda root: broken_npy(root / FACE, with_nan), "not finite", "listener/session0/take_0.npy"),
-        (
-            lambda root: (root / "data/train/audio/speaker/session0/take_0.wav").unlink(),
-            "missing sound",
-            "audio/speaker/session0/take_0.wav",
-        ),
-        (
-            lambda root: write.wav(root / "data/train/audio/speaker/session0/take_0.wav", 0.5),
-            "lengths differ",
-            "audio/speaker/session0/take_0.wav",
-        ),
-        (
-            lambda root: (root / "data/train/audio/speaker/session0/take_0.wav").write_bytes(b"RIFF"),
-            "unreadable",
-            "session0+take_0",
-        ),
-        (
-            lambda root: broken_npy(
-                root / "data/train/facial-attributes/listener/session0/take_0.npy", lambda x: x[:, :20]
-            ),
-            "wrong dims",
-            "facial-attributes/listener/session0/take_0.npy",
-        ),
+        (lambda root: (root / VOICE).unlink(), "missing sound", "audio/speaker/session0/take_0.wav"),
+        (lambda root: write.wav(root / VOICE, 0.5), "lengths differ", "audio/speaker/session0/take_0.wav"),
+        (lambda root: (root / VOICE).write_bytes(b"RIFF"), "unreadable", "session0+take_0"),
+        (lambda root: broken_npy(root / MOOD, lambda x: x[:, :20]), "wrong dims", MOOD.removeprefix("data/train/")),
     ],
 )
 def test_one_harm_is_one_named_problem_and_the_rest_is_usable(tmp_path, harm, kind, where):

@@ -54,9 +54,6 @@ def test_a_recorded_voice_can_be_checked_and_is_shown_as_it_comes():
     levels = []
     told = check_sound("katie", 0.4, lambda level_db, clips: levels.append((level_db, clips)))
     assert len(levels) == 10 and told["seconds"] == 0.4 and told["audio"] == "katie"
-
-
-def test_there_is_nothing_to_check_of_nobody():
     with pytest.raises(ConfigError, match="--check: there is nothing to listen to"):
         check_sound("none")
 

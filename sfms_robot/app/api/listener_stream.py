@@ -87,7 +87,7 @@ class ListenerStream:
         time_s = (self._frames + 1) / FRAME_HZ
         said = None if agent_audio is None else _checked("agent_audio", agent_audio)
         heard = np.zeros(0, np.float32) if audio is None else _checked("audio", audio)
-        seen = face
+        seen: FaceFrame | None = None
         if face is not None:
             motion = _checked("face", face.motion if isinstance(face, FaceFrame) else face)
             seen = FaceFrame(time_s, motion[:6], motion[6:], getattr(face, "jaw_rad", None))

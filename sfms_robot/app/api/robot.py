@@ -18,19 +18,15 @@ from sfms_robot.app.api.servos import Background, Driven, Progress, Report, head
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.options import SIM, RunOptions, begin_listening
-from sfms_robot.app.session import run
+from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.listeners.thread import ListenerThread
-from sfms_robot.ports import Listener, Observer, Source
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.puppet import Puppet
-from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.ports import Listener, Source
 from sfms_robot.runtime.planned_events import EventWatch
-from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
 from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
@@ -102,7 +98,6 @@ class Robot(Driven):
         if play is not None and source is not None:
             raise InputError(f"play={play!r}: what a source of your own says is not played; leave it out")
         own = listener if not isinstance(listener, (str, Path)) else None
-        self._calmness = parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness")
         self._options = RunOptions(
             head=head_name(head),
             port=port,
@@ -117,22 +112,21 @@ class Robot(Driven):
             duration_s=duration_s,
             seed=seed,
             engine=engine,
-            calmness=self._calmness,
+            intensity=_turned(intensity),
+            style=_turned(style),
+            calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
             record=None if record is None else Path(record),
             overwrite=overwrite,
         )
         prepare_head(self._options)
-        config = load_head(self._options.head)
         self._listener = own
-        self._feed: ListenerThread | NamedFeed | None = None
         self._person = (PushedVoice(), PushedSight()) if pushed else None
         hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
         self._speech = PushedSpeech() if pushed or hears else None
         self._source = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
-        self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
-        self._knobs = LiveKnobs(config, intensity or {}, style or {})
+        self._controls = RunControls(load_head(self._options.head), self._options)
 
     def __enter__(self) -> Self:
         return self.start()
@@ -141,7 +135,7 @@ class Robot(Driven):
         """Open the head, torque on, listen. Blocks until the first tick, a second or three. Raises RobotError."""
         if self._run is not None:
             raise ConfigError("this robot was started before: make another Robot")
-        self._run = Background(self._drive)
+        self._run = Background(self._drive, self._controls.interrupt, self._controls.halt)
         self._run.start()
         return self
 
@@ -232,19 +226,19 @@ class Robot(Driven):
         Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer face starts from the present one.
         Never blocks. Raises InputError for another shape, an unknown channel, or a value that is not finite.
         """
-        self._puppet.show(face58, seconds)
+        self._controls.puppet.show(face58, seconds)
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float = 2.0) -> None:
         """Look at a point for `seconds`, in metres from the middle of the head: x forward, y to its left, z up.
 
         Eyes first, then the head with its share. Never blocks. Raises InputError for a point that is not finite.
         """
-        self._puppet.look_at(x_m, y_m, z_m, seconds)
+        self._controls.puppet.look_at(x_m, y_m, z_m, seconds)
 
     @property
     def knobs(self) -> LiveKnobs:
         """Regions of the head: `robot.knobs["neck"].intensity = 0.5`, `.style`, 0..2."""
-        return self._knobs
+        return self._controls.knobs
 
     def calm(self, addressed: str | None = None, **per_minute: float | None) -> None:
         """Set the rate of events per minute: `robot.calm(nod=2.2, addressed="assume")`; None: the rate of people.
@@ -252,10 +246,7 @@ class Robot(Driven):
         Kinds that are not named keep their rate. It has no effect on a listener that decides no events, nor in virtual
         time once it runs. Raises ConfigError for an unknown kind and an invalid rate.
         """
-        rates = {**self._calmness.model_dump(), **per_minute}
-        self._calmness = parse(Calmness, rates if addressed is None else rates | {"addressed": addressed}, "calm")
-        if self._feed is not None:
-            self._feed.calm(self._calmness)
+        self._controls.calm(per_minute if addressed is None else {**per_minute, "addressed": addressed})
 
     # --- events, state, report ---
 
@@ -294,16 +285,18 @@ class Robot(Driven):
             "callbacks_detached": dict(self._events.detached),
         }
 
-    def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
-        options = self._options
+    def _drive(self, now: Background) -> Report:
+        options, controls = self._options, self._controls
         source: Source | None = self._source
+        feed: ListenerThread | NamedFeed | None = None
         with ExitStack() as stack:
             if self._listener is not None:
-                self._feed = ListenerThread(self._listener, options.seed)
+                feed = ListenerThread(self._listener, options.seed)
             elif not options.fast:  # in virtual time the run steps one inline
-                self._feed = begin_listening(replace(options, calmness=self._calmness))
-            if self._feed is not None:
-                stack.callback(self._feed.close)
+                feed = begin_listening(replace(options, calmness=controls.calmness))
+            if feed is not None:
+                stack.callback(feed.close)
+                controls.set_rates = feed.calm
             if source is None and self._speech is not None:
                 if self._person is not None:
                     own = self._speech if options.play is None else open_playback(options.play, self._speech)
@@ -313,14 +306,9 @@ class Robot(Driven):
                         options.hears, options.face, options.duration_s, agent=self._speech, play=options.play
                     )
                 stack.callback(source.close)
-            return run(
-                options,
-                source=source,
-                feed=self._feed,
-                observers=[progress, self._events],
-                knobs=self._knobs,
-                overlay=self._puppet.overlay,
-                interrupt=interrupt,
-                halt=halt,
-                signals=False,
-            )
+            watchers = [now.progress, self._events]
+            return run(options, source=source, feed=feed, observers=watchers, controls=controls, signals=False)
+
+
+def _turned(regions: Mapping[str, float] | None) -> tuple[str, ...]:
+    return tuple(f"{region}={value}" for region, value in (regions or {}).items())

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import run_report
+from sfms_robot.app.listen.report import failure, run_report
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
-from sfms_robot.errors import BusError, ConfigError, InputError, ModelError, PortError, RobotError
+from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
 from sfms_robot.frames import POSE, Doubles, Floats, Reading, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD: Final = 1e-3  # of the goal sent; the servo itself is behind by its lag
 SLACK_RAD: Final = 1e-9  # so that the end of a range, computed twice, is inside it
 _LOOK_S: Final = 0.01
-_KINDS: Final = {kind.exit_code: kind for kind in (PortError, BusError, ModelError)}
 
 Report = Mapping[str, Any]
 
@@ -60,19 +59,20 @@ class Progress(Observer):
 
 
 class Background:
-    """A run in its own thread: `work` drives a head until the interrupt is set, and returns its report.
+    """A run in its own thread: `work` drives a head until `interrupt` is set, and returns its report.
 
     A program that ends without `stop` is stopped at its exit: the head comes to rest first.
 
     Attributes:
         progress: the newest tick, and counts.
-        halt: emergency stop.
+        interrupt: ends it; `halt`: emergency stop.
     """
 
-    def __init__(self, work: Callable[[Interrupt, HaltLatch, Observer], Report]) -> None:
+    def __init__(
+        self, work: Callable[[Background], Report], interrupt: Interrupt | None = None, halt: HaltLatch | None = None
+    ) -> None:
         self._work = work
-        self._interrupt = Interrupt()
-        self.halt = HaltLatch()
+        self.interrupt, self.halt = interrupt or Interrupt(), halt or HaltLatch()
         self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
         self._error: Exception | None = None
         self._raised = False
@@ -122,14 +122,14 @@ class Background:
         """
         if self._thread.is_alive() and not self._stopping:
             self._stopping = True
-            self._interrupt.ask()
+            self.interrupt.ask()
         self._end()
 
     def release(self) -> None:
         """Torque off now, without coming to rest first. From any thread; does not wait. Raises nothing."""
         self._stopping = True
-        self._interrupt.ask()
-        self._interrupt.ask()
+        self.interrupt.ask()
+        self.interrupt.ask()
 
     def check(self) -> None:
         """Raise the error that ended the run, if there is one; once."""
@@ -148,10 +148,8 @@ class Background:
 
     def _run(self) -> None:
         try:
-            self.report = self._work(self._interrupt, self.halt, self.progress)
-            if self.report["exit"] == "failed":
-                kind = _KINDS.get(self.report.get("exit_code", 1), RobotError)
-                self._error = kind(self.report["error"])
+            self.report = self._work(self)
+            self._error = failure(self.report)
         except RobotError as error:
             self._error = error
         except Exception as error:
@@ -322,10 +320,10 @@ class Servos(Driven):
             raise InputError(f"{self.joints[worst]} = {angles[worst]:g} rad is not in {low:.4f}..{high:.4f}")
         return np.clip(angles, self.low_rad, self.high_rad)
 
-    def _drive(self, interrupt: Interrupt, halt: HaltLatch, observer: Observer) -> Report:
+    def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
-        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=halt, observers=[observer])
-        drove = drive_head(opened, parts, interrupt, signals=False)
+        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now.progress])
+        drove = drive_head(opened, parts, now.interrupt, signals=False)
         return run_report(opened, drove, alone, "none", 0)
 
 

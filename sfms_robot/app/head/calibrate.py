@@ -21,13 +21,12 @@ import numpy as np
 from sfms_robot.app.open_head import build_bus, build_motion, fastest_hz, identify
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.servo.move import SPEED_DEG_S
-from sfms_robot.app.wiring import Opened, open_wires
+from sfms_robot.app.wiring import Opened, calibration_of, open_wires
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.overlay import (
     CalibrateLayer,
     Identity,
     Measured,
-    Overlay,
     head_hash,
     layered,
     load_overlay,
@@ -146,7 +145,11 @@ def calibrate_on(
                 outcome.skipped[joint] = str(reason)
                 say(f"  left out: {reason}")
                 continue
-            overlay = _with(overlay, sha256, joint, found)
+            known = overlay.calibrate.joints if overlay.calibrate is not None else {}
+            layer = CalibrateLayer(head_sha256=sha256, joints={**known, joint: found})
+            overlay = overlay.model_copy(update={"calibrate": layer})
+            if overlay.stored is not None:
+                overlay = overlay.recorded(sha256, joint, found.stored)
             save_overlay(overlay, file)
             outcome.measured.append(joint)
             say("  saved")
@@ -252,14 +255,6 @@ class Guide:
         return answer
 
 
-def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay:
-    """Return the overlay with a measurement added."""
-    joints = overlay.calibrate.joints if overlay.calibrate is not None else {}
-    layer = CalibrateLayer(head_sha256=sha256, joints={**joints, joint: found})
-    overlay = overlay.model_copy(update={"calibrate": layer})
-    return overlay.recorded(sha256, joint, found.stored) if overlay.stored is not None else overlay
-
-
 def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: CalibrationOutcome) -> None:
     """Read the file back, apply it to the head, and build the head's motion from it."""
     try:
@@ -288,15 +283,14 @@ class JointProbe:
     def __init__(self, name: str, joint: Joint, bus: Bus, clock: Clock) -> None:
         self.name = name
         self.tells = "position" in bus.capabilities[name]
-        self._travel = _travel_ticks(joint)
         self._joint, self._bus, self._clock = joint, bus, clock
-        self._per_rad: float = math.degrees(1.0) * _ticks_per_deg(joint)
+        self._calibration = calibration_of({name: joint})
         self._goal_rad: float | None = None  # with torque, where it is held
 
     @property
     def ticks_per_deg(self) -> float:
         """Ticks per degree of the joint, without direction."""
-        return abs(self._per_rad) / math.degrees(1.0)
+        return math.radians(abs(float(self._calibration.ticks_per_rad[0])))
 
     def ticks(self) -> int:
         """Return its position; of a servo that reports none, its goal. Raises ServoError."""
@@ -320,7 +314,8 @@ class JointProbe:
         """Move slowly to `ticks`, torque on from where it stands, and hold. Blocks until then."""
         if self._goal_rad is None:
             self._goal_rad = float(self._bus.enable([self.name])[0])
-        start_rad, to_rad = self._goal_rad, self._angle(int(np.clip(ticks, *self._travel)))
+        inside = np.clip([ticks], self._calibration.low_ticks, self._calibration.high_ticks)
+        start_rad, to_rad = self._goal_rad, float(self._calibration.to_rad(inside)[0])
         steps = max(1, math.ceil(math.degrees(abs(to_rad - start_rad)) / (SPEED_DEG_S * _PERIOD_S)))
         began_s = self._clock.now_s()
         for k in range(1, steps + 1):
@@ -335,10 +330,7 @@ class JointProbe:
         self.go(here + round(step_deg * self.ticks_per_deg))
 
     def _ticks(self, angle_rad: float) -> int:
-        return round(self._joint.zero_ticks + self._per_rad * angle_rad)
-
-    def _angle(self, ticks: int) -> float:
-        return (ticks - self._joint.zero_ticks) / self._per_rad
+        return int(self._calibration.to_ticks(np.array([angle_rad]))[0])
 
 
 @contextmanager
@@ -366,19 +358,13 @@ def probe(
         bus.close()
 
 
-def _ticks_per_deg(joint: Joint) -> float:
-    return joint.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
-
-
-def _travel_ticks(joint: Joint) -> tuple[int, int]:
-    """Return the first and last tick that the servo, or a common one on a board, may be sent to."""
+def _whole_travel(joint: Joint) -> dict[str, float]:
+    """Return the range in which the servo, or a common one on a board, can be sent anywhere; rest is inside."""
     firmware = load_firmware_map(joint.model)
+    ticks = 0, int(firmware.ticks_per_revolution) - 1
     if firmware.pulse_us is not None and firmware.tick_us is not None:
         shortest, longest = max(firmware.pulse_us.min, _PULSE_US[0]), min(firmware.pulse_us.max, _PULSE_US[1])
-        return math.ceil(shortest / firmware.tick_us), math.floor(longest / firmware.tick_us)
-    return 0, int(firmware.ticks_per_revolution) - 1
-
-
-def _whole_travel(joint: Joint) -> dict[str, float]:
-    ends = sorted((ticks - joint.zero_ticks) / _ticks_per_deg(joint) for ticks in _travel_ticks(joint))
+        ticks = math.ceil(shortest / firmware.tick_us), math.floor(longest / firmware.tick_us)
+    per_deg = joint.sign * joint.ratio * firmware.ticks_per_revolution / 360.0
+    ends = sorted((tick - joint.zero_ticks) / per_deg for tick in ticks)
     return {"min_deg": min(ends[0], joint.rest_deg), "max_deg": max(ends[1], joint.rest_deg)}

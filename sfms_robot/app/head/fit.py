@@ -10,7 +10,6 @@ faces do. Poses of the head stay at rest, so that a camera in front of it sees t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -18,8 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
-from sfms_robot.app.listen.report import Drove
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.listen.report import failure
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import Head, load_head
@@ -29,8 +27,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import Units
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
-from sfms_robot.runtime.recorder import Recorder
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.spaces import bounded_least_squares
 from sfms_robot.signals.tracks import Track, read_track, write_track
@@ -51,26 +49,17 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
-def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> tuple[Head, Drove]:
-    """Move, and write DIR/run.mcap. Block until then; return the head and the end of the drive.
+def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> dict[str, Any]:
+    """Move, and record the run in a folder. Block until then; return its report.
 
     Raises RobotError, the head at rest.
     """
-    with ExitStack() as stack:
-        opened = stack.enter_context(open_head(options))
-        blind = set(opened.motion.retargeter.blind_channels)
-        faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
-        recorder = Recorder(
-            record,
-            list(opened.config.joints),
-            when_full="wait" if options.fast else "drop",
-            about={"head": opened.config.name},
-        )
-        stack.callback(recorder.close)
-        drove = faces.play(opened, recorder)
-    if drove.error is not None:
-        raise drove.error
-    return opened.config, drove
+    blind = HeadRetargeter(load_head(options.head)).blind_channels
+    faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
+    report = faces.play(options, record=record)
+    if (error := failure(report)) is not None:
+        raise error
+    return report
 
 
 def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceTrack:
@@ -133,7 +122,7 @@ def fit_head(name: str, recording: Path, practice: bool = False) -> dict[str, An
 def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for j, (joint, response) in enumerate(zip(head.joints, responses, strict=True)):
-        row = {"joint": joint, "moved": None, "before": None, "after": None}
+        row: dict[str, Any] = {"joint": joint, "moved": None, "before": None, "after": None}
         if response is not None:
             seen = looks[:, j] - response.offset
             row |= {"moved": response.moved, "before": rms(seen - has[:, j]), "after": rms(seen - response(has[:, j]))}
@@ -189,9 +178,9 @@ def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes:
     return round(float(_DELAYS_S[int(np.argmax(scores))]), 3)
 
 
-def see_virtual_face(head: Head, folder: Path) -> None:
+def see_virtual_face(name: str, folder: Path) -> None:
     """Write the track of a virtual face, with a random skin, beside a recorded run on emulated servos."""
-    run = read_recording(folder)
+    head, run = load_head(name), read_recording(folder)
     columns = [run.joints.index(joint) for joint in head.joints]
     step = max(1, round(0.04 / float(np.median(np.diff(run.times_s)))))
     angles = np.where(np.isfinite(run.present_rad), run.present_rad, run.goals_rad)[::step, columns]

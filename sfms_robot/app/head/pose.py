@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.listen.report import Drove, outcome
-from sfms_robot.app.open_head import OpenHead, open_head
-from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, run_parts
+from sfms_robot.app.listen.report import OUTCOME, failure
+from sfms_robot.app.options import HeadOptions, RunOptions
+from sfms_robot.app.session import Panel, run
+from sfms_robot.config import Head, load_head
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import IDLE_FEED
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.safety import EASE_S, Interrupt
+from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.5
@@ -85,19 +86,18 @@ def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -
 
     Blocks until then. Raises any other RobotError, the head at rest.
     """
-    face = parse_face(words)
-    with open_head(options) as opened:
-        motion = opened.motion
-        furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        drove = held_face(face, hold_s).play(opened, furthest)
-    if drove.error is not None and not isinstance(drove.error, TorqueError):
-        raise drove.error
-    shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
+    face, head = parse_face(words), load_head(options.head)
+    furthest = Furthest(head)
+    report = held_face(face, hold_s).play(options, observers=[furthest])
+    error = failure(report)
+    if error is not None and str(error) != str(TorqueError(report["torque_unconfirmed"])):
+        raise error
+    blind = HeadRetargeter(head).blind_channels
     return {
-        **outcome(opened, drove),
+        **{key: report[key] for key in OUTCOME},
         "face": list(words),
         "joints": furthest.moved(),
-        "blind": [name for name in shown if name in motion.retargeter.blind_channels],
+        "blind": [name for name, index in CHANNEL_INDEX.items() if face[index] and name in blind],
     }
 
 
@@ -115,19 +115,19 @@ class FaceTrack:
 
     def play(
         self,
-        opened: OpenHead,
-        observer: Observer,
-        interrupt: Interrupt | None = None,
+        options: HeadOptions,
+        panel: Panel | None = None,
         *,
-        signals: bool = True,
-        log: RunLog | None = None,
-        **more: Any,
-    ) -> Drove:
-        """Drive a head with this track once, without a person or a listener. `more`: see `run_parts`."""
+        listener: str = "none",
+        record: Path | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> dict[str, Any]:
+        """Run once with this track in place of a person and a listener; return the report. `listener`: its name."""
         alone = NobodyThere()
-        parts = run_parts(opened, alone, alone, timeline=self, observers=[observer], **more)
-        duration_s = self.duration_s
-        return drive_head(opened, parts, interrupt or Interrupt(), duration_s=duration_s, signals=signals, log=log)
+        chosen = RunOptions(
+            **vars(options), listener=listener, duration_s=self.duration_s, record=record, overwrite=True
+        )
+        return run(chosen, panel, source=alone, feed=alone, timeline=self, observers=observers)
 
     def start(self) -> None:
         return None
@@ -176,9 +176,10 @@ class NobodyThere(Source):
 class Furthest(Observer):
     """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
 
-    def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
-        self._joints, self._rest_rad = tuple(joints), rest_rad
-        self._sent, self._reached = np.zeros(len(rest_rad)), np.full(len(rest_rad), np.nan)
+    def __init__(self, head: Head) -> None:
+        self._joints = tuple(head.joints)
+        self._rest_rad = np.array([joint.rest_rad for joint in head.joints.values()])
+        self._sent, self._reached = np.zeros(len(self._joints)), np.full(len(self._joints), np.nan)
 
     def tick(self, seen: Tick) -> None:
         if seen.time_s < EASE_S:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -21,7 +21,6 @@ import numpy as np
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.head.pose import EXPRESSIONS
-from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.page_observer import (
     PageObserver,
     PageRecorder,
@@ -30,15 +29,12 @@ from sfms_robot.app.listen.page_observer import (
 )
 from sfms_robot.app.listen.report import run_facts
 from sfms_robot.app.options import RunOptions, begin_listening
-from sfms_robot.config import Calmness, load_head, parse
+from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.puppet import Puppet
-from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
 from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, open_source, split_kind
@@ -47,55 +43,10 @@ from sfms_robot.viewer.page_process import PageProcess
 AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
 LEFT_S: Final = 30.0
 BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it
+_FEEDS: Final = ("voice", "face")  # of a person
 _LOOK_S: Final = 0.5
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(kw_only=True)
-class PageReach:
-    """Commands of a page on a run.
-
-    Attributes:
-        calm: sets how often the listener does what.
-        record: begins a recording, or ends it.
-        release: torque off at once, as a second Ctrl-C does; the run ends with it.
-    """
-
-    halt: HaltLatch
-    puppet: Puppet
-    knobs: LiveKnobs
-    calmness: Calmness
-    calm: Callable[[Calmness], None]
-    record: Callable[[bool], None]
-    release: Callable[[], None]
-
-    def do(self, name: str, values: Mapping[str, Any]) -> None:
-        """Carry out a command. Raises RobotError."""
-        match name:
-            case "halt":
-                self.halt.close(BY_PAGE, BY_PAGE)
-            case "resume":
-                self.halt.resume(BY_PAGE)
-            case "release":
-                self.release()
-            case "neutral":
-                self.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"])
-            case "show":
-                self.puppet.show(values["channels"], values["seconds"])
-            case "expression":
-                if values["name"] not in EXPRESSIONS:
-                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(EXPRESSIONS)})")
-                self.puppet.show(EXPRESSIONS[values["name"]], values["seconds"])
-            case "look_at":
-                self.puppet.look_at(**values)
-            case "knobs":
-                self.knobs.turn(values["intensity"], values["style"])
-            case "calm":
-                self.calmness = parse(Calmness, {**self.calmness.model_dump(), **values["rates"]}, "calm")
-                self.calm(self.calmness)
-            case "record":
-                self.record(values["on"])
 
 
 class PageSession:
@@ -108,16 +59,17 @@ class PageSession:
     Attributes:
         options: of the present run, or of the last one.
         released: a visitor has ended that run.
-        reach: the present run; None: there is none.
+        reach: controls of the present run; None: there is none.
+        recorder: of that run.
     """
 
     def __init__(self, page: PageProcess, options: RunOptions, folder: Path, choices: bool) -> None:
         self.page, self.options, self.released = page, options, False
-        self.reach: PageReach | None = None
+        self.reach: session.RunControls | None = None
+        self.recorder: PageRecorder | None = None
         self._folder, self._choices = folder, choices
         self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
         self._visitor = PageVisitor()
-        self._interrupt: Interrupt | None = None
         self._wanted: RunOptions | None = None
         self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
@@ -135,40 +87,35 @@ class PageSession:
         """
         options, head = self.options, load_head(self.options.head)
         joints, by_visitor = list(head.joints), _taken_of_visitors(options)
-        knobs, calmness = turned(head, options.intensity, options.style), options.calmness or Calmness()
-        watcher, interrupt = PageObserver(self.page, joints), Interrupt()
-        self._interrupt, self.released = interrupt, False
+        controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
+        self.released = False
         self._chosen.clear()
-
-        def shown(document: session.Document, *rest: Any) -> Any:
-            watcher.document = document
-            return nullcontext() if panel is None else panel(document, *rest)
-
+        watcher.document = lambda: controls.document()
         with ExitStack() as stack:
             if feed is None:
                 feed = stack.enter_context(closing(begin_listening(options)))
-            halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
+            controls.set_rates = feed.calm
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out if scene else ():
                 logger.warning("%s; the page leaves it out", line)
             speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
             facts = page_facts(
-                head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
-                speaker=speaker if speaker in speaker_names() else None, people=people_per_minute(options.listener),
-                knobs=knobs, source={name: self._choices or by for name, by in by_visitor.items()},
+                head,
+                options,
+                controls.knobs,
+                speaker if speaker in speaker_names() else None,
+                feeds=_FEEDS if self._choices else by_visitor,
                 choices=self._choices,
-            )  # fmt: skip
+            )
+            facts["people_per_minute"] = people_per_minute(options.listener)
             self.page.say("begin", scene=str(options.head), packages=options.packages, **facts)
-            recorder = PageRecorder(self.page, self._folder, joints, run_facts(head, options))
-            stack.callback(recorder.close)
-            self.reach = PageReach(
-                halt=halt, puppet=puppet, knobs=knobs, calmness=calmness, calm=feed.calm, record=recorder.record,
-                release=self._release,
-            )  # fmt: skip
+            self.recorder = PageRecorder(self.page, self._folder, joints, run_facts(head, options))
+            stack.callback(self.recorder.close)
+            self.reach = controls
             stack.callback(self._ended)
-            source, lonely = None, EndsAlone(self.page, interrupt)
-            watchers: list[Observer] = [watcher, recorder, *observers]
-            if any(by_visitor.values()):
+            source, lonely = None, EndsAlone(self.page, controls.interrupt)
+            watchers: list[Observer] = [watcher, self.recorder, *observers]
+            if by_visitor:
                 source = stack.enter_context(closing(open_source(
                     options.hears, options.face, options.duration_s, agent_audio=options.agent_audio,
                     play=options.play, visitor=self._visitor,
@@ -176,8 +123,8 @@ class PageSession:
                 if self._choices:  # nothing else would end it
                     watchers.append(lonely)
             report = session.run(
-                options, shown, source=source, feed=feed, observers=watchers, knobs=knobs, overlay=puppet.overlay,
-                interrupt=interrupt, halt=halt, more=lambda: {"page": self.page.statistics()},
+                options, panel, source=source, feed=feed, observers=watchers, controls=controls,
+                more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
         if report["exit"] == "interrupted" and lonely.ended:  # its proper end
             report |= {"exit": "done", "exit_code": 0}
@@ -218,7 +165,33 @@ class PageSession:
         elif self.reach is None:
             raise InputError(f"{name}: no run is on")
         else:
-            self.reach.do(name, values)
+            self._do(self.reach, name, values)
+
+    def _do(self, run: session.RunControls, name: str, values: Mapping[str, Any]) -> None:
+        match name:
+            case "halt":
+                run.halt.close(BY_PAGE, BY_PAGE)
+            case "resume":
+                run.halt.resume(BY_PAGE)
+            case "release":
+                self.released = True
+                run.release()
+            case "neutral":
+                run.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"])
+            case "show":
+                run.puppet.show(values["channels"], values["seconds"])
+            case "expression":
+                if values["name"] not in EXPRESSIONS:
+                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(EXPRESSIONS)})")
+                run.puppet.show(EXPRESSIONS[values["name"]], values["seconds"])
+            case "look_at":
+                run.puppet.look_at(**values)
+            case "knobs":
+                run.knobs.turn(values["intensity"], values["style"])
+            case "calm":
+                run.calm(values["rates"])
+            case "record" if self.recorder is not None:
+                self.recorder.record(values["on"])
 
     def person(self, visitor: int, message: bytes) -> None:
         """Take a piece of the voice, or a face, of the visitor that is the person. Raises PacketError."""
@@ -243,27 +216,20 @@ class PageSession:
         self._want(changes[what])
 
     def _feeds(self, visitor: int, feeds: Sequence[str]) -> None:
-        takes = _taken_of_visitors(self._wanted or self.options)
-        if feeds and self._choices and not all(takes.values()):
+        taken = _taken_of_visitors(self._wanted or self.options)
+        if feeds and self._choices and len(taken) < len(_FEEDS):
             self._want({"audio": BROWSER, "face": BROWSER, "duration_s": None})
-        elif missing := [feed for feed in feeds if not takes[feed]]:
+        elif missing := [feed for feed in feeds if feed not in taken]:
             flag = "--audio" if missing[0] == "voice" else "--face"
             raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flag} {BROWSER})")
         self._visitor.came(visitor, feeds)
-
-    def _release(self) -> None:
-        self.released = True
-        if self._interrupt is not None:
-            self._interrupt.ask()
-            self._interrupt.ask()
 
     def _want(self, changes: Mapping[str, Any]) -> None:
         """Ask for another run, with these options; the present one comes to rest."""
         self._wanted = replace(self._wanted or self.options, record=None, **changes)
         self._chosen.set()
-        interrupt = self._interrupt
-        if interrupt is not None and not interrupt():
-            interrupt.ask()
+        if self.reach is not None and not self.reach.interrupt():
+            self.reach.interrupt.ask()
 
 
 class EndsAlone(Observer):
@@ -306,6 +272,8 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
         yield PageSession(page, options, Path(folder), choices)
 
 
-def _taken_of_visitors(options: RunOptions) -> dict[str, bool]:
-    """Return which of voice and face a visitor brings."""
-    return {"voice": split_kind(options.hears)[0] == BROWSER, "face": split_kind(options.face)[0] == BROWSER}
+def _taken_of_visitors(options: RunOptions) -> list[str]:
+    """Return the feeds that a visitor brings."""
+    return [
+        feed for feed, kind in zip(_FEEDS, (options.hears, options.face), strict=True) if split_kind(kind)[0] == BROWSER
+    ]

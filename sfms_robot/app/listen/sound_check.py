@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from sfms_robot.app.listen.panel import level_bar
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, Floats
 from sfms_robot.signals.audio import energy_db
@@ -25,7 +26,6 @@ NOISY_DB: Final = 10.0  # speech closer to the noise than this is hard to unders
 SILENT_DB: Final = -95.0  # quieter than any room or microphone
 _NOISE_PERCENT, _SPEECH_PERCENT = 10, 95  # of the frames, by their level
 _POLL_S: Final = 0.01
-_QUIETEST_DB: Final = -60.0  # an empty meter
 _WIDTH: Final = 40
 _LOUD_DB: Final = -12.0
 
@@ -118,7 +118,6 @@ def level_meter() -> Iterator[Callable[[float, bool], None]]:
 
 def meter_line(level_db: float, clipped: bool) -> Text:
     """Return a bar from -60 to 0 dB of full scale, and a note after clipping."""
-    full = round(_WIDTH * min(max(1.0 - level_db / _QUIETEST_DB, 0.0), 1.0))
     colour = "red" if clipped else "yellow" if level_db > _LOUD_DB else "green"
-    bar = ("█" * full).ljust(_WIDTH)
+    bar = level_bar(level_db, _WIDTH, "█ ")
     return Text.assemble((bar, colour), f" {level_db:6.1f} dBFS", (" clips" if clipped else "", "bold red"))

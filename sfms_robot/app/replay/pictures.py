@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.output_paths import FAINT, INK, checked_png, new_figure, plain, save
@@ -22,7 +21,6 @@ from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face import drawing
 from sfms_robot.face.human import load_human, with_hair
-from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 from sfms_robot.signals.events import find_nods, runs
 
@@ -100,22 +98,6 @@ def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> d
     if sheet_png is not None:
         sheet(recording, sheet_png)
     return summary(recording)
-
-
-def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
-    """Draw virtual head and robot at twelve instants: the face of the listener, the servos. Return the instants.
-
-    A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
-    """
-    talking = recording.talks_at(recording.times_s) if recording.has_voice else None
-    robot = None
-    with suppress(ConfigError):
-        head = load_head(recording.about["head"])
-        scene = scene_of(head) if tuple(head.joints) == recording.joints else None
-        if scene is not None:
-            read_rad = recording.present_rad.astype(np.float64)
-            robot = scene, np.where(np.isnan(read_rad), recording.goals_rad, read_rad)
-    return render_sheet(png, recording.times_s, recording.motion, talking, recording.title, robot)
 
 
 # --- plot -------------------------------------------------------------------------------------------------------------
@@ -260,8 +242,8 @@ class SheetInstant(NamedTuple):
     label: str
 
 
-def pick_instants(times_s: Doubles, motion: Floats, count: int = _INSTANTS) -> list[SheetInstant]:
-    """Return `count` instants of a motion (N, 58) that show its events, in order. Raises ValueError when N = 0."""
+def pick_instants(times_s: Doubles, motion: Floats) -> list[SheetInstant]:
+    """Return twelve instants of a motion (N, 58) that show its events, in order. Raises ValueError when N = 0."""
     if not len(times_s):
         raise ValueError("a sheet needs at least one frame")
     signals = {name: _signal(motion, name) for name in _SIGNALS}
@@ -270,8 +252,8 @@ def pick_instants(times_s: Doubles, motion: Floats, count: int = _INSTANTS) -> l
     if nods:
         largest = max(nods, key=lambda nod: np.ptp(motion[nod[0] : nod[2] + 1, CHANNEL_INDEX["pitch"]]))
         labels = dict(zip(largest, ("nod begins", "nod, lowest", "nod ends"), strict=True))
-    rows = list(dict.fromkeys([*labels, *_peaks(signals)]))[:count]
-    while len(rows) < min(count, len(times_s)):
+    rows = list(dict.fromkeys([*labels, *_peaks(signals)]))[:_INSTANTS]
+    while len(rows) < min(_INSTANTS, len(times_s)):
         rows.append(_loneliest(times_s, rows))
     for row in rows:
         there = [label for name, sign, least, label in _LABELS if sign * signals[name][row] > least]
@@ -320,27 +302,24 @@ def _loneliest(times_s: Doubles, rows: Sequence[int]) -> int:
 # --- contact sheet: the picture --------------------------------------------------------------------------------------
 
 
-def render_sheet(
-    file: Path | str,
-    times_s: Doubles,
-    motion: Floats,
-    talking: NDArray[np.bool_] | None = None,
-    title: str = "",
-    robot: tuple[RobotScene, Doubles] | None = None,
-) -> list[SheetInstant]:
-    """Draw twelve instants of a motion (N, 58) as one PNG, 4 x 3; return them.
+def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
+    """Draw virtual head and robot at twelve instants: the face of the listener, the servos. Return the instants.
 
-    talking: (N,) whether the speaker talks, written under each picture. robot: its scene, and the angles (N, J) that it
-    showed; None leaves it out. Raises ConfigError for a bad mesh, MissingExtra without vtk.
+    A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
     """
-    vtk = drawing.load_vtk()
-    instants = pick_instants(times_s, motion)
-    widths, cell_high = _ALONE_PX if robot is None else _BESIDE_PX
+    vtk, scene, motion = drawing.load_vtk(), None, recording.motion
+    with suppress(ConfigError):
+        head = load_head(recording.about["head"])
+        scene = scene_of(head) if tuple(head.joints) == recording.joints else None
+    instants = pick_instants(recording.times_s, motion)
+    talking = recording.talks_at(recording.times_s)
+    angles_rad = np.where(np.isnan(recording.present_rad), recording.goals_rad, recording.present_rad)
+    widths, cell_high = _ALONE_PX if scene is None else _BESIDE_PX
     wide, high = sum(widths) + _GAP_PX, cell_high + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
     window, human = drawing.open_window(vtk, size), with_hair(load_human())
     paper = drawing.add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
-    drawing.add_text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
+    drawing.add_text(vtk, paper, recording.title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
     for index, instant in enumerate(instants):
         left = _GAP_PX + index % _COLUMNS * wide
         low = size[1] - _TITLE_PX - index // _COLUMNS * high - cell_high
@@ -351,13 +330,12 @@ def render_sheet(
             cells.append(drawing.add_renderer(vtk, window, ends, drawing.BACKGROUND))
         drawing.add_head(vtk, cells[0], human, motion[instant.row])
         drawing.look(cells[0], (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)  # from a little to its left
-        if robot is not None:
-            scene, angles_rad = robot
-            drawing.add_robot(vtk, cells[1], scene, scene.values(angles_rad[instant.row]))
+        if scene is not None:
+            drawing.add_robot(vtk, cells[1], scene, scene.values(angles_rad[instant.row].astype(np.float64)))
         drawing.add_text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19).SetBold(True)
         drawing.add_text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT).SetBold(instant.label != "-")
-        if talking is not None:
+        if recording.has_voice:
             text = "speaker talks" if talking[instant.row] else "speaker silent"
             drawing.add_text(vtk, paper, text, (left + 4, low - 46), 14, _PALE)
-    drawing.save(vtk, window, file)
+    drawing.save(vtk, window, png)
     return instants

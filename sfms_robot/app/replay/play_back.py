@@ -14,14 +14,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.head.pose import FaceTrack, NobodyThere
+from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.page_session import stay_for_visitors
-from sfms_robot.app.options import SIM, RunOptions
+from sfms_robot.app.listen.report import OUTCOME
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
-from sfms_robot.app.session import Panel, run
-from sfms_robot.config import Calmness, load_head
+from sfms_robot.app.session import Panel
+from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db
@@ -29,18 +30,6 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-_KEPT: Final = (
-    "version",
-    "head",
-    "port",
-    "exit",
-    "exit_code",
-    "error",
-    "torque_unconfirmed",
-    "ticks",
-    "motion",
-    "joints",
-)
 FAULTY: Final = "faulty"  # the name of every fault: a recording has only whether there was one
 
 
@@ -68,11 +57,10 @@ def play_back(
     head = head or recording.about.get("head")
     if head is None:
         raise ConfigError(f"{folder}: does not say which head it is of: --head NAME or DIR")
-    face, alone = recorded_face(recording), NobodyThere()
-    options = RunOptions(head=head, port=port, fast=fast, yes=yes, listener="recorded", duration_s=face.duration_s)
-    report = run(options, panel, source=alone, feed=alone, timeline=face)
+    options = HeadOptions(head=head, port=port, fast=fast, yes=yes)
+    report = recorded_face(recording).play(options, panel, listener="recorded")
     return {
-        **{key: report[key] for key in _KEPT},
+        **{key: report[key] for key in (*OUTCOME, "ticks", "motion", "joints")},
         "recorded_s": round(recording.listened_s, 3),
         "duration_s": round(report["duration_s"], 3),
         "whole": recording.whole,
@@ -133,16 +121,6 @@ def _facts(recording: RunRecording) -> dict[str, Any]:
     if tuple(head.joints) != recording.joints:
         raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
     speaker = about.get("audio")
-    facts = page_facts(
-        head,
-        port=about["port"],
-        listener=about["listener"],
-        seed=int(about["seed"]),
-        speaker=DEFAULT_SPEAKER if speaker == "default" else speaker,
-        calmness=Calmness(),
-        people={},
-        knobs=turned(head),
-        source={"voice": False, "face": False},
-        choices=False,
-    )
+    options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
+    facts = page_facts(head, options, turned(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
     return facts | {"replay": True}

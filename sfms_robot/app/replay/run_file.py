@@ -123,7 +123,9 @@ def read_recording(folder: Path | str) -> RunRecording:
     if not parts:
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
         raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
-    rows, about, joints, whole = _Rows(list), {}, (), False
+    about: Mapping[str, str] = {}
+    joints: tuple[str, ...] = ()
+    rows, whole = _Rows(list), False
     try:
         for file in parts:
             for topic, body in _records(file):

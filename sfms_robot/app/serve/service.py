@@ -155,6 +155,8 @@ class WorkerPool:
 
     def _take(self, worker: _Worker, message: Any) -> None:
         """Handle a message of a process, in the thread that reads it."""
+        kind: str
+        value: Any
         kind, value = ("ended", message.code) if isinstance(message, Ended) else message
         if kind == "send":
             for stream, plan in value:
@@ -224,49 +226,6 @@ def _client(message: bytes) -> str | None:
     return words.client if isinstance(words, Join) else None
 
 
-class ZenohService:
-    """A `WorkerPool` on zenoh's keys. Serves from construction, which blocks for some seconds, until `close`.
-
-    Raises PortError, and as `WorkerPool`.
-    """
-
-    def __init__(self, served: Served, config: zenoh.Config, processes: int | None) -> None:
-        self._name = served.name
-        self._session = serve_session(config)
-        try:
-            self.pool = WorkerPool(served, self._publish, processes)
-        except BaseException:
-            close_session(self._session)
-            raise
-        self._session.declare_queryable(join_key(self._name), self._on_join)
-        self._session.declare_subscriber(f"{ROOT}/{self._name}/*/up", self._on_frame)
-
-    def close(self) -> None:
-        """End the processes and close the session. Idempotent."""
-        self.pool.close()
-        close_session(self._session)
-
-    def _on_join(self, query: zenoh.Query) -> None:
-        payload = query.payload
-        if payload is not None:
-            self.pool.join(payload.to_bytes(), lambda answer: query.reply(join_key(self._name), answer))
-
-    def _on_frame(self, sample: zenoh.Sample) -> None:
-        stream = str(sample.key_expr).split("/")[-2]
-        self.pool.receive(stream, sample.payload.to_bytes())
-
-    def _publish(self, stream: str, message: bytes) -> None:
-        import zenoh
-
-        self._session.put(
-            down_key(self._name, stream),
-            message,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-        )
-
-
 def serve(
     served: Served,
     over: threading.Event,
@@ -293,14 +252,32 @@ def serve(
     from sfms_robot.runtime.observers import ServiceManager
 
     check_zenoh()
+    import zenoh
+
     name = check_name(served.name, "listener")
     config = session_config("serve", Router(router, insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
         figures = None if metrics is None else stack.enter_context(closing(metrics_server(metrics)))
-        service = ZenohService(served, config, processes)
-        stack.callback(service.close)
-        pool = service.pool
+        session = serve_session(config)
+        stack.callback(close_session, session)
+        now: dict[str, Any] = {
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "priority": zenoh.Priority.REAL_TIME,
+            "express": True,
+        }
+        pool = WorkerPool(served, lambda to, message: session.put(down_key(name, to), message, **now), processes)
+        stack.callback(pool.close)
+
+        def join(query: zenoh.Query) -> None:
+            if query.payload is not None:
+                pool.join(query.payload.to_bytes(), lambda answer: query.reply(join_key(name), answer))
+
+        def receive(sample: zenoh.Sample) -> None:
+            pool.receive(str(sample.key_expr).split("/")[-2], sample.payload.to_bytes())
+
+        session.declare_queryable(join_key(name), join)
+        session.declare_subscriber(f"{ROOT}/{name}/*/up", receive)
         if figures is not None:
             figures.begin(pool.statistics)
             say(f"metrics: {figures.url}")
@@ -362,7 +339,7 @@ class _Collector:
 
         statistics = self._statistics()
         for name, kind, text, place in _FIGURES:
-            value = reduce(lambda found, key: found[key], place.split("."), statistics)
+            value: Any = reduce(lambda found, key: found[key], place.split("."), statistics)
             if value is not None:
                 family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
                 metric = family(f"sfms_{name}", text, labels=["listener", "server"])
