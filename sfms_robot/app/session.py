@@ -15,9 +15,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
@@ -50,6 +51,10 @@ from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
 from sfms_robot.viewer.web_server import status_server
+
+if TYPE_CHECKING:
+    from sfms_robot.sources.net_person import PageVisitor
+    from sfms_robot.sources.push import Spoken
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +139,7 @@ class RunControls:
         puppet: faces over the listener's plan.
         calmness: rates of events.
         set_rates: of the listener; None: not begun, or in virtual time.
+        visitor: the person in front of a page. speech: what a program lets the robot say.
         document: returns the status of the run; an empty one before it begins.
     """
 
@@ -144,6 +150,8 @@ class RunControls:
         self.calmness = options.calmness or Calmness()
         self.set_rates: Callable[[Calmness], None] | None = None
         self.document: Document = dict
+        self.visitor: PageVisitor | None = None
+        self.speech: Spoken | None = None
 
     def calm(self, rates: Mapping[str, Any]) -> None:
         """Set rates of events per minute; the others stay. Raises ConfigError for an unknown kind or a bad rate."""
@@ -208,7 +216,7 @@ def run(
             server = stack.enter_context(closing(status_server(options.status)))
             logger.warning("status: %s%s", server.url, server.note)
             server.begin(RunStatus((), facts).document)
-        opened, person, feed = _open(options, source, feed, stack)
+        opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:
             return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
         log, joints = run_log(opened), list(opened.config.joints)
@@ -231,7 +239,7 @@ def run(
             watchers.append(NotifyingObserver(manager))
         if options.fleet is not None:
             reach, key = (
-                FleetControls(halt, interrupt, knobs, getattr(feed, "calm", None)),
+                FleetControls(halt, interrupt, knobs, controls.set_rates),
                 fleet_key(options.fleet_key),
             )
             fleet = FleetHead(options.fleet, status.document, reach, options.router, key)
@@ -276,11 +284,12 @@ def _check(options: RunOptions) -> None:
 
 
 def _open(
-    options: RunOptions, source: Source | None, feed: PlanFeed | None, stack: ExitStack
+    options: RunOptions, controls: RunControls, source: Source | None, feed: PlanFeed | None, stack: ExitStack
 ) -> tuple[OpenHead, Source, PlanFeed | None]:
     """Open the head, the person and the listener side by side; without a listener in a dry run. Blocks until then."""
     if feed is None and not options.dry_run:
-        feed = _feed(options, stack)
+        feed = _feed(replace(options, calmness=controls.calmness), stack)
+    controls.set_rates = getattr(feed, "calm", None)
     opening: Future[Source] = Future()
     if source is not None:
         opening.set_result(source)
@@ -293,6 +302,8 @@ def _open(
             options.duration_s,
             agent_audio=options.agent_audio,
             play=options.play,
+            agent=controls.speech,
+            visitor=controls.visitor,
         )
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())

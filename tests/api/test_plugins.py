@@ -84,28 +84,24 @@ def test_a_listener_of_another_package_is_loaded_by_its_name(installed):
     listener = sr.load_listener("nodder:0.2")
     plan = listener.stream().push(None)
     assert listener.hop == 1 and plan is not None and plan.frames.shape == (1, 58)
-
-
-def test_shipped_names_go_first(installed):
-    assert sr.load_listener("sfms-small").horizon == 8
+    assert sr.load_listener("sfms-small").horizon == 8  # shipped names go first
 
 
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("broken", "broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
-        ("nodder:large", "nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not convert"),
+        ("broken", "^plug-in broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
+        (
+            "nodder:large",
+            "^plug-in nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not",
+        ),
+        ("nope", "'nope' is neither .*sfms-small"),
     ],
 )
 def test_one_that_fails_at_import_or_when_it_is_made_says_which(installed, name, problem):
-    with pytest.raises(sr.ConfigError, match=f"^plug-in {problem}.*$") as raised:
+    with pytest.raises(sr.ConfigError, match=problem) as raised:
         sr.load_listener(name)
     assert "\n" not in str(raised.value)
-
-
-def test_an_unknown_name_is_refused_with_the_shipped_ones(installed):
-    with pytest.raises(sr.ConfigError, match="'nope' is neither .*sfms-small"):
-        sr.load_listener("nope")
 
 
 def test_a_run_listens_with_it_in_its_own_process(installed):

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -73,17 +74,26 @@ def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end()
     assert len(told) == len({event.start_s for event in told})
 
 
-def test_what_is_pushed_is_what_the_listener_hears():
+def test_what_is_pushed_is_what_the_listener_hears_from_any_thread():
     face = np.zeros(58, np.float32)
     face[PITCH] = 0.25
     listener = Nodder()
-    with sr.Robot(HEAD, listener=listener) as robot:
+    robot = sr.Robot(HEAD, listener=listener)
+    starts = threading.Thread(target=robot.start)
+    starts.start()
+    starts.join()
+    assert robot.state == "starting"
+    try:
         for _ in range(50):
             robot.hear(np.full(1920, 8192, np.int16), 48000)
             robot.see(face)
             robot.say(np.full(960, 0.5, np.float32), 24000)
             if robot.wait(0.04):
                 break
+    finally:
+        robot.stop()
+    robot.stop()
+    assert robot.state == "stopped"
     heard = [frame for frame in listener.heard if len(frame.audio)]
     assert heard and all(len(frame.audio) == 640 and np.abs(frame.audio).max() <= 1 for frame in heard)
     assert np.median(heard[-1].audio) == pytest.approx(0.25, abs=0.01)
@@ -98,22 +108,6 @@ def test_a_listener_that_raises_ends_no_run_and_is_named():
         assert robot.state == "degraded"
     assert robot.report()["states"]["changes"][1]["why"] == ["listener"]
     assert robot.report()["listener_state"]["state"] == "failed: RuntimeError: out of ideas"
-
-
-def test_it_runs_in_any_thread_and_stops_from_another():
-    robots = []
-
-    def drive():
-        robots.append(sr.Robot(HEAD, listener=Nodder()).start())
-
-    thread = threading.Thread(target=drive)
-    thread.start()
-    thread.join()
-    (robot,) = robots
-    assert robot.state == "starting"
-    robot.stop()
-    robot.stop()
-    assert robot.state == "stopped"
 
 
 def test_show_reaches_the_servos_and_intensity_zero_keeps_them_still():
@@ -217,6 +211,8 @@ def test_servos_alone_go_where_they_are_told_within_the_limits_and_rest_at_the_e
 
 
 def test_servos_alone_refuse_what_is_no_goal():
+    with pytest.raises(sr.ConfigError, match="is not what its file says"):
+        sr.open_bus(sr.load_head(HEAD).model_copy(update={"description": "another"}))
     with sr.open_bus(sr.load_head(HEAD)) as bus:
         with pytest.raises(sr.BusError, match=r"enable\(\) first"):
             bus.write(bus.rest_rad)
@@ -234,12 +230,6 @@ def test_servos_alone_refuse_what_is_no_goal():
         bus.stop()
         with pytest.raises(sr.BusError, match="the run has ended"):
             bus.write(bus.rest_rad)
-
-
-def test_a_head_that_was_changed_after_loading_is_refused():
-    head = sr.load_head(HEAD)
-    with pytest.raises(sr.ConfigError, match="is not what its file says"):
-        sr.open_bus(head.model_copy(update={"description": "another"}))
 
 
 SCRIPT = """
@@ -273,9 +263,8 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
         robot.resume()
         robot.wait(0.3)
         assert robot.state == "starting"
-    assert [change["state"] for change in robot.report()["states"]["changes"]] == [
-        "starting", "halted", "starting", "stopping", "stopped",
-    ]  # fmt: skip
+    changes = groupby(change["state"] for change in robot.report()["states"]["changes"])  # a tick may see the button
+    assert [state for state, _ in changes] == ["starting", "halted", "starting", "stopping", "stopped"]
 
 
 @pytest.mark.parametrize("opens", [sr.Robot, sr.open_bus])

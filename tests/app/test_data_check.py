@@ -113,16 +113,10 @@ def test_table_names_what_is_left_out_and_the_command_ends_well(tmp_path, comman
     shown = ended.out
     assert ended.code == 0
     assert "too short" in shown and "session0+take_0" in shown and "rotation_x" in shown
-
-
-def test_set_of_which_nothing_can_be_used_ends_with_2(tmp_path, command_line):
-    write.react2025(tmp_path)
     ended = command_line("data", "check", tmp_path, "--window", 4800)
     assert ended.code == 2 and "not usable" in ended.out
-
-
-def test_no_data_set_is_one_line_and_2(tmp_path, command_line):
-    ended = command_line("data", "check", tmp_path, "--json")
+    (tmp_path / "empty").mkdir()
+    ended = command_line("data", "check", tmp_path / "empty", "--json")
     assert ended.code == 2 and ended.complaint
 
 

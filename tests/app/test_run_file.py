@@ -28,6 +28,10 @@ def test_what_was_recorded_is_read_back(tmp_path):
     assert run.faults.any(axis=0).tolist() == [False, True, False]
     assert run.motion.shape == (200, 58) and len(run.audio) == 50 * 640
     assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
+    assert run.states == [(0.0, "listening", ()), (1.5, "halted", ("key",))]
+    np.testing.assert_allclose(run.servos_s, [0.0, 1.0])
+    assert set(run.servos) == {"temperature_C"}
+    np.testing.assert_array_equal(run.servos["temperature_C"], [[40.0, np.nan, np.nan], [41.0, np.nan, np.nan]])
 
 
 def test_the_heads_own_voice_and_jaws_are_read_back_beside_the_persons(tmp_path):
@@ -41,14 +45,6 @@ def test_the_heads_own_voice_and_jaws_are_read_back_beside_the_persons(tmp_path)
     run = read_recording(tmp_path)
     np.testing.assert_allclose(run.agent_audio[::640], [0.0, 0.25, 0.5], atol=2e-5)
     np.testing.assert_array_equal(run.speaker_jaw_rad, [[np.nan] * 3, [0, 0.25, 0], [0, 0.25, 0]])
-
-
-def test_states_and_what_servos_tell_are_read_back(tmp_path):
-    run = read_recording(record(tmp_path))
-    assert run.states == [(0.0, "listening", ()), (1.5, "halted", ("key",))]
-    np.testing.assert_allclose(run.servos_s, [0.0, 1.0])
-    assert set(run.servos) == {"temperature_C"}
-    np.testing.assert_array_equal(run.servos["temperature_C"], [[40.0, np.nan, np.nan], [41.0, np.nan, np.nan]])
 
 
 def test_events_that_plans_held_are_read_back(tmp_path):

@@ -26,20 +26,16 @@ def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListen
 
 
 class LoadedListener:
-    """Weights and the pure functions of a `Listener`; `stream` keeps the state of a conversation."""
+    """Weights and the pure functions of a `Listener`; `stream` keeps the state of a conversation.
+
+    Attributes:
+        hop: a new plan is made every `hop` frames.
+        horizon: frames in a plan.
+    """
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
-
-    @property
-    def hop(self) -> int:
-        """A new plan is made every `hop` frames."""
-        return self._listener.hop
-
-    @property
-    def horizon(self) -> int:
-        """Frames in a plan."""
-        return self._listener.horizon
+        self.hop, self.horizon = listener.hop, listener.horizon
 
     def start(self, seed: int) -> Any:
         """Return the memory of a new stream."""

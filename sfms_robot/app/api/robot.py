@@ -10,27 +10,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.servos import Background, Driven, Progress, Report, head_name
+from sfms_robot.app.api.servos import Background, Driven, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, RunOptions, begin_listening
+from sfms_robot.app.options import SIM, RunOptions
 from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.listeners.thread import ListenerThread
 from sfms_robot.ports import Listener, Source
 from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.sources.paired import JudgedSource, PairedSource
 from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
-from sfms_robot.sources.registry import open_source, split_kind
+from sfms_robot.sources.registry import split_kind
 
 PUSH: Final = "push"
 EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
@@ -123,10 +121,11 @@ class Robot(Driven):
         self._person = (PushedVoice(), PushedSight()) if pushed else None
         hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
         self._speech = PushedSpeech() if pushed or hears else None
-        self._source = None if source is None else JudgedSource(source)
+        self._source: Source | None = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
         self._controls = RunControls(load_head(self._options.head), self._options)
+        self._controls.speech = self._speech
 
     def __enter__(self) -> Self:
         return self.start()
@@ -270,7 +269,7 @@ class Robot(Driven):
         """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
         if self._run is not None and self._run.report is not None:
             return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
-        options, progress = self._options, Progress() if self._run is None else self._run.progress
+        options, now = self._options, self._controls.document()
         return {
             "version": 1,
             "head": Path(options.head).name,
@@ -279,35 +278,25 @@ class Robot(Driven):
             "seed": options.seed,
             "exit": "running",
             "torque_unconfirmed": [],
-            "duration_s": 0.0 if progress.seen is None else progress.seen.time_s,
-            "frames": progress.frames,
-            "ticks": progress.ticks,
+            "duration_s": now.get("time_s", 0.0),
+            "frames": now.get("frames", 0),
+            "ticks": now.get("ticks", 0),
             "callbacks_detached": dict(self._events.detached),
         }
 
     def _drive(self, now: Background) -> Report:
-        options, controls = self._options, self._controls
-        source: Source | None = self._source
-        feed: ListenerThread | NamedFeed | None = None
+        options, source = self._options, self._source
+        feed = None
         with ExitStack() as stack:
             if self._listener is not None:
                 feed = ListenerThread(self._listener, options.seed)
-            elif not options.fast:  # in virtual time the run steps one inline
-                feed = begin_listening(replace(options, calmness=controls.calmness))
-            if feed is not None:
                 stack.callback(feed.close)
-                controls.set_rates = feed.calm
-            if source is None and self._speech is not None:
-                if self._person is not None:
-                    own = self._speech if options.play is None else open_playback(options.play, self._speech)
-                    source = PairedSource(*self._person, own)
-                else:
-                    source = open_source(
-                        options.hears, options.face, options.duration_s, agent=self._speech, play=options.play
-                    )
+            if self._person is not None and self._speech is not None:
+                own = self._speech if options.play is None else open_playback(options.play, self._speech)
+                source = PairedSource(*self._person, own)
                 stack.callback(source.close)
-            watchers = [now.progress, self._events]
-            return run(options, source=source, feed=feed, observers=watchers, controls=controls, signals=False)
+            watchers = [now, self._events]
+            return run(options, source=source, feed=feed, observers=watchers, controls=self._controls, signals=False)
 
 
 def _turned(regions: Mapping[str, float] | None) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
 from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
-from sfms_robot.frames import POSE, Doubles, Floats, Reading, SpeakerFrame
+from sfms_robot.frames import POSE, Doubles, Floats, Reading
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -40,31 +40,13 @@ Report = Mapping[str, Any]
 # --- a run in its own thread ----------------------------------------------------------------------------------------
 
 
-class Progress(Observer):
-    """An observer that keeps the newest tick and counts; `came` is set at the first tick, or when the run ends."""
-
-    def __init__(self) -> None:
-        self.came = threading.Event()
-        self.seen: Tick | None = None
-        self.ticks = 0
-        self.frames = 0
-
-    def tick(self, seen: Tick) -> None:
-        self.seen = seen
-        self.ticks += 1
-        self.came.set()
-
-    def heard(self, frame: SpeakerFrame) -> None:
-        self.frames += 1
-
-
-class Background:
-    """A run in its own thread: `work` drives a head until `interrupt` is set, and returns its report.
+class Background(Observer):
+    """A run in its own thread: `work` drives a head until `interrupt` is set, with this as an observer, and reports.
 
     A program that ends without `stop` is stopped at its exit: the head comes to rest first.
 
     Attributes:
-        progress: the newest tick, and counts.
+        seen: the newest tick.
         interrupt: ends it; `halt`: emergency stop.
     """
 
@@ -77,7 +59,8 @@ class Background:
         self._error: Exception | None = None
         self._raised = False
         self._stopping = False
-        self.progress = Progress()
+        self._came = threading.Event()  # the first tick, or the end of the run
+        self.seen: Tick | None = None
         self.report: Report | None = None
 
     @property
@@ -89,21 +72,24 @@ class Background:
             return "stopped"
         if self._stopping:
             return "stopping"
-        seen = self.progress.seen
-        return "starting" if seen is None else seen.state
+        return "starting" if self.seen is None else self.seen.state
 
     @property
     def running(self) -> bool:
         """True from the first tick until the end, or until it is stopped."""
         ended = self._error is not None or self.report is not None or self._stopping
-        return self.progress.came.is_set() and not ended
+        return self._came.is_set() and not ended
+
+    def tick(self, seen: Tick) -> None:
+        self.seen = seen
+        self._came.set()
 
     def start(self) -> None:
         """Start; block until the first tick, all torque on. Raises the error that prevented it, as RobotError."""
         atexit.register(self.stop)
         self._thread.start()
         try:
-            self.progress.came.wait()
+            self._came.wait()
         except BaseException:  # Ctrl-C: the caller gets no object that it could stop
             self.stop()
             raise
@@ -157,7 +143,7 @@ class Background:
             self._error = RobotError(f"{type(error).__name__}: {error}")
             self._error.__cause__ = error
         finally:
-            self.progress.came.set()
+            self._came.set()
 
 
 class Driven:
@@ -283,7 +269,7 @@ class Servos(Driven):
         self.write(angles_rad)
         run, target = self._running(), self._target.angles_rad
         for _ in range(round(limit_s / _LOOK_S)):
-            seen = run.progress.seen
+            seen = run.seen
             if seen is not None and np.abs(seen.goals_rad - target).max() < ARRIVED_RAD:
                 return True
             run.wait(_LOOK_S)
@@ -294,7 +280,7 @@ class Servos(Driven):
         """Return the newest reading of every joint. Before `enable` it polls the servos and blocks for that."""
         if self._run is None:
             return self._opened.bus.poll(self._opened.clock.now_s())
-        seen = self._running().progress.seen
+        seen = self._running().seen
         return {} if seen is None else seen.readings
 
     def report(self) -> Report | None:
@@ -322,7 +308,7 @@ class Servos(Driven):
 
     def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
-        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now.progress])
+        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now])
         drove = drive_head(opened, parts, now.interrupt, signals=False)
         return run_report(opened, drove, alone, "none", 0)
 

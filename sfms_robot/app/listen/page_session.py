@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +28,7 @@ from sfms_robot.app.listen.page_observer import (
     people_per_minute,
 )
 from sfms_robot.app.listen.report import run_facts
-from sfms_robot.app.options import RunOptions, begin_listening
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
@@ -37,7 +37,7 @@ from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
-from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, open_source, split_kind
+from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, split_kind
 from sfms_robot.viewer.page_process import PageProcess
 
 AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
@@ -83,18 +83,15 @@ class PageSession:
     ) -> dict[str, Any]:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 
-        `feed`: a listener of these options that loads already; None: it is started here, and ended.
+        `feed`: a listener of these options that loads already.
         """
         options, head = self.options, load_head(self.options.head)
         joints, by_visitor = list(head.joints), _taken_of_visitors(options)
         controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
         self.released = False
         self._chosen.clear()
-        watcher.document = lambda: controls.document()
+        watcher.document, controls.visitor = lambda: controls.document(), self._visitor
         with ExitStack() as stack:
-            if feed is None:
-                feed = stack.enter_context(closing(begin_listening(options)))
-            controls.set_rates = feed.calm
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out if scene else ():
                 logger.warning("%s; the page leaves it out", line)
@@ -113,17 +110,12 @@ class PageSession:
             stack.callback(self.recorder.close)
             self.reach = controls
             stack.callback(self._ended)
-            source, lonely = None, EndsAlone(self.page, controls.interrupt)
+            lonely = EndsAlone(self.page, controls.interrupt)
             watchers: list[Observer] = [watcher, self.recorder, *observers]
-            if by_visitor:
-                source = stack.enter_context(closing(open_source(
-                    options.hears, options.face, options.duration_s, agent_audio=options.agent_audio,
-                    play=options.play, visitor=self._visitor,
-                )))  # fmt: skip
-                if self._choices:  # nothing else would end it
-                    watchers.append(lonely)
+            if by_visitor and self._choices:  # nothing else would end it
+                watchers.append(lonely)
             report = session.run(
-                options, panel, source=source, feed=feed, observers=watchers, controls=controls,
+                options, panel, feed=feed, observers=watchers, controls=controls,
                 more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
         if report["exit"] == "interrupted" and lonely.ended:  # its proper end
