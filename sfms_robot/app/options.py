@@ -135,11 +135,7 @@ def begin_listening(options: RunOptions) -> NamedFeed:
 
 
 def begin_page(
-    address: str | None,
-    certificate: Path | None = None,
-    key: Path | None = None,
-    *,
-    options: RunOptions = _DEFAULTS,
+    address: str | None, certificate: Path | None = None, key: Path | None = None, *, options: RunOptions = _DEFAULTS
 ) -> PageProcess | None:
     """Return the page's process, which starts from now on; None where no page is wanted. The caller closes it.
 

@@ -22,14 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.report import (
-    Drove,
-    OutletObserver,
-    figures_so_far,
-    limitation,
-    run_facts,
-    run_report,
-)
+from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
 from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.config import Calmness, Head, parse
@@ -238,10 +231,7 @@ def run(
         if (manager := ServiceManager()).wanted:
             watchers.append(NotifyingObserver(manager))
         if options.fleet is not None:
-            reach, key = (
-                FleetControls(halt, interrupt, knobs, controls.set_rates),
-                fleet_key(options.fleet_key),
-            )
+            reach, key = (FleetControls(halt, interrupt, knobs, controls.set_rates), fleet_key(options.fleet_key))
             fleet = FleetHead(options.fleet, status.document, reach, options.router, key)
             watchers.append(stack.enter_context(closing(fleet)))
         played: dict[str, Any] = {"timeline": timeline}

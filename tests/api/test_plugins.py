@@ -91,10 +91,7 @@ def test_a_listener_of_another_package_is_loaded_by_its_name(installed):
     ("name", "problem"),
     [
         ("broken", "^plug-in broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
-        (
-            "nodder:large",
-            "^plug-in nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not",
-        ),
+        ("nodder:large", "^plug-in nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not"),
         ("nope", "'nope' is neither .*sfms-small"),
     ],
 )

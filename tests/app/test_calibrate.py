@@ -22,15 +22,7 @@ from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import held_back
-from sfms_robot.config.overlay import (
-    Overlay,
-    calibrated,
-    head_hash,
-    layered,
-    load_overlay,
-    overlay_file,
-    save_overlay,
-)
+from sfms_robot.config.overlay import Overlay, calibrated, head_hash, layered, load_overlay, overlay_file, save_overlay
 from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.runtime.clock import RealClock, VirtualClock

@@ -9,10 +9,7 @@ from urllib.request import urlopen
 import pytest
 from drill_rig import HEAD, Command
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here")]
 RUN = ("run", "--head", HEAD, "--duration", 600)
 TOLD = "WARNING: status: "
 

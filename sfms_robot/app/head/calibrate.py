@@ -101,14 +101,7 @@ def calibrate(
 
 
 def calibrate_on(
-    name: str,
-    where: Opened,
-    clock: Clock,
-    guide: Guide,
-    file: Path,
-    *,
-    joints: Sequence[str] = (),
-    again: bool = False,
+    name: str, where: Opened, clock: Clock, guide: Guide, file: Path, *, joints: Sequence[str] = (), again: bool = False
 ) -> CalibrationOutcome:
     """Calibrate as `calibrate` does, on buses that are there, into `file`."""
     head, sha256 = load_head(name), head_hash(name)

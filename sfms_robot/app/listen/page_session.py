@@ -21,12 +21,7 @@ import numpy as np
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.head.pose import EXPRESSIONS
-from sfms_robot.app.listen.page_observer import (
-    PageObserver,
-    PageRecorder,
-    page_facts,
-    people_per_minute,
-)
+from sfms_robot.app.listen.page_observer import PageObserver, PageRecorder, page_facts, people_per_minute
 from sfms_robot.app.listen.report import run_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
@@ -76,10 +71,7 @@ class PageSession:
         page.answered_by(self)
 
     def run(
-        self,
-        panel: session.Panel | None = None,
-        feed: NamedFeed | None = None,
-        observers: Sequence[Observer] = (),
+        self, panel: session.Panel | None = None, feed: NamedFeed | None = None, observers: Sequence[Observer] = ()
     ) -> dict[str, Any]:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 

@@ -30,15 +30,7 @@ from sfms_robot.app.servo.diagnosis import (
     udev_rule,
     wire_budget,
 )
-from sfms_robot.app.servo.serial_line import (
-    SIM,
-    Confirm,
-    FoundServo,
-    Wire,
-    check_baud,
-    only_port,
-    protocol_hint,
-)
+from sfms_robot.app.servo.serial_line import SIM, Confirm, FoundServo, Wire, check_baud, only_port, protocol_hint
 from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored

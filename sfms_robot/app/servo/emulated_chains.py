@@ -26,10 +26,7 @@ USUAL_BAUD: Final = 1_000_000
 _BOARD_BAUDS: Final = {"maestro": 115_200, "ssc32": 9_600}
 _MORE_IDS: Final = re.compile(r"\d+(-\d+)?")
 _CHANGE: Final = re.compile(r"(?P<ids>[0-9,-]+)(:(?P<register>\w+))?=(?P<value>-?\d+)")
-_FORMS: Final = {
-    "stored": "IDS:REGISTER=VALUE, as in 3:min_position_limit=1900",
-    "start": "IDS=TICKS, as in 3=4150",
-}
+_FORMS: Final = {"stored": "IDS:REGISTER=VALUE, as in 3:min_position_limit=1900", "start": "IDS=TICKS, as in 3=4150"}
 
 
 @contextmanager
