@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.config import Calmness
 from sfms_robot.config.base import Finite, one_line, parse
 from sfms_robot.config.overlay import config_folder
@@ -132,11 +132,7 @@ class FleetControls:
     """
 
     def __init__(
-        self,
-        halt: HaltLatch,
-        interrupt: Interrupt,
-        knobs: LiveKnobs | None,
-        calm: Callable[[Calmness], None] | None,
+        self, halt: HaltLatch, interrupt: Interrupt, knobs: LiveKnobs, calm: Callable[[Calmness], None] | None
     ) -> None:
         self._lock = threading.Lock()
         self.nonce = secrets.token_hex(8)
@@ -178,11 +174,7 @@ class FleetControls:
                     raise ConfigError("calm: this run's listener decides no events")
                 self._calm(calmness)
             case _Knobs():
-                if self._knobs is None:
-                    raise ConfigError("knobs: this run has none")
-                for kind in KNOB_KINDS:
-                    for region, value in getattr(command, kind).items():
-                        setattr(self._knobs[region], kind, value)
+                self._knobs.turn(command.intensity, command.style)
 
     def _check_proof(self, command: _Keyed, name: str, key: bytes) -> None:
         """Raise ConfigError unless a command comes from a holder of the key; the nonce is used up then."""
@@ -219,8 +211,7 @@ class FleetHead(Observer):
         self._key = key
         self._name, self._document, self._controls = fleet_name(name), document, controls
         self._connection = Connection(session_config("call", router))
-        self._changed = threading.Condition()
-        self._news = self._over = False
+        self._news, self._over = threading.Event(), False
         self._malformed = 0
         self._state: tuple[str, tuple[str, ...]] = ("", ())
         self._thread = threading.Thread(target=self._work, name="fleet", daemon=True)
@@ -231,40 +222,35 @@ class FleetHead(Observer):
         state = seen.state, seen.why
         if state != self._state:
             self._state = state
-            with self._changed:
-                self._news = True
-                self._changed.notify()
+            self._news.set()
 
     def close(self) -> None:
         """Send how the run ended, and disconnect. Idempotent."""
-        with self._changed:
-            self._over = True
-            self._changed.notify()
+        self._over = True
+        self._news.set()
         self._thread.join(TELL_S)
         self._connection.close()
 
     def _work(self) -> None:
-        session = None
-        while session is None:
-            try:
-                session = self._connection.wait(TELL_S)
-            except RobotError as error:
-                log.error("fleet: %s; the head continues without it", error)
-                return
-            if self._over:
-                return
+        try:
+            while (session := self._connection.wait(TELL_S)) is None:
+                if self._over:
+                    return
+        except RobotError as error:
+            log.error("fleet: %s; the head continues without it", error)
+            return
         key = f"{ROOT}/{self._name}"
         session.declare_queryable(f"{key}/state", lambda query: query.reply(f"{key}/state", self._state_json()))
         session.declare_queryable(f"{key}/command", self._on_query)
         session.declare_subscriber(f"{key}/command", lambda sample: self._obey(sample.payload.to_bytes()))
         session.declare_subscriber(f"{key}/halt", self._on_halt)
         while True:
+            over = self._over  # read first: the last state is sent after it
             session.put(f"{key}/state", self._state_json())
-            with self._changed:
-                if self._over:
-                    return
-                self._changed.wait_for(lambda: self._news or self._over, TELL_S)
-                self._news = False
+            if over:
+                return
+            self._news.wait(TELL_S)
+            self._news.clear()
 
     def _state_json(self) -> bytes:
         more = {"name": self._name, "nonce": self._controls.nonce, "malformed": self._malformed}
@@ -367,26 +353,6 @@ class Fleet:
             log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
 
 
-class FleetBoard:
-    """The newest document of every head, and which heads are away. From any thread."""
-
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s = now_s
-        self._heads: dict[str, tuple[float, Document]] = {}
-        self._lock = threading.Lock()
-
-    def put(self, document: Document) -> None:
-        """Take a document in."""
-        with self._lock:
-            self._heads[str(document.get("name", "?"))] = (self._now_s(), document)
-
-    def tiles(self) -> list[dict[str, Any]]:
-        """Return what a page shows of each head, by name."""
-        with self._lock:
-            heads = sorted(self._heads.items())
-        return [tile(name, document, self._now_s() - at_s) for name, (at_s, document) in heads]
-
-
 def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
     """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
     state = str(document.get("state", "?"))
@@ -413,17 +379,22 @@ def fleet_page(fleet: Fleet, port: int = PORT) -> LocalServer:
 
     from sfms_robot.viewer.web_server import LocalServer, json_body
 
-    board = FleetBoard()
+    newest: dict[str, tuple[float, Document]] = {}  # of each head, and when it came
+
+    def put(document: Document) -> None:
+        newest[str(document.get("name", "?"))] = time.monotonic(), document
+
     for document in fleet.states():
-        board.put(document)
-    fleet.follow(board.put)
+        put(document)
+    fleet.follow(put)
 
     def page(request: Request) -> Response:
         inline = "default-src 'self' data: 'unsafe-inline'; frame-ancestors 'none'"
         return HTMLResponse(PAGE.read_bytes(), headers={"content-security-policy": inline})
 
     def tiles(request: Request) -> Response:
-        return JSONResponse({"heads": board.tiles()})
+        heads, now_s = sorted(newest.copy().items()), time.monotonic()
+        return JSONResponse({"heads": [tile(name, document, now_s - came_s) for name, (came_s, document) in heads]})
 
     async def order(request: Request) -> Response:
         heads = (await json_body(request)).get("heads", [])

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.app.options import SIM, HeadOptions
-from sfms_robot.app.servo.serial_line import FoundServo, Wire
+from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.wiring import Opened, calibration_of, devices, firmware_maps, open_wires, port_of
-from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
+from sfms_robot.config import FirmwareMap, Head, Joint, load_head
 from sfms_robot.config.check import check_registers
 from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
@@ -83,6 +83,11 @@ class OpenHead:
         """Rate of the loop: that of the head's fastest bus."""
         return fastest_hz(self.config)
 
+    def readings(self) -> dict[str, Any]:
+        """Return what the servos report, torque untouched."""
+        polled = self.bus.poll(self.clock.now_s()).items()
+        return {joint: {"position_rad": each.position_rad, "fault": each.fault} for joint, each in polled}
+
     def digests(self) -> dict[str, Any]:
         """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
         digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}
@@ -125,7 +130,12 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
     clock: Clock = VirtualClock() if options.fast else RealClock()
     kept: dict[str, Port] = {}  # by bus, open since their servos were identified
     with ExitStack() as stack:
-        stack.callback(_close_all, kept)
+
+        @stack.callback
+        def close_kept() -> None:
+            for port in kept.values():
+                port.close()
+
         head = calibrated_head(options.head, options.port, clock, kept)
         motion = build_motion(head, fastest_hz(head))
         opened = stack.enter_context(open_wires(head, options))
@@ -137,11 +147,6 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         if weak := bus.statistics().get("stored_warnings"):
             log.warning("servos protect themselves less than usual: %s; mend it: %s", "; ".join(weak), doctor)
         yield OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
-
-
-def _close_all(ports: Mapping[str, Port]) -> None:
-    for port in ports.values():
-        port.close()
 
 
 # --- the head's file, the overlay of this build, and the servos that answer -----------------------------------------
@@ -211,26 +216,16 @@ def identify(
 
 
 def _identity(wire: Wire, joint: Joint) -> Identity | None:
-    seen = wire.ping(joint.id)
-    if seen is None:
+    if (found := wire.ping(joint.id)) is None:
         return None
-    expected = load_firmware_map(joint.model)
-    known = seen.model_number in (None, expected.model_number)
-    table = seen.table if seen.table is not None and seen.model_number != expected.model_number else Table.of(expected)
-    drive_mode = _register(seen, table, "drive_mode")
-    return Identity(
-        id=joint.id,
-        model=joint.model if known else seen.model,
-        firmware=seen.firmware,
-        homing_offset=_register(seen, table, "homing_offset"),
-        drive_mode=None if drive_mode is None else drive_mode & _REVERSED,
-    )
-
-
-def _register(seen: FoundServo, table: Table, name: str) -> int | None:
-    with suppress(ServoError):
-        return seen.read(table.fields[name]) if name in table.fields else None
-    return None
+    seen, stored = found.taken_for(joint.model), {}
+    for name in ("homing_offset", "drive_mode"):
+        with suppress(ConfigError, ServoError):  # the model has no such register, or the servo is silent
+            stored[name] = seen.read(seen.named(name))
+    if "drive_mode" in stored:
+        stored["drive_mode"] &= _REVERSED
+    model = found.model if seen is found else joint.model
+    return Identity(id=joint.id, model=model, firmware=seen.firmware, **stored)
 
 
 # --- the parts between a plan and the bus ---------------------------------------------------------------------------
@@ -290,12 +285,13 @@ def build_bus(
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None
     if without:
-        buses[LEFT_OUT] = AbsentBus(_bus_servos(head, {joint: head.joints[joint] for joint in without}, doctor))
+        buses[LEFT_OUT] = AbsentBus(bus_servos(head, {joint: head.joints[joint] for joint in without}, doctor))
         rates = rates and {**rates, LEFT_OUT: max(rates.values())}
     return CompositeBus(buses, list(head.joints), rates)
 
 
-def _bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str) -> list[BusServo]:
+def bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str = BusServo.doctor) -> list[BusServo]:
+    """Return the servos of joints; `doctor`: see `BusServo`."""
     maps = firmware_maps(joints)
     return [
         BusServo(
@@ -325,7 +321,7 @@ def build_one(
     """Return the bus `name` with `joints`, of the class of its family, not yet connected."""
     config = head.buses[name]
     check_safety(head, joints)
-    servos = _bus_servos(head, joints, doctor)
+    servos = bus_servos(head, joints, doctor)
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
-PAGE: Final = "sfms_robot.app.listen.page_scene:main"
+PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
 
@@ -122,10 +122,9 @@ def check_names(options: RunOptions) -> None:
 
 def engine_named(name: str) -> EngineName:
     """Return the engine of that name. Raises ConfigError."""
-    for known in ENGINES:
-        if name == known:
-            return known
-    raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    if name not in ENGINES:
+        raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    return name
 
 
 def begin_listening(options: RunOptions) -> NamedFeed:
@@ -136,11 +135,7 @@ def begin_listening(options: RunOptions) -> NamedFeed:
 
 
 def begin_page(
-    address: str | None,
-    certificate: Path | None = None,
-    key: Path | None = None,
-    *,
-    options: RunOptions = _DEFAULTS,
+    address: str | None, certificate: Path | None = None, key: Path | None = None, *, options: RunOptions = _DEFAULTS
 ) -> PageProcess | None:
     """Return the page's process, which starts from now on; None where no page is wanted. The caller closes it.
 

@@ -22,24 +22,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.report import (
-    Drove,
-    OutletObserver,
-    figures_so_far,
-    limitation,
-    run_facts,
-    run_report,
-)
+from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
 from sfms_robot.app.options import RunOptions, begin_listening
+from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import ConfigError, RobotError, TorqueError
-from sfms_robot.frames import Doubles, Floats
 from sfms_robot.listeners.process import ListenerProcess
-from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Observer, PlanFeed, Source
+from sfms_robot.ports import Observer, PlanFeed, Source, Timeline
 from sfms_robot.processes import realtime_priority
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed
 from sfms_robot.runtime.halt import HaltLatch, halt_signals, halt_switch
@@ -52,16 +46,14 @@ from sfms_robot.sources.registry import open_source, split_kind
 from sfms_robot.viewer.web_server import status_server
 
 if TYPE_CHECKING:
-    pass
+    from sfms_robot.sources.net_person import PageVisitor
+    from sfms_robot.sources.push import Spoken
 
 logger = logging.getLogger(__name__)
 
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
 Document = Callable[[], Mapping[str, Any]]
-Panel = Callable[[Document, Interrupt, HaltLatch, Callable[[float], None]], AbstractContextManager[object]]
-
-
 # --- any motion on a head -------------------------------------------------------------------------------------------
 
 
@@ -72,22 +64,9 @@ def run_log(opened: OpenHead) -> RunLog:
 
 def run_parts(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
     """Return the parts of a run on an open head: a person and a listener; `more` replaces parts of the head's own."""
-    motion = opened.motion
-    parts = Parts(
-        source=source,
-        feed=feed,
-        timeline=motion.timeline,
-        retargeter=motion.retargeter,
-        limiter=motion.limiter,
-        bus=opened.bus,
-        observers=(),
-        leads_s=motion.leads_s,
-        rest_rad=motion.rest_rad,
-        holds=motion.holds,
-        heat=motion.heat,
-        ignored=frozenset(opened.options.without),
-    )
-    return replace(parts, **more)
+    own = {key: part for key, part in vars(opened.motion).items() if key != "audit"}  # names of `Parts` all
+    own |= {"bus": opened.bus, "observers": (), "ignored": frozenset(opened.options.without), **more}
+    return Parts(source=source, feed=feed, **own)
 
 
 def drive_head(
@@ -140,6 +119,48 @@ def drive_head(
     return Drove(outcome=outcome, log=log, elapsed_s=elapsed_s, priority=priority, error=error)
 
 
+# --- what other threads may do to a run ------------------------------------------------------------------------------
+
+
+class RunControls:
+    """Commands on a run from any thread: a page, a fleet, keys, a program. Motion stays under the head's limits.
+
+    Attributes:
+        interrupt: ends the run.
+        halt: emergency stop.
+        knobs: scale of each region.
+        puppet: faces over the listener's plan.
+        calmness: rates of events.
+        set_rates: of the listener; None: not begun, or in virtual time.
+        visitor: the person in front of a page. speech: what a program lets the robot say.
+        document: returns the status of the run; an empty one before it begins.
+    """
+
+    def __init__(self, head: Head, options: RunOptions) -> None:
+        self.interrupt, self.halt = Interrupt(), HaltLatch()
+        self.knobs = turned(head, options.intensity, options.style)
+        self.puppet = Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
+        self.calmness = options.calmness or Calmness()
+        self.set_rates: Callable[[Calmness], None] | None = None
+        self.document: Document = dict
+        self.visitor: PageVisitor | None = None
+        self.speech: Spoken | None = None
+
+    def calm(self, rates: Mapping[str, Any]) -> None:
+        """Set rates of events per minute; the others stay. Raises ConfigError for an unknown kind or a bad rate."""
+        self.calmness = parse(Calmness, {**self.calmness.model_dump(), **rates}, "calm")
+        if self.set_rates is not None:
+            self.set_rates(self.calmness)
+
+    def release(self) -> None:
+        """Take torque off at once, as a second Ctrl-C does; the run ends with it."""
+        self.interrupt.ask()
+        self.interrupt.ask()
+
+
+Panel = Callable[[RunControls], AbstractContextManager[object]]
+
+
 # --- a person, a listener, a head -----------------------------------------------------------------------------------
 
 
@@ -150,10 +171,8 @@ def run(
     source: Source | None = None,
     feed: PlanFeed | None = None,
     observers: Sequence[Observer] = (),
-    knobs: LiveKnobs | None = None,
-    overlay: Callable[[Floats, Doubles], Floats] | None = None,
-    interrupt: Interrupt | None = None,
-    halt: HaltLatch | None = None,
+    timeline: Timeline | None = None,
+    controls: RunControls | None = None,
     more: Callable[[], Mapping[str, Any]] = dict,
     signals: bool = True,
 ) -> dict[str, Any]:
@@ -163,12 +182,10 @@ def run(
     the report says `"exit": "failed"` and why, and the head is at rest.
 
     Args:
-        panel: a context manager of (status document, interrupt, halt latch, function that turns the intensity up),
-            which shows the run and takes keys.
-        source, feed, knobs: instead of those that the options name.
-        observers, overlay: see `Parts`; the caller closes the observers.
-        interrupt: ends the run from another thread.
-        halt: closed and opened from other threads.
+        panel: a context manager of the controls, which shows the run and takes keys.
+        source, feed, controls: instead of those that the options name.
+        timeline: what is played instead of the listener's plans; nothing is added to it.
+        observers: see `Parts`; the caller closes them.
         more: further entries of the status and of the report.
 
     Raises RobotError before torque came on.
@@ -178,46 +195,57 @@ def run(
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
         logger.warning("%s: %s", Path(options.listener).name, limited)
-    interrupt, halt = interrupt or Interrupt(), halt or HaltLatch()
+    controls = controls or RunControls(head, options)
+    interrupt, halt, knobs = controls.interrupt, controls.halt, controls.knobs
     facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
-    with signals_to(interrupt) if signals else nullcontext(), ExitStack() as stack:  # until all is closed again
+    with ExitStack() as stack:  # until all is closed again
         if signals:
+            stack.enter_context(signals_to(interrupt))
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
-        begin_status = _status_server(options, stack)  # a port that is in use is found before a listener is loaded
-        begin_status(RunStatus((), facts).document)
-        opened, person, feed = _open(options, source, feed, stack)
+        server = None
+        if options.status is not None:  # a port that is in use is found before a listener is loaded
+            server = stack.enter_context(closing(status_server(options.status)))
+            logger.warning("status: %s%s", server.url, server.note)
+            server.begin(RunStatus((), facts).document)
+        opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:
-            return {"version": 1, **facts, "exit": "done", "readings": _readings(opened)}
-        live = turned(opened.config, options.intensity, options.style) if knobs is None else knobs
-        log = run_log(opened)
+            return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
+        log, joints = run_log(opened), list(opened.config.joints)
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
-        figures = partial(_figures, opened, log, person, feed, live, more)
-        status = RunStatus(list(opened.config.joints), {**facts, "duration_s": duration_s}, figures)
-        recorder = _recorder(options, opened, stack)
+        figures = partial(_figures, opened, log, person, feed, knobs, more)
+        status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
+        controls.document = status.document
+        watchers: list[Observer] = [status, *observers]
+        recorder = None
+        if options.record is not None:
+            about = run_facts(opened.config, options)
+            recorder = Recorder(options.record, joints, "wait" if options.fast else "drop", about)
+            watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
-            stack.enter_context(panel(status.document, interrupt, halt, live.turn_all))
-        outlets = [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
-        begin_status(status.document)
-        watchers = _watchers(options, status, FleetControls(halt, interrupt, live, getattr(feed, "calm", None)), stack)
+            stack.enter_context(panel(controls))
+        watchers += [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
+        if server is not None:
+            server.begin(status.document)
+        if (manager := ServiceManager()).wanted:
+            watchers.append(NotifyingObserver(manager))
+        if options.fleet is not None:
+            reach, key = (FleetControls(halt, interrupt, knobs, controls.set_rates), fleet_key(options.fleet_key))
+            fleet = FleetHead(options.fleet, status.document, reach, options.router, key)
+            watchers.append(stack.enter_context(closing(fleet)))
+        played: dict[str, Any] = {"timeline": timeline}
+        if timeline is None:
+            played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
+        overlay = controls.puppet.overlay
         parts = run_parts(
-            opened,
-            person,
-            feed,
-            life=HeadLife(opened.config.life, options.seed, opened.config.camera),
-            knobs=lambda: live.now,
-            overlay=overlay,
-            answers=True,
-            halt=halt,
-            observers=[status, *watchers, *observers, *outlets, *([] if recorder is None else [recorder])],
+            opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played
         )
         drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
         status.ended(log.states[-1][1])
         report = run_report(opened, drove, feed, facts["listener"], options.seed)
         report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
-        if options.fast:
-            report["wire"] = opened.digests()
+        report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
             recorder.close()
             report["recording"] = recorder.statistics()
@@ -245,22 +273,13 @@ def _check(options: RunOptions) -> None:
         check_folder(options.record, options.overwrite)
 
 
-def _status_server(options: RunOptions, stack: ExitStack) -> Callable[[Document], None]:
-    """Bind the port of `--status`, if wanted; return the function that serves a document there from now on."""
-    if options.status is None:
-        return lambda document: None
-
-    server = stack.enter_context(closing(status_server(options.status)))
-    logger.warning("status: %s%s", server.url, server.note)
-    return server.begin
-
-
 def _open(
-    options: RunOptions, source: Source | None, feed: PlanFeed | None, stack: ExitStack
+    options: RunOptions, controls: RunControls, source: Source | None, feed: PlanFeed | None, stack: ExitStack
 ) -> tuple[OpenHead, Source, PlanFeed | None]:
     """Open the head, the person and the listener side by side; without a listener in a dry run. Blocks until then."""
     if feed is None and not options.dry_run:
-        feed = _feed(options, stack)
+        feed = _feed(replace(options, calmness=controls.calmness), stack)
+    controls.set_rates = getattr(feed, "calm", None)
     opening: Future[Source] = Future()
     if source is not None:
         opening.set_result(source)
@@ -273,6 +292,8 @@ def _open(
             options.duration_s,
             agent_audio=options.agent_audio,
             play=options.play,
+            agent=controls.speech,
+            visitor=controls.visitor,
         )
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())
@@ -280,8 +301,8 @@ def _open(
     person = opening.result()
     if options.fast and options.duration_s is None and person.duration_s is None:
         raise ConfigError("--fast without a recording never ends: give it a --duration")
-    if isinstance(feed, NamedFeed):
-        feed.wait_loaded()
+    if (wait_loaded := getattr(feed, "wait_loaded", None)) is not None:
+        wait_loaded()
     if isinstance(feed, ListenerProcess):  # a listener of this machine gets the hop that the head needs
         tick_s = 1.0 / opened.rate_hz
         feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
@@ -303,12 +324,6 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
     return feed
 
 
-def _readings(opened: OpenHead) -> dict[str, Any]:
-    """Return what the servos report, torque untouched."""
-    readings = opened.bus.poll(opened.clock.now_s())
-    return {name: {"position_rad": each.position_rad, "fault": each.fault} for name, each in readings.items()}
-
-
 def _figures(
     opened: OpenHead,
     log: RunLog,
@@ -325,28 +340,3 @@ def _figures(
         "intensity": live.values["intensity"],
         **more(),
     }
-
-
-def _recorder(options: RunOptions, opened: OpenHead, stack: ExitStack) -> Recorder | None:
-    if options.record is None:
-        return None
-    recorder = Recorder(
-        options.record,
-        list(opened.config.joints),
-        when_full="wait" if options.fast else "drop",
-        about=run_facts(opened.config, options),
-    )
-    return stack.enter_context(closing(recorder))
-
-
-def _watchers(options: RunOptions, status: RunStatus, controls: FleetControls, stack: ExitStack) -> list[Observer]:
-    """Return observers that report state changes to systemd and to the fleet, where there are any."""
-    watchers: list[Observer] = []
-    manager = ServiceManager()
-    if manager.wanted:
-        watchers.append(NotifyingObserver(manager))
-    if options.fleet is not None:
-        head = FleetHead(options.fleet, status.document, controls, options.router, fleet_key(options.fleet_key))
-        stack.callback(head.close)
-        watchers.append(head)
-    return watchers

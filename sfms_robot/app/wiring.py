@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from functools import partial
 from math import radians
 from typing import Final
@@ -13,7 +12,7 @@ import numpy as np
 
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
-from sfms_robot.config.head import load_stored
+from sfms_robot.config.head import StoredRegisters, load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
@@ -23,6 +22,7 @@ from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
+_NEW: Final = StoredRegisters()
 HANGING: Final = 0.3  # fraction of the way from rest to its lower end, where nothing pulls hard
 BEYOND_RAD: Final = radians(2.0)  # how far a stop lies outside the range of the head's file
 
@@ -64,11 +64,16 @@ def calibration_of(joints: dict[str, Joint]) -> Calibration:
     return Calibration(joints, turns)
 
 
-def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
+def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[EmulatedServo]]:
     """Return, by bus, the servos of a head that was switched off: sagged onto its stops, torque off.
 
     A geared joint hangs where its servo, which counts turns from power-up only, can be in one place of its range.
+    `stored`: supply and registers. Raises ConfigError for those of a joint that the head does not have.
     """
+    for unknown in stored.joints.keys() - head.joints.keys():
+        raise ConfigError.at(
+            f"{head.name}: emulate.yaml", "joints", unknown, "is not a joint of this head", head.joints
+        )
     by_bus: dict[str, list[EmulatedServo]] = {}
     calibration, sagging = calibration_of(head.joints), sagging_joints(head)
     for index, (name, joint) in enumerate(head.joints.items()):
@@ -82,29 +87,15 @@ def emulated(head: Head) -> dict[str, list[EmulatedServo]]:
             first, last = home_ticks(table.ticks_per_revolution, needs)
             ticks = max(first, min(ticks, last))
         bus = head.buses[joint.bus]
-        stored = {"crc": 1} if bus.crc else head.safety_of(name).stored
-        servo = EmulatedServo(joint.id, joint.model, bus.baud, ticks, registers=stored)
+        registers = ({"crc": 1} if bus.crc else head.safety_of(name).stored) | stored.of(name)
+        servo = EmulatedServo(joint.id, joint.model, bus.baud, ticks, registers=registers, supply_v=stored.supply_v)
         by_bus.setdefault(joint.bus, []).append(servo)
     return by_bus
 
 
 def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
-    """Return servos as `emulated` does, with the registers and the supply voltage of the emulate.yaml of head `name`.
-
-    Raises ConfigError for stored values of a joint that the head does not have.
-    """
-    stored = load_stored(name)
-    for joint in stored.joints:
-        if joint not in head.joints:
-            raise ConfigError.at(f"{name}: emulate.yaml", "joints", joint, "is not a joint of this head", head.joints)
-    joints = {(joint.bus, joint.id): key for key, joint in head.joints.items()}
-    return {
-        bus: [
-            replace(servo, registers={**servo.registers, **stored.of(joints[bus, servo.id])}, supply_v=stored.supply_v)
-            for servo in servos
-        ]
-        for bus, servos in emulated(head).items()
-    }
+    """Return the servos of `emulated` with what the emulate.yaml of head `name` says. Raises ConfigError."""
+    return emulated(head, load_stored(name))
 
 
 # --- where the joints of a head stand that is switched off ----------------------------------------------------------

@@ -6,16 +6,14 @@ import csv
 import sys
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, cell, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
-
-if TYPE_CHECKING:
-    from sfms_robot.app.head.fit import HeadFit
 
 PACKAGES = Option(
     [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
@@ -54,9 +52,10 @@ def list_speakers(json: bool = JSON) -> None:
 @port.command("list")
 def list_ports(json: bool = JSON) -> None:
     """Serial ports that servos may hang on, with what speaks against using them; devices that record, or play."""
-    from sfms_robot.app.catalogue import serial_ports, sound_devices
+    from sfms_robot.app.catalogue import sound_devices
+    from sfms_robot.servo.discovery import ports_data
 
-    found: dict[str, Any] = {"version": 1, "ports": serial_ports(), "microphones": [], "loudspeakers": []}
+    found: dict[str, Any] = {"version": 1, "ports": ports_data(), "microphones": [], "loudspeakers": []}
     found["microphone_problem"] = None
     try:
         found |= {"microphones": sound_devices("recording"), "loudspeakers": sound_devices("playing")}
@@ -98,10 +97,10 @@ def check(
     if plot is not None:
         checked_png(plot, "--plot")
     checked = check_head(name, data, listener, packages)
-    if plot is not None and not checked.problems:
+    if plot is not None and not checked["problems"]:
         draw(checked, plot)
-    show(checked.as_dict(), json, _print_check)
-    if checked.problems:
+    show(checked, json, _print_check)
+    if checked["problems"]:
         raise Exit(ConfigError.exit_code)
 
 
@@ -191,7 +190,7 @@ def calibrate(
     """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
     from sfms_robot.app.head.calibrate import calibrate as lead_through
 
-    outcome = lead_through(name, port, _Terminal(), joint, again)
+    outcome = lead_through(name, port, partial(print, flush=True), input, joint, again)
     print()  # ends the line of the last question
     show(outcome.as_dict(), json)
     if outcome.torque_unconfirmed:
@@ -202,16 +201,6 @@ def calibrate(
         raise Exit(TorqueError.exit_code)
     if outcome.exit == "interrupted":
         raise Exit(INTERRUPTED)
-
-
-class _Terminal:
-    """The user of `head calibrate`: prints lines, and reads one after each question."""
-
-    def say(self, text: str) -> None:
-        print(text, flush=True)
-
-    def ask(self, prompt: str) -> str:
-        return input(prompt)
 
 
 @app.command("pose")
@@ -254,27 +243,24 @@ def fit(
     from sfms_robot.app.head.fit import fit_head, see_virtual_face
     from sfms_robot.app.options import HeadOptions
 
-    def fitted(found: HeadFit) -> None:
-        show(found.as_dict(), json)
-
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")
     if recording is not None:
-        fitted(fit_head(name, recording))
+        show(fit_head(name, recording), json)
         return
     if port != "sim" and record is None:
         raise ConfigError("head fit --babble on a real port needs --record DIR, where the face track goes too")
     with tempfile.TemporaryDirectory() as spare:
         folder = record if record is not None else Path(spare)
         servos = HeadOptions(head=name, port=port, fast=port == "sim", yes=yes)
-        head, drove = move(servos, folder, minutes=minutes, seed=seed)
-        if port == "sim" and drove.outcome == "done":
-            see_virtual_face(head, folder)
-            fitted(fit_head(name, folder, practice=True))
+        report = move(servos, folder, minutes=minutes, seed=seed)
+        if port == "sim" and report["exit"] == "done":
+            see_virtual_face(name, folder)
+            show(fit_head(name, folder, practice=True), json)
             return
-    seconds = round(drove.log.listened_s, 1)
-    moved = {"head": head.name, "exit": drove.outcome, "seconds": seconds, "record": str(record)}
-    show(moved, json, lambda _: say(f"{drove.outcome}: {folder}/run.mcap; put the face track beside it"))
+    seconds = round(report["duration_s"], 1)
+    moved = {"head": report["head"], "exit": report["exit"], "seconds": seconds, "record": str(record)}
+    show(moved, json, lambda _: say(f"{report['exit']}: {folder}/run.mcap; put the face track beside it"))
 
 
 @app.command("solve")

@@ -216,9 +216,9 @@ def run(
     )
     check_names(options)
     if check:
-        from sfms_robot.app.listen.sound_check import LevelMeter, check_sound
+        from sfms_robot.app.listen.sound_check import check_sound, level_meter
 
-        with LevelMeter() as meter:
+        with level_meter() as meter:
             found = check_sound("mic" if audio == "default" else audio, duration, None if json else meter)
         show(found, json)
         return

@@ -133,7 +133,7 @@ def read(
     """Read registers by name: raw and in their unit."""
     from sfms_robot.app.servo.single_servo import read_registers
 
-    _each(ids, on, "registers", lambda seen: [value.row() for value in read_registers(seen, registers)])
+    _each(ids, on, "registers", lambda seen: read_registers(seen, registers))
 
 
 @app.command()
@@ -235,13 +235,7 @@ def write(
 
     confirm = confirmation(yes, ids)
 
-    def change(seen: FoundServo) -> list[dict[str, Any]]:
-        before, after = write_register(seen, register, value, confirm)
-        row = after.row()
-        kept = {key: row[key] for key in ("raw", "value", "unit")}
-        return [{"register": row["register"], "before": before.raw if before else None, **kept}]
-
-    _each(ids, on, "written", change)
+    _each(ids, on, "written", lambda seen: [write_register(seen, register, value, confirm)])
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
@@ -314,10 +308,11 @@ def restore(
     yes: YesOption = False,
 ) -> None:
     """Write the EEPROM of a dumped servo to one of the same model. Shows the differences and asks."""
-    from sfms_robot.app.servo.single_servo import load_dump
+    from sfms_robot.app.servo.single_servo import Dump
     from sfms_robot.app.servo.single_servo import restore as write_back
+    from sfms_robot.config.base import load
 
-    kept = {each.id: each for each in load_dump(file).servos}
+    kept = {each.id: each for each in load(Dump, file).servos}
     if source is None and into is not None:
         raise ConfigError("servo restore: --into needs --from, the id in the file")
     if source is not None and source not in kept:

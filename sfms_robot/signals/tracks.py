@@ -99,7 +99,7 @@ def read_track(path: Path | str) -> Track:
     divided by something else than commas, values or times that are in another unit.
     """
     file = Path(path)
-    header, rows = _cells(file)
+    header, rows = csv_cells(file)
     if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
         raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
     from_camera = any(match and match[1] for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)))
@@ -113,7 +113,7 @@ def read_track(path: Path | str) -> Track:
     for channel, (index, factor) in columns.items():
         cells = [row[index].strip() for row in rows]
         lost = [cell == "" or cell.lower() == "nan" for cell in cells]
-        values = factor * np.where(lost, np.nan, _numbers(file, header[index], np.where(lost, "0", cells)))
+        values = factor * np.where(lost, np.nan, csv_numbers(file, header[index], np.where(lost, "0", cells)))
         low, high, problem = _RANGES.get(channel, _SHAPE_RANGE)
         outside = np.flatnonzero((values < low) | (values > high))
         if len(outside):
@@ -177,8 +177,8 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
 # --- the parts of reading ---------------------------------------------------------------------------------------
 
 
-def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows that are not empty."""
+def csv_cells(file: Path) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows that are not empty, of a CSV file that may be gzipped. Raises ConfigError."""
     try:
         data = file.read_bytes()
         if data[:2] == b"\x1f\x8b":
@@ -189,7 +189,7 @@ def _cells(file: Path) -> tuple[list[str], list[list[str]]]:
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
     if len(rows) < 2:
-        raise ConfigError(f"{file}: holds no face: " + ("a header and no rows" if rows else "the file is empty"))
+        raise ConfigError(f"{file}: holds no rows: " + ("only a header" if rows else "the file is empty"))
     return [cell.strip() for cell in rows[0]], rows[1:]
 
 
@@ -233,8 +233,8 @@ def _columns(file: Path, header: Sequence[str], moved: Mapping[str, str]) -> dic
     return columns
 
 
-def _numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
-    """Return the numbers of a column, one row after the other from row 2 on."""
+def csv_numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
+    """Return the numbers of a column, one row after the other from row 2 on. Raises ConfigError for another cell."""
     numbers = []
     for row, cell in enumerate(cells, 2):
         try:
@@ -250,7 +250,7 @@ def _numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
 def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
     """Return seconds (N,): as written, or from the first row for a time of day and for a clock that began long ago."""
     factor = _TIME_COLUMNS[name.lower()]
-    times_s = factor * _numbers(file, name, cells) if factor else _timecodes(file, name, cells)
+    times_s = factor * csv_numbers(file, name, cells) if factor else _timecodes(file, name, cells)
     steps_s = np.diff(times_s)
     backwards = np.flatnonzero(steps_s <= 0)
     if len(backwards):
@@ -272,7 +272,7 @@ def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
     for row, each in enumerate(fields, 2):
         if len(each) != 4:
             raise ConfigError(f"{file}: row {row}, column {name} = {':'.join(each)!r} is not HH:MM:SS:FF.fff")
-    hours, minutes, seconds, frames = (_numbers(file, name, column) for column in zip(*fields, strict=True))
+    hours, minutes, seconds, frames = (csv_numbers(file, name, column) for column in zip(*fields, strict=True))
     whole_s = 3600.0 * hours + 60.0 * minutes + seconds
     whole_s += 86_400.0 * np.cumsum(np.diff(whole_s, prepend=whole_s[0]) < -43_200)  # a take across midnight
     counts = 60

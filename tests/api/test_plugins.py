@@ -73,39 +73,36 @@ def installed(tmp_path, monkeypatch):
     return tmp_path
 
 
+def program(installed, *words, code="from sfms_robot.cli.main import main; main()"):
+    """Run a command line, or other code, where that package is installed."""
+    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+
+
 def test_a_listener_of_another_package_is_loaded_by_its_name(installed):
     listener = sr.load_listener("nodder:0.2")
     plan = listener.stream().push(None)
     assert listener.hop == 1 and plan is not None and plan.frames.shape == (1, 58)
-
-
-def test_shipped_names_go_first(installed):
-    assert sr.load_listener("sfms-small").horizon == 8
+    assert sr.load_listener("sfms-small").horizon == 8  # shipped names go first
 
 
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("broken", "broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
-        ("nodder:large", "nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not convert"),
+        ("broken", "^plug-in broken .package somebodys-nods, somebodys_nods:Missing.: AttributeError: .*'Missing'"),
+        ("nodder:large", "^plug-in nodder .package somebodys-nods, somebodys_nods:Nodder.: ValueError: could not"),
+        ("nope", "'nope' is neither .*sfms-small"),
     ],
 )
 def test_one_that_fails_at_import_or_when_it_is_made_says_which(installed, name, problem):
-    with pytest.raises(sr.ConfigError, match=f"^plug-in {problem}.*$") as raised:
+    with pytest.raises(sr.ConfigError, match=problem) as raised:
         sr.load_listener(name)
     assert "\n" not in str(raised.value)
 
 
-def test_an_unknown_name_is_refused_with_the_shipped_ones(installed):
-    with pytest.raises(sr.ConfigError, match="'nope' is neither .*sfms-small"):
-        sr.load_listener("nope")
-
-
 def test_a_run_listens_with_it_in_its_own_process(installed):
-    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    arguments = ["run", "--head", "reachy_mini", "--listener", "nodder:0.15", "--duration", "2", "--json"]
-    command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+    done = program(installed, "run", "--head", "reachy_mini", "--listener", "nodder:0.15", "--duration", "2", "--json")
     assert done.returncode == 0, done.stderr
     assert '"listener_state": {"state": "listening"' in done.stdout.splitlines()[-1]
 
@@ -115,8 +112,7 @@ def test_a_bus_family_of_another_package_is_in_the_table(installed):
         "from sfms_robot.servo.families import family_named\n"
         "family = family_named('somebodys'); print(family.title, family.build())"
     )
-    here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
+    done = program(installed, code=code)
     assert done.stdout.strip() == "Somebody's servos <class 'somebodys_servos.Bus'>", done.stderr
 
 
@@ -158,21 +154,19 @@ def their_head(installed):
 
 def test_a_broken_plug_in_ends_no_command_but_the_one_that_names_it(installed, their_head):
     (installed / "somebodys_servos.py").write_text("raise RuntimeError('not for this computer')")
-    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    for words, code in ((["doctor", "--port", "/dev/null", "--baud", "5"], 2), (["run", "--head", str(their_head)], 2)):
-        command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *words]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+    for words, problem in (
+        (["doctor", "--port", "/dev/null", "--baud", "5"], "--baud 5"),
+        (["run", "--head", str(their_head)], "not for this computer"),
+    ):
+        done = program(installed, *words)
         warned, said = done.stderr.splitlines()
-        assert done.returncode == code and "somebodys" in warned and warned.endswith("it is left out")
-        assert ("--baud 5" if words[0] == "doctor" else "not for this computer") in said
+        assert done.returncode == 2 and "somebodys" in warned and warned.endswith("it is left out")
+        assert problem in said
 
 
 def test_a_head_on_a_bus_of_another_package_runs_on_emulated_servos(installed, their_head):
-    here = {**os.environ, "XDG_CONFIG_HOME": str(installed), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    arguments = ["run", "--head", str(their_head), "--listener", "nodder:0.15", "--audio", "none", "--face", "none"]
-    arguments += ["--fast", "--duration", "3", "--json"]
-    command = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=here, timeout=120)
+    words = ["--listener", "nodder:0.15", "--audio", "none", "--face", "none", "--fast", "--duration", "3", "--json"]
+    done = program(installed, "run", "--head", str(their_head), *words)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout.splitlines()[-1])
     assert report["exit"] == "done" and report["limits"]["violations"] == 0

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -46,6 +47,18 @@ class Nodder:
         return sr.Plan(speaker.time_s, times, frames), memory + 1
 
 
+class Still(Nodder):
+    """A listener whose face stands still."""
+
+    def __init__(self, face):
+        super().__init__()
+        self._face = face
+
+    def step(self, speaker, memory):
+        plan, memory = super().step(speaker, memory)
+        return sr.Plan(plan.made_at_s, plan.times_s, np.full((2, MOTION_DIM), self._face, np.float32)), memory
+
+
 def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end():
     told = []
     with sr.Robot(HEAD, listener=(nodder := Nodder())) as robot:
@@ -61,17 +74,26 @@ def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end()
     assert len(told) == len({event.start_s for event in told})
 
 
-def test_what_is_pushed_is_what_the_listener_hears():
+def test_what_is_pushed_is_what_the_listener_hears_from_any_thread():
     face = np.zeros(58, np.float32)
     face[PITCH] = 0.25
     listener = Nodder()
-    with sr.Robot(HEAD, listener=listener) as robot:
+    robot = sr.Robot(HEAD, listener=listener)
+    starts = threading.Thread(target=robot.start)
+    starts.start()
+    starts.join()
+    assert robot.state == "starting"
+    try:
         for _ in range(50):
             robot.hear(np.full(1920, 8192, np.int16), 48000)
             robot.see(face)
             robot.say(np.full(960, 0.5, np.float32), 24000)
             if robot.wait(0.04):
                 break
+    finally:
+        robot.stop()
+    robot.stop()
+    assert robot.state == "stopped"
     heard = [frame for frame in listener.heard if len(frame.audio)]
     assert heard and all(len(frame.audio) == 640 and np.abs(frame.audio).max() <= 1 for frame in heard)
     assert np.median(heard[-1].audio) == pytest.approx(0.25, abs=0.01)
@@ -88,46 +110,18 @@ def test_a_listener_that_raises_ends_no_run_and_is_named():
     assert robot.report()["listener_state"]["state"] == "failed: RuntimeError: out of ideas"
 
 
-def test_it_runs_in_any_thread_and_stops_from_another():
-    robots = []
-
-    def drive():
-        robots.append(sr.Robot(HEAD, listener=Nodder()).start())
-
-    thread = threading.Thread(target=drive)
-    thread.start()
-    thread.join()
-    (robot,) = robots
-    assert robot.state == "starting"
-    robot.stop()
-    robot.stop()
-    assert robot.state == "stopped"
-
-
-def test_virtual_time_a_source_by_name_and_the_end_by_itself():
-    with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Nodder()) as robot:
-        robot.show({"pitch": -0.2}, seconds=0.5)
-        robot.look_at(1.0, 0.2, 0.0, seconds=0.5)
-        assert robot.wait()
-    report = robot.report()
-    assert (report["exit"], report["frames"], report["limits"]["violations"]) == ("done", 75, 0)
-
-
 def test_show_reaches_the_servos_and_intensity_zero_keeps_them_still():
     travels = []
     for intensity in (1.0, 0.0):
-        with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Still(), seed=1) as robot:
+        with sr.Robot(HEAD, audio="katie", duration_s=3.0, fast=True, listener=Still(0.1), seed=1) as robot:
             for region in robot.knobs:
                 robot.knobs[region].intensity = intensity
-            robot.wait()
-        travels.append(sum(joint["travel_rad"] for joint in robot.report()["joints"].values()))
+            robot.look_at(1.0, 0.2, 0.0, seconds=0.5)
+            assert robot.wait()
+        report = robot.report()
+        assert (report["exit"], report["frames"], report["limits"]["violations"]) == ("done", 75, 0)
+        travels.append(sum(joint["travel_rad"] for joint in report["joints"].values()))
     assert travels[0] > 2 * travels[1]
-
-
-class Still(Nodder):
-    def step(self, speaker, memory):
-        plan, memory = super().step(speaker, memory)
-        return sr.Plan(plan.made_at_s, plan.times_s, np.full((2, 58), 0.1, np.float32)), memory
 
 
 class BadSource(sr.Source):
@@ -217,6 +211,8 @@ def test_servos_alone_go_where_they_are_told_within_the_limits_and_rest_at_the_e
 
 
 def test_servos_alone_refuse_what_is_no_goal():
+    with pytest.raises(sr.ConfigError, match="is not what its file says"):
+        sr.open_bus(sr.load_head(HEAD).model_copy(update={"description": "another"}))
     with sr.open_bus(sr.load_head(HEAD)) as bus:
         with pytest.raises(sr.BusError, match=r"enable\(\) first"):
             bus.write(bus.rest_rad)
@@ -234,12 +230,6 @@ def test_servos_alone_refuse_what_is_no_goal():
         bus.stop()
         with pytest.raises(sr.BusError, match="the run has ended"):
             bus.write(bus.rest_rad)
-
-
-def test_a_head_that_was_changed_after_loading_is_refused():
-    head = sr.load_head(HEAD)
-    with pytest.raises(sr.ConfigError, match="is not what its file says"):
-        sr.open_bus(head.model_copy(update={"description": "another"}))
 
 
 SCRIPT = """
@@ -273,9 +263,8 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
         robot.resume()
         robot.wait(0.3)
         assert robot.state == "starting"
-    assert [change["state"] for change in robot.report()["states"]["changes"]] == [
-        "starting", "halted", "starting", "stopping", "stopped",
-    ]  # fmt: skip
+    changes = groupby(change["state"] for change in robot.report()["states"]["changes"])  # a tick may see the button
+    assert [state for state, _ in changes] == ["starting", "halted", "starting", "stopping", "stopped"]
 
 
 @pytest.mark.parametrize("opens", [sr.Robot, sr.open_bus])
@@ -300,14 +289,6 @@ def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report
 # --- speech that is played ---
 
 
-class Resting(Nodder):
-    """A listener whose face rests."""
-
-    def step(self, speaker, memory):
-        plan, memory = super().step(speaker, memory)
-        return sr.Plan(plan.made_at_s, plan.times_s, np.zeros((2, MOTION_DIM), np.float32)), memory
-
-
 def until(robot, state):
     for _ in range(round(LIMIT_S / LOOK_S)):
         if robot.state == state:
@@ -319,7 +300,7 @@ def until(robot, state):
 @pytest.mark.slow
 def test_what_it_says_is_played_and_it_speaks_until_it_is_hushed(sound_server):
     noise = (0.3 * np.random.default_rng(0).uniform(-1, 1, 60 * 24_000)).astype(np.float32)
-    with sr.Robot("interbotix_wxxms", listener=Resting(), play="person") as robot:
+    with sr.Robot("interbotix_wxxms", listener=Still(0.0), play="person") as robot:
         until(robot, "idle")
         robot.say(noise, 24_000)
         until(robot, "speaking")
@@ -336,6 +317,6 @@ def test_what_is_said_elsewhere_is_not_played(sound_server):
 
     with pytest.raises(sr.InputError, match="play='person': what a source of your own says is not played"):
         sr.Robot("interbotix_wxxms", source=Nobody(), play="person")
-    robot = sr.Robot("interbotix_wxxms", listener=Resting(), audio="katie", play="person")
+    robot = sr.Robot("interbotix_wxxms", listener=Still(0.0), audio="katie", play="person")
     with pytest.raises(sr.ConfigError, match="^--play person: nothing is played of --agent-audio none"):
         robot.start()

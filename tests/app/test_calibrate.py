@@ -16,21 +16,13 @@ import pytest
 import yaml
 from emulated_devices import device_of, servos_of
 
-from sfms_robot.app.head.calibrate import CalibrationOutcome, calibrate, calibrate_on
+from sfms_robot.app.head.calibrate import CalibrationOutcome, Guide, calibrate, calibrate_on
 from sfms_robot.app.open_head import calibrated_head, identify, open_head
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import held_back
-from sfms_robot.config.overlay import (
-    Overlay,
-    calibrated,
-    head_hash,
-    layered,
-    load_overlay,
-    overlay_file,
-    save_overlay,
-)
+from sfms_robot.config.overlay import Overlay, calibrated, head_hash, layered, load_overlay, overlay_file, save_overlay
 from sfms_robot.data import find
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -103,7 +95,8 @@ def hand(chain: Chain, servo: int, ticks: int) -> Callable[[], str]:
 
 
 def led(name: str, chain: Chain, person: Person, **more) -> CalibrationOutcome:
-    return calibrate_on(name, {"main": chain}, VirtualClock(), person, overlay_file("two"), DAY, **more)
+    guide = Guide(person.say, person.ask, DAY)
+    return calibrate_on(name, {"main": chain}, VirtualClock(), guide, overlay_file("two"), **more)
 
 
 def by_hand(chain: Chain) -> list[Answer]:
@@ -172,19 +165,6 @@ def test_what_cannot_be_is_measured_again(name, ends, why):
     assert not overlay_file("two").exists()
 
 
-def test_a_servo_that_falls_silent_on_the_way_is_left_out(name):
-    with head_on_emulated_servos(name) as chain:
-
-        def cable_out() -> str:
-            chain.kill(1)
-            return ""
-
-        answers: list[Answer] = ["", hand(chain, 1, 1990), hand(chain, 1, 2300), cable_out]
-        outcome = led(name, chain, Person(*answers), joints=["jaw"])
-    assert outcome.measured == [] and "jaw (id 1) does not answer" in outcome.skipped["jaw"]
-    assert not overlay_file("two").exists()
-
-
 @pytest.mark.parametrize(("answer", "measured"), [("n", ["jaw"]), ("q", []), (KeyboardInterrupt, [])])
 def test_a_joint_whose_torque_is_not_confirmed_off_at_its_end_is_named(name, answer, measured):
     with head_on_emulated_servos(name) as chain:
@@ -212,9 +192,17 @@ def test_nobody_is_told_to_move_a_joint_by_hand_whose_torque_is_not_confirmed_of
     assert outcome.skipped["jaw"].startswith("torque of jaw could not be confirmed off")
 
 
-def test_a_silent_servo_is_left_out_and_the_others_are_done(name):
+def test_a_servo_that_is_silent_or_falls_silent_is_left_out_and_the_others_are_done(name):
     with head_on_emulated_servos(name) as chain:
-        chain.kill(1)
+
+        def cable_out() -> str:
+            chain.kill(1)
+            return ""
+
+        jaw: list[Answer] = ["", hand(chain, 1, 1990), hand(chain, 1, 2300), cable_out]
+        outcome = led(name, chain, Person(*jaw), joints=["jaw"])
+        assert outcome.measured == [] and "jaw (id 1) does not answer" in outcome.skipped["jaw"]
+        assert not overlay_file("two").exists()
         outcome = led(name, chain, Person(*by_hand(chain)[5:]))
     assert outcome.skipped == {"jaw": "no answer from id 1 on bus 'main'"} and outcome.measured == ["brow"]
 
@@ -262,7 +250,8 @@ def test_every_family_tells_who_it_is(tmp_path, family, model, zero):
 
 
 def test_practice_on_emulated_servos_is_kept_apart(name):
-    outcome = calibrate(name, "sim", Person("k", "5", "", "20", "", "n"), ["jaw"])
+    person = Person("k", "5", "", "20", "", "n")
+    outcome = calibrate(name, "sim", person.say, person.ask, ["jaw"])
     assert outcome.measured == ["jaw"] and outcome.file == overlay_file("two", practice=True)
     assert outcome.file.exists() and not overlay_file("two").exists()
 

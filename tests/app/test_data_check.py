@@ -30,6 +30,8 @@ def with_nan(values):
 
 
 FACE = "data/train/coefficients/listener/session0/take_0.npy"
+VOICE = "data/train/audio/speaker/session0/take_0.wav"
+MOOD = "data/train/facial-attributes/listener/session0/take_0.npy"
 
 
 @pytest.mark.parametrize(
@@ -41,28 +43,10 @@ FACE = "data/train/coefficients/listener/session0/take_0.npy"
         (lambda root: broken_npy(root / FACE, lambda x: x[..., :50]), "wrong dims", "listener/session0/take_0.npy"),
         (lambda root: broken_npy(root / FACE, lambda x: x[:20]), "lengths differ", "session0+take_0"),
         (lambda root: broken_npy(root / FACE, with_nan), "not finite", "listener/session0/take_0.npy"),
-        (
-            lambda root: (root / "data/train/audio/speaker/session0/take_0.wav").unlink(),
-            "missing sound",
-            "audio/speaker/session0/take_0.wav",
-        ),
-        (
-            lambda root: write.wav(root / "data/train/audio/speaker/session0/take_0.wav", 0.5),
-            "lengths differ",
-            "audio/speaker/session0/take_0.wav",
-        ),
-        (
-            lambda root: (root / "data/train/audio/speaker/session0/take_0.wav").write_bytes(b"RIFF"),
-            "unreadable",
-            "session0+take_0",
-        ),
-        (
-            lambda root: broken_npy(
-                root / "data/train/facial-attributes/listener/session0/take_0.npy", lambda x: x[:, :20]
-            ),
-            "wrong dims",
-            "facial-attributes/listener/session0/take_0.npy",
-        ),
+        (lambda root: (root / VOICE).unlink(), "missing sound", "audio/speaker/session0/take_0.wav"),
+        (lambda root: write.wav(root / VOICE, 0.5), "lengths differ", "audio/speaker/session0/take_0.wav"),
+        (lambda root: (root / VOICE).write_bytes(b"RIFF"), "unreadable", "session0+take_0"),
+        (lambda root: broken_npy(root / MOOD, lambda x: x[:, :20]), "wrong dims", MOOD.removeprefix("data/train/")),
     ],
 )
 def test_one_harm_is_one_named_problem_and_the_rest_is_usable(tmp_path, harm, kind, where):
@@ -129,16 +113,10 @@ def test_table_names_what_is_left_out_and_the_command_ends_well(tmp_path, comman
     shown = ended.out
     assert ended.code == 0
     assert "too short" in shown and "session0+take_0" in shown and "rotation_x" in shown
-
-
-def test_set_of_which_nothing_can_be_used_ends_with_2(tmp_path, command_line):
-    write.react2025(tmp_path)
     ended = command_line("data", "check", tmp_path, "--window", 4800)
     assert ended.code == 2 and "not usable" in ended.out
-
-
-def test_no_data_set_is_one_line_and_2(tmp_path, command_line):
-    ended = command_line("data", "check", tmp_path, "--json")
+    (tmp_path / "empty").mkdir()
+    ended = command_line("data", "check", tmp_path / "empty", "--json")
     assert ended.code == 2 and ended.complaint
 
 

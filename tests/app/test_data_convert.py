@@ -134,6 +134,9 @@ def test_licence_goes_along(tmp_path, caplog, command_line):
     open_for("arkit58", tmp_path / "out", "train")
     assert "CC BY-NC 4.0" in caplog.text
     assert command_line("data", "check", tmp_path / "out", "--json").told["licence"] == told["licence"]
+    (tmp_path / "out" / "source.yaml").write_text("licence: [1]\n")
+    report = command_line("data", "check", tmp_path / "out", "--json").told
+    assert "source.yaml: licence = [1] is no text" in report["splits"][0]["problems"][0]["first"]
 
 
 def test_table_tells_splits_licence_and_residual(tmp_path, command_line):
@@ -172,25 +175,15 @@ def test_what_cannot_be_converted_is_one_line_and_nothing_is_written(tmp_path, c
     assert ended.code == 2 and said in ended.complaint and not list(tmp_path.glob("out/*/*"))
 
 
-def test_a_folder_that_holds_something_is_not_written_into(tmp_path, command_line):
+def test_a_folder_that_holds_something_is_not_written_into_and_no_usable_clip_is_said(tmp_path, command_line):
     write.dualtalk(tmp_path / "in")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("mine")
     ended = command_line("data", "convert", tmp_path / "in", tmp_path / "out")
     assert ended.code == 2 and "is not empty" in ended.complaint
     assert "is a file" in command_line("data", "convert", tmp_path / "in", tmp_path / "out" / "mine.txt").complaint
-
-
-def test_where_no_clip_can_be_used_the_first_reason_is_told(tmp_path, command_line):
-    write.seamless(tmp_path / "in", 1)
-    next((tmp_path / "in").rglob("*.wav")).unlink()
-    ended = command_line("data", "convert", tmp_path / "in", tmp_path / "out")
+    write.seamless(tmp_path / "mute", 1)
+    next((tmp_path / "mute").rglob("*.wav")).unlink()
+    ended = command_line("data", "convert", tmp_path / "mute", tmp_path / "other")
     assert ended.code == 2 and "no usable clip" in ended.complaint and ".wav: no such file" in ended.complaint
-    assert not list((tmp_path / "out").iterdir())
-
-
-def test_a_source_that_is_no_text_is_named(tmp_path, command_line):
-    convert_data(write.dualtalk(tmp_path / "in"), tmp_path / "out")
-    (tmp_path / "out" / "source.yaml").write_text("licence: [1]\n")
-    report = command_line("data", "check", tmp_path / "out", "--json").told
-    assert "source.yaml: licence = [1] is no text" in report["splits"][0]["problems"][0]["first"]
+    assert not list((tmp_path / "other").iterdir())

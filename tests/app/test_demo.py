@@ -2,7 +2,6 @@
 
 import sys
 
-import numpy as np
 import pytest
 
 from sfms_robot.app.listen.demo import compare_seeds, demo, free_folder, nods_over_seeds
@@ -46,9 +45,9 @@ def test_a_second_demo_writes_beside_the_first(tmp_path):
 def test_seeds_are_told_one_by_one():
     seen = []
     told = compare_seeds(SHORT, 2, seen.append)
-    assert [row["seed"] for row in seen] == [0, 1] == [row["seed"] for row in told["runs"]]
-    assert told["exit"] == "done" and told["exit_code"] == 0
-    assert told["nods"]["mean"] == np.mean([row["nods"] for row in told["runs"]])
+    assert [row["seed"] for row in seen] == [0, 1] and seen == told["runs"]
+    assert (told["exit"], told["exit_code"]) == ("done", 0)
+    assert told["nods"] == nods_over_seeds([row["nods"] for row in seen])
 
 
 def test_nods_of_several_seeds_have_a_mean_a_scatter_and_those_without():
@@ -56,14 +55,15 @@ def test_nods_of_several_seeds_have_a_mean_a_scatter_and_those_without():
     assert nods_over_seeds([0, 0])["variance_over_mean"] is None is nods_over_seeds([3])["variance_over_mean"]
 
 
-def test_without_the_packages_of_pictures_the_run_is_kept_and_the_pip_install_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
+@pytest.mark.parametrize(
+    ("package", "extra", "pictures"), [("matplotlib", "plots", []), ("vtkmodules", "pictures", ["run.png"])]
+)
+def test_without_a_package_of_pictures_the_run_is_kept_and_the_pip_install_named(
+    package, extra, pictures, tmp_path, monkeypatch
+):
+    for module in (package, f"{package}.figure"):  # as if it were not installed
+        monkeypatch.setitem(sys.modules, module, None)
     told = demo(SHORT, tmp_path / "demo")
-    assert told["exit"] == "done" and told["pictures"] == [] and (tmp_path / "demo" / "run.mcap").is_file()
-    assert told["missing"].count("\n") == 0 and "pip install 'sfms-robot[plots]'" in told["missing"]
-
-
-def test_without_vtk_the_plot_is_drawn(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "vtkmodules", None)  # as if it were not installed
-    told = demo(SHORT, tmp_path / "demo")
-    assert told["pictures"] == [str(tmp_path / "demo" / "run.png")] and "sfms-robot[pictures]" in told["missing"]
+    assert told["exit"] == "done" and (tmp_path / "demo" / "run.mcap").is_file()
+    assert told["pictures"] == [str(tmp_path / "demo" / name) for name in pictures]
+    assert told["missing"].count("\n") == 0 and f"pip install 'sfms-robot[{extra}]'" in told["missing"]

@@ -1,14 +1,12 @@
 """Findings without a wire: what to type, and the wire budget against packets and figures of real chains."""
 
-from dataclasses import asdict
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.app.servo.diagnosis import (
-    Command,
     Finding,
+    Line,
     grouped,
     ids_text,
     judge_adapter,
@@ -24,7 +22,13 @@ from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.discovery import Holder, SerialDevice
 
 BAUD = 1_000_000
-COMMAND = Command("/dev/ttyUSB0", "dynamixel2")
+
+
+def line_on(shown, family="dynamixel2", head=None, ports=None):
+    return Line(device=shown, shown=shown, family=family, head=head, ports=ports)
+
+
+LINE = line_on("/dev/ttyUSB0")
 FACTORY = {"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}
 TUNED = {"baud": 1_000_000, "return_delay_us": 0.0, "latency_ms": 1.0}
 
@@ -40,9 +44,9 @@ def test_bytes_are_those_of_the_packets(servos, read, write):
     answers = servos * len(dxl2.encode_status(1, 0, bytes(read)))
     fast = len(dxl2.encode_fast_status([(i, 0, bytes(read)) for i in ids]))
     budget = wire_budget("dynamixel2", servos, **TUNED, read_bytes=read, write_bytes=write)
-    assert budget.write_only.bytes == len(goals)
-    assert budget.plain.bytes == len(goals) + len(ask) + answers
-    assert budget.fast.bytes == len(goals) + len(ask) + fast
+    assert budget["write_only"]["bytes"] == len(goals)
+    assert budget["plain"]["bytes"] == len(goals) + len(ask) + answers
+    assert budget["fast"]["bytes"] == len(goals) + len(ask) + fast
 
 
 @pytest.mark.parametrize(
@@ -57,40 +61,30 @@ def test_bytes_are_those_of_the_packets(servos, read, write):
     ],
 )
 def test_figures_of_a_sync_read_and_a_sync_write_of_four_bytes(servos, wire, ms):
-    assert wire_budget("dynamixel2", servos, **wire, read_bytes=4).plain.ms == pytest.approx(ms, abs=0.06)
-
-
-def test_fast_sync_read_spares_the_return_delays_and_most_of_the_headers():
-    for servos, ms in ((9, 2.6), (25, 4.9)):
-        budget = wire_budget("dynamixel2", servos, **TUNED, read_bytes=4)
-        assert budget.fast.ms == pytest.approx(ms, abs=0.05) and budget.fast.hz > budget.plain.hz
+    budget = wire_budget("dynamixel2", servos, **wire, read_bytes=4)
+    assert budget["plain"]["ms"] == pytest.approx(ms, abs=0.06) and budget["fast"]["hz"] > budget["plain"]["hz"]
 
 
 def test_single_reads_pay_the_adapter_once_per_servo():
     slow = wire_budget("dynamixel1", 9, 1_000_000, 500.0, 16.0, read_bytes=2, write_bytes=2)
-    assert slow.plain.ms == pytest.approx(150, abs=0.5) and slow.fast is None
-    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2, together=False).plain.ms > 9 * 16
-    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2).plain.ms < 18
-
-
-def test_budget_is_rounded_and_complete():
-    plain = asdict(wire_budget("dynamixel2", 28, **TUNED, read_bytes=10))
-    assert plain["plain"]["bytes"] == 14 + 28 * 5 + 14 + 28 + 28 * 21 and plain["fast"]["hz"] > plain["plain"]["hz"]
+    assert slow["plain"]["ms"] == pytest.approx(150, abs=0.5) and slow["fast"] is None
+    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2, together=False)["plain"]["ms"] > 9 * 16
+    assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2)["plain"]["ms"] < 18
 
 
 def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
     words = "write 19 return_delay_time 0"
-    assert COMMAND.servo(words, BAUD).endswith("--port /dev/ttyUSB0 --baud 1000000")
-    assert Command("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
-    assert Command("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
-    assert Command("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
-    two = Command("/dev/a", "feetech", "my face", "face=/dev/a,neck=/dev/b")
+    assert LINE.servo(words, BAUD).endswith("--port /dev/ttyUSB0 --baud 1000000")
+    assert line_on("/dev/ttyUSB0", "feetech", "face").servo(words).endswith("--port /dev/ttyUSB0 --family feetech")
+    assert line_on("sim", "feetech", "face").servo(words, BAUD).endswith("--port sim --head face")
+    assert line_on("sim", "feetech").servo(words, BAUD).endswith("--port sim --baud 1000000 --family feetech")
+    two = line_on("/dev/a", "feetech", "my face", "face=/dev/a,neck=/dev/b")
     assert two.fix == "sfms-robot doctor --port face=/dev/a,neck=/dev/b --head 'my face' --fix"
 
 
 def test_permissions_holders_and_latency_come_with_what_to_type():
-    denied = list(judge_port("/dev/ttyUSB0", "no permission to open it", "dialout", []))
-    assert denied[0].severity == "error" and denied[0].fix.startswith("sudo usermod -aG dialout $USER")
+    denied = judge_port("/dev/ttyUSB0", "no permission to open it", "dialout", [])
+    assert denied.severity == "error" and denied.fix.startswith("sudo usermod -aG dialout $USER")
     busy = list(judge_opening("/dev/ttyUSB0", "/dev/ttyUSB0: is held", [Holder(42, "python wizard.py")]))
     assert busy[0].fix == "kill 42" and "wizard.py" in busy[0].problem
     slow = SerialDevice("/dev/ttyUSB0", latency_ms=16, latency_file="/sys/bus/usb-serial/devices/ttyUSB0/latency_timer")
@@ -112,21 +106,21 @@ def test_a_udev_rule_names_the_adapter_and_sets_its_latency_timer():
 @pytest.mark.parametrize(
     ("wire", "blamed"),
     [
-        ({"baud": 57_600, "return_delay_us": 500.0, "latency_ms": 16.0}, "baud"),
-        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 16.0}, "adapter latency"),
-        ({"baud": 1_000_000, "return_delay_us": 500.0, "latency_ms": 1.0}, "return delay"),
+        (FACTORY, "baud"),
+        ({**FACTORY, "baud": BAUD}, "adapter latency"),
+        ({**FACTORY, "baud": BAUD, "latency_ms": 1.0}, "return delay"),
     ],
 )
 def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
     budget = wire_budget("dynamixel2", 25, **wire, read_bytes=4)
-    (finding,) = judge_rate(budget, 100.0, False, COMMAND)
+    (finding,) = judge_rate(budget, LINE, False)
     assert finding.severity == "warning" and f"({blamed} takes most)" in finding.problem
 
 
 def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
     budget = wire_budget("dynamixel2", 28, 1_000_000, 500.0, 1.0, read_bytes=4)
-    assert next(judge_rate(budget, 100.0, True, COMMAND)).severity == "note"
-    assert next(judge_rate(budget, 100.0, False, COMMAND)).severity == "warning"
+    assert next(judge_rate(budget, LINE, True)).severity == "note"
+    assert next(judge_rate(budget, LINE, False)).severity == "warning"
 
 
 def test_findings_alike_are_one_and_the_worst_come_first():

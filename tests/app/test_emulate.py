@@ -50,12 +50,6 @@ def test_faults_may_stand_in_a_file(tmp_path):
         assert chains["servos"].faults() == ["drop:1=0.5", "brownout@3", "delay=0.001"]
 
 
-def test_either_a_head_or_servos():
-    for options in ({}, {"head": "face28", "servo": "ax-12a:1"}):
-        with pytest.raises(ConfigError, match="either --head NAME or --servo"), emulators(**options):
-            pass
-
-
 @pytest.mark.parametrize(
     ("stored", "message"),
     [
@@ -92,10 +86,12 @@ def test_what_is_stored_and_where_servos_are_found_is_told_by_id():
         ({"starts": ("1:4150",)}, "start = '1:4150' cannot be read: IDS=TICKS"),
         ({"starts": ("7=4150",)}, "start = '7=4150' names 7, which no servo has"),
         ({"starts": ("3-1=4150",)}, "start = '3-1=4150' holds bad ids"),
+        ({"servo": None}, "either --head NAME or --servo"),
+        ({"head": "face28"}, "either --head NAME or --servo"),
     ],
 )
 def test_start_that_cannot_be_is_one_clear_line(more, message):
-    with pytest.raises(ConfigError, match=message), emulators(servo="xl330-m288:1", **more):
+    with pytest.raises(ConfigError, match=message), emulators(**{"servo": "xl330-m288:1", **more}):
         pass
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sfms_robot.app.fleet import GONE_S, FleetBoard, FleetControls, fleet_key, fleet_name, proof, tile
+from sfms_robot.app.fleet import GONE_S, FleetControls, fleet_key, fleet_name, proof, tile
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
@@ -31,6 +31,8 @@ def test_halt_names_who_asked_and_resume_lets_go(run):
     assert run.halt.by == "kitchen"
     assert run.obey(command="resume") == {"done": "resume"}
     assert run.halt.by is None
+    run.obey(command="end")
+    assert run.interrupt()
 
 
 def test_the_fleet_does_not_end_a_halt_of_the_device_and_its_client_is_answered(run):
@@ -41,18 +43,13 @@ def test_the_fleet_does_not_end_a_halt_of_the_device_and_its_client_is_answered(
     run.halt.resume("device")
 
 
-def test_end_asks_the_run_to_end(run):
-    run.obey(command="end")
-    assert run.interrupt()
-
-
 KEY = b"k" * 64
 
 
 @pytest.mark.parametrize("command", ["resume", "end"])
 def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
     controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
-    run.halt.close("kitchen", "fleet")
+    assert controls.obey(b'{"command": "halt", "by": "kitchen"}', "hall", KEY) == {"done": "halt"}  # needs no key
 
     def sent(**more):
         return controls.obey(json.dumps({"command": command, **more}).encode(), "hall", KEY)
@@ -71,11 +68,6 @@ def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
     assert sent(proof=signed) == {"done": command}
     assert (run.halt.by is None) if command == "resume" else run.interrupt()
     assert "--fleet-key" in sent(proof=signed)["error"]  # overheard, and sent again
-
-
-def test_halt_needs_no_key(run):
-    controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
-    assert controls.obey(b'{"command": "halt"}', "hall", KEY) == {"done": "halt"}
 
 
 def test_a_key_is_made_for_its_owner_alone_and_one_that_others_can_read_is_refused(tmp_path, monkeypatch):
@@ -135,18 +127,8 @@ def test_a_name_that_cannot_be_part_of_a_key_is_refused(name):
         fleet_name(name)
 
 
-def test_a_board_keeps_the_newest_of_each_and_says_who_went_away():
-    now_s = [0.0]
-    board = FleetBoard(lambda: now_s[0])
-    board.put({"name": "b", "state": "idle"})
-    board.put({"name": "a", "state": "listening", "head": "face28", "person": {"voice_db": -30.0}})
-    now_s[0] = GONE_S + 1
-    board.put({"name": "a", "state": "halted", "why": ["kitchen"]})
-    a, b = board.tiles()
-    assert (a["name"], a["state"], a["why"], a["here"]) == ("a", "halted", ["kitchen"], True)
-    assert (b["name"], b["here"], b["age_s"]) == ("b", False, 4.0)
-
-
-def test_a_head_that_has_ended_is_not_there():
-    assert not tile("a", {"state": "stopped"})["here"]
-    assert tile("a", {})["state"] == "?"
+def test_a_tile_says_what_a_head_does_and_whether_it_is_away():
+    here = tile("a", {"state": "halted", "why": ["kitchen"], "head": "face28", "person": {"voice_db": -30.0}}, 0.04)
+    assert (here["name"], here["state"], here["why"], here["voice_db"]) == ("a", "halted", ["kitchen"], -30.0)
+    assert here["here"] and not tile("a", {"state": "idle"}, GONE_S + 1)["here"]
+    assert not tile("a", {"state": "stopped"})["here"] and tile("a", {})["state"] == "?"

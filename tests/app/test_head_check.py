@@ -34,34 +34,34 @@ def command(command_line):
 
 
 def test_use_and_demand_are_those_of_the_faces_shown(tracks):
-    rows = {row.joint: row for row in check("face28", tracks).joints}
+    rows = {row["joint"]: row for row in check("face28", tracks)["joints"]}
     pitch, jaw = rows["neck_pitch"], rows["jaw"]
-    assert (pitch.low_deg, pitch.high_deg) == pytest.approx((-10, 10), abs=0.1)
-    assert pitch.used == pytest.approx(20 / 65, abs=0.01)
+    assert (pitch["low_deg"], pitch["high_deg"]) == pytest.approx((-10, 10), abs=0.1)
+    assert pitch["used"] == pytest.approx(20 / 65, abs=0.01)
     limit = load_head("face28").limit("neck_pitch")
-    assert pitch.speed == pytest.approx(2 * np.pi * 10 / limit.speed_deg_s, rel=0.02)
-    assert 1 < pitch.jerk / ((2 * np.pi) ** 3 * 10 / limit.jerk_deg_s3) < 1.5  # frames make it a little rougher
-    assert jaw.high_deg == pytest.approx(14, abs=0.1) and jaw.clipped == 0
-    assert (pitch.channels, jaw.channels) == (("pitch",), ["jawOpen"])
+    assert pitch["speed"] == pytest.approx(2 * np.pi * 10 / limit.speed_deg_s, rel=0.02)
+    assert 1 < pitch["jerk"] / ((2 * np.pi) ** 3 * 10 / limit.jerk_deg_s3) < 1.5  # frames make it a little rougher
+    assert jaw["high_deg"] == pytest.approx(14, abs=0.1) and jaw["clipped"] == 0
+    assert (pitch["channels"], jaw["channels"]) == (("pitch",), ["jawOpen"])
 
 
 def test_clipping_counts_ends_of_the_range_but_not_where_the_joint_rests(tracks):
-    rows = {row.joint: row for row in check("inmoov2_maestro", tracks).joints}
-    assert rows["jaw"].low_deg == 0 and rows["jaw"].clipped == 0
+    rows = {row["joint"]: row for row in check("inmoov2_maestro", tracks)["joints"]}
+    assert rows["jaw"]["low_deg"] == 0 and rows["jaw"]["clipped"] == 0
 
 
 @pytest.mark.parametrize("name", FACES)
 def test_recorded_faces_use_half_of_what_shows_a_face_and_rarely_an_end(name):
-    rows = {row.joint: row for row in check(name).joints}
+    rows = {row["joint"]: row for row in check(name)["joints"]}
     for joint in (joint for joint in rows if joint.startswith(("lid_left", "lid_upper_left", "jaw", "eye_pan"))):
-        assert rows[joint].used > 0.5, joint
-    assert all(row.clipped < 0.05 for row in rows.values())
+        assert rows[joint]["used"] > 0.5, joint
+    assert all(row["clipped"] < 0.05 for row in rows.values())
 
 
 def test_a_platforms_reach_and_the_share_of_recorded_poses_in_it_are_told():
-    neck = check("reachy_mini").neck
-    assert neck.reach["pitch"] == (-40, 40) and neck.reach["z"] == (-50, 23)
-    assert 0.9 < neck.reached < 1
+    neck = check("reachy_mini")["neck"]
+    assert neck["reach"]["pitch"] == (-40, 40) and neck["reach"]["z"] == (-50, 23)
+    assert 0.9 < neck["reached"] < 1
 
 
 def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, command):
@@ -81,7 +81,7 @@ def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, command):
 def test_a_neck_whose_home_is_out_of_reach_is_a_problem_of_the_head(tmp_path):
     text = (data_dir("configs") / "heads" / "reachy_mini" / "head.yaml").read_text()
     (tmp_path / "head.yaml").write_text(text.replace("home_height_m: 0.177", "home_height_m: 0.3"))
-    assert "home is out of reach" in " ".join(check(str(tmp_path)).problems)
+    assert "home is out of reach" in " ".join(check(str(tmp_path))["problems"])
 
 
 def test_a_folder_without_tracks_is_refused(tmp_path):
@@ -126,7 +126,7 @@ def test_a_shipped_head_has_its_picture_and_provenance(head):
 def test_a_servo_without_a_register_map_is_told(tmp_path):
     text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
     (tmp_path / "head.yaml").write_text(text.replace("xm430-w350", "xm999"))
-    problems = check(str(tmp_path)).problems
+    problems = check(str(tmp_path))["problems"]
     assert problems and all("model = 'xm999' has no firmware map" in problem for problem in problems)
 
 
@@ -135,5 +135,5 @@ def test_an_overlay_of_another_head_is_told(tmp_path, monkeypatch):
     overlay = tmp_path / "sfms-robot" / "heads" / "op3_head.yaml"
     overlay.parent.mkdir(parents=True)
     overlay.write_text("head: poppy_head\n")
-    (problem,) = check("op3_head").problems
+    (problem,) = check("op3_head")["problems"]
     assert problem == f"{overlay}: head = 'poppy_head' is another head (op3_head)"

@@ -5,7 +5,7 @@ import pytest
 
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated, plugged_in
-from sfms_robot.config import Faults, Head, Safety, load_head, parse
+from sfms_robot.config import Head, Safety, load_head, parse
 from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -38,10 +38,7 @@ def test_joint_says_what_is_different_from_its_head():
 @pytest.mark.parametrize(
     ("safety", "message"),
     [
-        (
-            {"registers": {"position_q_gain": 1}},
-            r"position_q_gain = 1 is no register of xl330-m288 \(.*pos",
-        ),
+        ({"registers": {"position_q_gain": 1}}, r"position_q_gain = 1 is no register of xl330-m288 \(.*pos"),
         ({"registers": {"present_position": 1}}, "present_position = 1 of xl330-m288 is not the file's to set"),
         ({"registers": {"position_p_gain": 99999}}, r"position_p_gain = 99999 does not fit xl330-m288 \(0..16383\)"),
     ],
@@ -63,10 +60,6 @@ def test_register_that_cannot_be_written_is_refused_before_a_port_is_opened(safe
 def test_mistake_in_the_file_is_named(more, message):
     with pytest.raises(ConfigError, match=message):
         head_of(**more)
-
-
-def test_masks_are_those_of_the_head():
-    assert head_of(faults={"mask": ["input voltage"]}).faults == Faults(mask=("input voltage",))
 
 
 @pytest.mark.parametrize("virtual", [True, False])
@@ -147,17 +140,3 @@ def test_emulated_servos_have_stored_what_those_of_the_head_have():
     assert all(servo.supply_v == 7.2 and servo.registers["shutdown"] == 52 for servo in legs.values())
     assert (legs[11].registers["homing_offset"], legs[12].registers["homing_offset"]) == (1024, -1024)
     assert plugged_in("face28", load_head("face28")) == emulated(load_head("face28"))
-
-
-def test_an_emulated_head_says_its_supply_and_stands_in_its_range():
-    head, clock = load_head("reachy_mini"), VirtualClock()
-    with launch(plugged_in("reachy_mini", head)["main"], virtual=True) as chain:
-        bus = build_bus(head, {"main": chain}, clock)
-        bus.connect()
-        readings = bus.poll(clock.now_s())
-        bus.close()
-        assert {chain.state(joint.id)["faults"] for joint in head.joints.values()} == {"input voltage"}
-    assert all(each.extra["voltage_V"] == 7.2 and each.fault is None for each in readings.values())
-    assert all(
-        head.joints[name].min_rad < each.position_rad < head.joints[name].max_rad for name, each in readings.items()
-    )

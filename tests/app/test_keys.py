@@ -18,31 +18,29 @@ HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"
 PROGRAM = """
 import logging, os, sys, threading
 from sfms_robot.app.listen.panel import live_panel
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.safety import Interrupt, signals_to
+from sfms_robot.app.options import RunOptions
+from sfms_robot.app.session import RunControls
+from sfms_robot.config import load_head
+from sfms_robot.runtime.safety import signals_to
 
 terminal = os.open(sys.argv[1], os.O_RDWR)  # becomes the one that controls this session
 for each in range(3):
     os.dup2(terminal, each)
 os.environ["TERM"] = "xterm"
 logging.basicConfig(format="%(message)s")
-interrupt, halt = Interrupt(), HaltLatch()
-
+run = RunControls(load_head("op3_head"), RunOptions())
 if sys.argv[2] == "button":
-    halt.switches["button"] = lambda: True
-level = [1.0]
+    run.halt.switches["button"] = lambda: True
 
 def document():
-    state = "halted" if halt.by else "listening"
-    return {"state": state, "note": sys.argv[2], "intensity": {"neck": level[0], "eyes": level[0]}}
+    state = "halted" if run.halt.by else "listening"
+    return {"state": state, "note": sys.argv[2], "intensity": run.knobs.values["intensity"]}
 
-def turn(by):
-    level[0] = round(level[0] + by, 3)
-
-with signals_to(interrupt), live_panel(document, interrupt, halt, turn):
-    while not interrupt():
+run.document = document
+with signals_to(run.interrupt), live_panel(run):
+    while not run.interrupt():
         threading.Event().wait(0.01)
-        if sys.argv[2] == "fails" and halt.by:
+        if sys.argv[2] == "fails" and run.halt.by:
             raise SystemExit(7)
 """
 
@@ -152,8 +150,6 @@ def test_a_keyboard_that_was_left_is_not_taken_again():
     assert keys.take() and termios.tcgetattr(far) != usual
     keys.leave()
     assert not keys.take() and termios.tcgetattr(far) == usual
-    os.close(near)
-    os.close(far)
 
 
 def test_a_suspended_run_leaves_the_terminal_and_takes_it_again():

@@ -6,8 +6,6 @@ import pytest
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.open_head import build_bus, build_motion
-from sfms_robot.app.options import RunOptions
-from sfms_robot.app.session import run
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
@@ -66,15 +64,6 @@ def test_all_regions_are_turned_together_and_none_leaves_its_range():
     face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
     angles, _ = RETARGETER.step(face, RETARGETER.start(), knobs.now)
     assert angles == pytest.approx(build_motion(HEAD, 100.0).rest_rad, abs=0.02)
-
-
-def test_a_run_with_the_neck_turned_off_keeps_it_at_rest():
-    still = run(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=0",)))
-    loud = run(RunOptions(head="op3_head", duration_s=3.0, fast=True, intensity=("neck=2",)))
-    assert sum(joint["travel_rad"] for joint in still["joints"].values()) < sum(
-        joint["travel_rad"] for joint in loud["joints"].values()
-    )
-    assert loud["limits"]["violations"] == 0
 
 
 class Goals(Observer):

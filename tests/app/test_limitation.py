@@ -38,16 +38,10 @@ def deca(tmp_path):
     return tmp_path
 
 
-def test_the_shipped_listener_shows_everything():
-    assert limitation("sfms-small") is None and check("op3_head", listener="sfms-small").limitation is None
-
-
-def test_deca56_without_a_matrix_says_pose_and_jaw_only(deca):
+def test_only_a_listener_in_deca56_without_a_matrix_shows_pose_and_jaw_only(deca):
+    assert limitation("sfms-small") is None and check("op3_head", listener="sfms-small")["limitation"] is None
     assert "pose and jaw only" in limitation(str(deca))
-    assert "pose and jaw only" in check("op3_head", listener=str(deca)).limitation
-
-
-def test_with_a_matrix_beside_it_nothing_is_missing(deca):
+    assert "pose and jaw only" in check("op3_head", listener=str(deca))["limitation"]
     np.save(deca / "mine.npy", np.random.default_rng(0).normal(size=(52, 50)))
     (deca / "config.yaml").write_text(yaml.safe_dump(TINY | {"flame_matrix": "mine.npy"}))
     assert limitation(str(deca)) is None

@@ -73,16 +73,12 @@ def test_it_speaks_from_when_it_is_played_until_a_pause_after_it():
     assert begins_s == pytest.approx(2.0, abs=0.06)
     assert ends_s == pytest.approx(3.5 + TURN_GAP_S, abs=0.08)
     assert told.heard == TALKS_S / FRAME_S
+    assert [name for name, _ in told.states if name != "stopping"][-2:] == ["speaking", "listening"]
 
 
 def test_a_pause_between_words_and_a_person_who_talks_do_not_end_its_turn():
     ((begins_s, ends_s),) = turns(spoken((0.5, 2.0), (0.5, 2.9)))
     assert (begins_s, ends_s) == (pytest.approx(2.0, abs=0.06), pytest.approx(3.4 + TURN_GAP_S, abs=0.08))
-
-
-def test_after_its_turn_it_listens_to_who_is_there():
-    told = spoken((1.0, 2.0))
-    assert [name for name, _ in told.states if name != "stopping"][-2:] == ["speaking", "listening"]
 
 
 def test_with_nobody_there_it_is_idle_again():

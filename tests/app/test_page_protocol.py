@@ -10,7 +10,8 @@ import pytest
 import sfms_robot
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
-from sfms_robot.config import Calmness, load_head
+from sfms_robot.app.options import RunOptions
+from sfms_robot.config import load_head
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.viewer.page_messages import (
     COMMANDS,
@@ -60,10 +61,7 @@ def test_every_message_to_a_page_is_described():
 
 def test_every_key_of_a_hello_is_described():
     head = load_head("face28")
-    facts = page_facts(
-        head, port="sim", listener="sfms-small", speaker=None, seed=0, calmness=Calmness(), people={},
-        knobs=turned(head), source={"voice": False, "face": False}, choices=True,
-    )  # fmt: skip
+    facts = page_facts(head, RunOptions(), turned(head), None, choices=True)
     keys = set(facts) | OF_VISITORS | set(facts["joints"][0]) | set(facts["listeners"][0]) | set(facts["source"])
     assert keys <= rows(TOLD)["hello"]
 

@@ -43,9 +43,9 @@ def status(state="listening", why=(), faults=(), loud=0.1, figures=FIGURES):
 def test_it_says_what_the_document_says():
     told = drawn(status("degraded", ("voice", "jaw"), faults=["jaw"]))
     for part in (
-        "degraded", "voice, jaw", "continues without", "0:12 of 0:47", "face28", "-20 dB", "attention 62%", "no sound",
-        "3 nods, 12 blinks, 0 smiles", "99.9 of 100 Hz, 2 late", "frame to wire 11 ms (21)", "lid_right 45 C",
-        "jaw silent", "space halt",
+        "degraded", "voice, jaw", "continues without", "0:00:12 of 0:00:47", "face28", "-20 dB", "attention 62%",
+        "no sound", "3 nods, 12 blinks, 0 smiles", "99.9 of 100 Hz, 2 late", "frame to wire 11 ms (21)",
+        "lid_right 45 C", "jaw silent", "space halt",
     ):  # fmt: skip
         assert part in told
     assert "speech to wire" not in told  # nobody knows yet

@@ -1,12 +1,13 @@
 """Pictures of a recording: the plot, and the sheet with its twelve instants."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 from recorded_runs import record
 
-from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.replay.pictures import pick_instants, plot, render_sheet, sheet
+from sfms_robot.app.replay.pictures import pick_instants, plot, sheet
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import load_head
 from sfms_robot.frames import CHANNEL_INDEX
@@ -54,6 +55,16 @@ def run_with_events():
     return times_s, frames
 
 
+def run_of(folder, head):
+    """Return a recording of those events, by a head of two joints."""
+    times_s, frames = run_with_events()
+    still = np.zeros((len(times_s), 2), np.float32)
+    return replace(
+        read_recording(record(folder, 0.3)), about={"head": head}, joints=tuple(load_head("op3_head").joints),
+        times_s=times_s, motion=frames, goals_rad=still, present_rad=still.copy(),
+    )  # fmt: skip
+
+
 def test_a_sheet_shows_what_happened():
     instants = pick_instants(*run_with_events())
     labels = {instant.label: instant.time_s for instant in instants}
@@ -78,23 +89,21 @@ def test_a_short_run_gives_every_frame_once(frames):
     assert [instant.row for instant in instants] == list(range(frames))
 
 
-def test_pictures_are_drawn_without_a_display(tmp_path):
+@pytest.mark.parametrize("head", ["op3_head", "gone"])
+def test_pictures_are_drawn_without_a_display_and_without_the_head(tmp_path, head):
     pytest.importorskip("vtkmodules")
-    times_s, frames = run_with_events()
-    instants = render_sheet(tmp_path / "sheet.png", times_s, frames, times_s > 5, "a run")
+    run = run_of(tmp_path, head)
+    assert sheet(run, tmp_path / "sheet.png") == pick_instants(run.times_s, run.motion)
     height, width = size_of(tmp_path / "sheet.png")
-    assert width == pytest.approx(1600, abs=20) and 1000 < height < 1400
-    assert instants == pick_instants(times_s, frames)
+    assert width == pytest.approx(1800 if head == "op3_head" else 1600, abs=20) and 1000 < height < 1400
 
 
 def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
     pytest.importorskip("vtkmodules")
-    scene = scene_of(load_head("op3_head"))
-    times_s, frames = run_with_events()
-    angles_rad = np.zeros((len(times_s), 2))
+    run = run_of(tmp_path, "op3_head")
     for name, tilt_rad in (("still", 0.0), ("down", 0.4)):
-        angles_rad[:, 1] = tilt_rad
-        render_sheet(tmp_path / f"{name}.png", times_s, frames, None, "a run", (scene, angles_rad))
+        run.present_rad[:, 1] = tilt_rad
+        sheet(run, tmp_path / f"{name}.png")
     still, down = (pixels_of(tmp_path / f"{name}.png") for name in ("still", "down"))
     change = np.abs(still - down).mean(axis=2)
     first = slice(8, 260), slice(268, 440)  # the virtual head and the robot, of the first instant

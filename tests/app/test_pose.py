@@ -67,13 +67,3 @@ def test_a_smile_moves_the_mouth_and_leaves_the_neck_alone():
 def test_every_head_nods_or_says_that_it_cannot(name):
     told = pose_head(HeadOptions(head=name, fast=True), ["pitch=0.1"], 0.2)
     assert told["exit"] == "done" and (told["joints"] or told["blind"] == ["pitch"])
-
-
-def test_virtual_time_on_real_servos_is_refused():
-    with pytest.raises(ConfigError, match="--fast needs emulated servos"):
-        pose_head(HeadOptions(port="/dev/ttyUSB0", fast=True), ["smile"])
-
-
-def test_hobby_servos_move_only_when_somebody_said_yes():
-    with pytest.raises(ConfigError, match="hobby servos report no position, and each jumps to rest .*--yes"):
-        pose_head(HeadOptions(head="inmoov2_maestro", port="/dev/null"), ["blink"])

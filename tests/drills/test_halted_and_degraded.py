@@ -3,17 +3,13 @@
 import json
 import os
 import signal
-import termios
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from drill_rig import HEAD, Command, Terminal
+from drill_rig import HEAD, Command
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here")]
 RUN = ("run", "--head", HEAD, "--duration", 600)
 TOLD = "WARNING: status: "
 
@@ -92,18 +88,3 @@ def test_a_listener_that_is_killed_is_missed_and_comes_back(log):
         running.report()
     assert document["listener_state"]["restarts"] == 1
     assert document["ticks"] > 0 and document["tick"]["target_hz"] > 0 and set(document["motion"]) >= {"nods"}
-
-
-def test_keys_halt_resume_and_end_a_run_on_a_terminal():
-    terminal = Terminal()
-    usual = termios.tcgetattr(terminal.far)
-    with Command(*RUN, stderr=terminal.far, keyboard=terminal.far, TERM="xterm", COLUMNS="80") as running:
-        for key, state in ((b"", b" listening "), (b" ", b" halted "), (b"r", b" listening ")):
-            before = len(terminal.shown)
-            terminal.press(key)
-            running.until(lambda at=before, state=state: state in terminal.shown[at:])
-        terminal.press(b"q")
-        code, out, _ = running.ended()
-        assert termios.tcgetattr(terminal.far) == usual
-    assert code == 130 and "interrupted" in out
-    assert b"Traceback" not in terminal.closed()

@@ -21,10 +21,7 @@ from drill_rig import (
     torque,
 )
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here")]
 PHASES = (loading, connecting, enabling, listening, resting)
 HIDE, SHOW = b"\x1b[?25l", b"\x1b[?25h"
 CASES = [(phase, number) for phase in PHASES for number in (signal.SIGINT, signal.SIGTERM)]

@@ -26,20 +26,16 @@ def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListen
 
 
 class LoadedListener:
-    """Weights and the pure functions of a `Listener`; `stream` keeps the state of a conversation."""
+    """Weights and the pure functions of a `Listener`; `stream` keeps the state of a conversation.
+
+    Attributes:
+        hop: a new plan is made every `hop` frames.
+        horizon: frames in a plan.
+    """
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
-
-    @property
-    def hop(self) -> int:
-        """A new plan is made every `hop` frames."""
-        return self._listener.hop
-
-    @property
-    def horizon(self) -> int:
-        """Frames in a plan."""
-        return self._listener.horizon
+        self.hop, self.horizon = listener.hop, listener.horizon
 
     def start(self, seed: int) -> Any:
         """Return the memory of a new stream."""
@@ -85,30 +81,23 @@ class ListenerStream:
         Raises InputError for another number of samples or channels, and for values that are not finite.
         """
         time_s = (self._frames + 1) / FRAME_HZ
-        said = None if agent_audio is None else _samples("agent_audio", agent_audio)
-        heard = np.zeros(0, np.float32) if audio is None else _samples("audio", audio)
-        frame = SpeakerFrame(time_s, heard, _face(face, time_s), said)
+        said = None if agent_audio is None else _checked("agent_audio", agent_audio)
+        heard = np.zeros(0, np.float32) if audio is None else _checked("audio", audio)
+        seen: FaceFrame | None = None
+        if face is not None:
+            motion = _checked("face", face.motion if isinstance(face, FaceFrame) else face)
+            seen = FaceFrame(time_s, motion[:6], motion[6:], getattr(face, "jaw_rad", None))
+        frame = SpeakerFrame(time_s, heard, seen, said)
         plan, self._memory = self._listener.step(frame, self._memory)
         self._frames += 1
         return plan
 
 
-def _samples(name: str, audio: ArrayLike) -> Floats:
-    samples = np.asarray(audio, np.float32)
-    if samples.shape not in ((0,), (FRAME_SAMPLES,)):
-        raise InputError(f"{name} has shape {samples.shape}: 40 ms of mono sound at 16 kHz are ({FRAME_SAMPLES},)")
-    if not np.isfinite(samples).all():
-        raise InputError(f"{name}[{int(np.argmin(np.isfinite(samples)))}] is not finite")
-    return samples
-
-
-def _face(face: FaceFrame | ArrayLike | None, time_s: float) -> FaceFrame | None:
-    if face is None:
-        return None
-    motion = face.motion if isinstance(face, FaceFrame) else np.asarray(face, np.float32)
-    if motion.shape != (MOTION_DIM,):
-        raise InputError(f"face has shape {motion.shape}: pose 6 and blendshapes 52 are ({MOTION_DIM},)")
-    if not np.isfinite(motion).all():
-        raise InputError(f"face[{int(np.argmin(np.isfinite(motion)))}] is not finite")
-    jaw_rad = face.jaw_rad if isinstance(face, FaceFrame) else None
-    return FaceFrame(time_s, motion[:6], motion[6:], jaw_rad)
+def _checked(name: str, values: ArrayLike) -> Floats:
+    found = np.asarray(values, np.float32)
+    size, what = (MOTION_DIM, "pose 6 and blendshapes 52") if name == "face" else (FRAME_SAMPLES, "40 ms, mono, 16 kHz")
+    if found.shape != (size,) and (name == "face" or found.shape != (0,)):
+        raise InputError(f"{name}: expected shape ({size},) ({what}), got {found.shape}")
+    if not np.isfinite(found).all():
+        raise InputError(f"{name}[{int(np.argmin(np.isfinite(found)))}] is not finite")
+    return found

@@ -8,54 +8,33 @@ rates   ->  calm                how often it does them
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sfms_robot.app.api.servos import Background, Progress, Report, head_name
+from sfms_robot.app.api.servos import Background, Driven, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, RunOptions, begin_listening
-from sfms_robot.app.session import run
+from sfms_robot.app.options import SIM, RunOptions
+from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import Calmness, Head, load_head, parse
-from sfms_robot.errors import ConfigError, InputError, RobotError
+from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.listeners.thread import ListenerThread
-from sfms_robot.ports import Listener, Observer, Source
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.puppet import Puppet
-from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.ports import Listener, Source
 from sfms_robot.runtime.planned_events import EventWatch
-from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.paired import JudgedSource, PairedSource
 from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
-from sfms_robot.sources.registry import open_source, split_kind
-
-log = logging.getLogger(__name__)
+from sfms_robot.sources.registry import split_kind
 
 PUSH: Final = "push"
 EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
 
 
-class _PushedPerson:
-    """The sound and faces that a program hands over, and the robot's own speech."""
-
-    def __init__(self) -> None:
-        self.voice, self.sight, self.speech = PushedVoice(), PushedSight(), PushedSpeech()
-
-    def source(self, play: str | None) -> Source:
-        """Return them as a source. `play`: the device that plays the speech; None: the program does."""
-        own = self.speech if play is None else open_playback(play, self.speech)
-        return PairedSource(self.voice, self.sight, own)
-
-
-class Robot:
+class Robot(Driven):
     """A run of `sfms-robot run`, with its options by name, in its own thread.
 
     `with Robot(...) as robot:` or `Robot(...).start()` and `stop()`: from then on the head moves, until `stop`. In a
@@ -117,7 +96,6 @@ class Robot:
         if play is not None and source is not None:
             raise InputError(f"play={play!r}: what a source of your own says is not played; leave it out")
         own = listener if not isinstance(listener, (str, Path)) else None
-        self._calmness = parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness")
         self._options = RunOptions(
             head=head_name(head),
             port=port,
@@ -132,42 +110,31 @@ class Robot:
             duration_s=duration_s,
             seed=seed,
             engine=engine,
-            calmness=self._calmness,
+            intensity=_turned(intensity),
+            style=_turned(style),
+            calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
             record=None if record is None else Path(record),
             overwrite=overwrite,
         )
         prepare_head(self._options)
-        config = load_head(self._options.head)
         self._listener = own
-        self._feed: ListenerThread | NamedFeed | None = None
-        self._person = _PushedPerson() if pushed else None
-        self._speech = self._person.speech if self._person is not None else None
-        if source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none":
-            self._speech = PushedSpeech()
-        self._source = None if source is None else JudgedSource(source)
+        self._person = (PushedVoice(), PushedSight()) if pushed else None
+        hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
+        self._speech = PushedSpeech() if pushed or hears else None
+        self._source: Source | None = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
-        self._puppet = Puppet(config.life.gaze, frozenset(HeadRetargeter(config).blind_channels))
-        self._knobs = LiveKnobs(config, intensity or {}, style or {})
-        self._run: Background | None = None
+        self._controls = RunControls(load_head(self._options.head), self._options)
+        self._controls.speech = self._speech
 
     def __enter__(self) -> Self:
         return self.start()
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """Stop. An error of it does not replace an exception that is being raised."""
-        try:
-            self.stop()
-        except RobotError as failure:
-            if error is None:
-                raise
-            log.error("%s", failure)
 
     def start(self) -> Self:
         """Open the head, torque on, listen. Blocks until the first tick, a second or three. Raises RobotError."""
         if self._run is not None:
             raise ConfigError("this robot was started before: make another Robot")
-        self._run = Background(self._drive)
+        self._run = Background(self._drive, self._controls.interrupt, self._controls.halt)
         self._run.start()
         return self
 
@@ -183,15 +150,10 @@ class Robot:
         """
         if self._run is not None:
             try:
-                self._run.stop()
+                super().stop()
             finally:
                 self._events.close()
                 self._events.join(EVENTS_LIMIT_S)
-
-    def release(self) -> None:
-        """Switch torque off now, without coming to rest: for emergencies. Does not wait, raises nothing."""
-        if self._run is not None:
-            self._run.release()
 
     def halt(self) -> None:
         """Stop in an emergency: from the next tick on every joint brakes as fast as its limits allow.
@@ -219,14 +181,14 @@ class Robot:
         this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
         kept. Raises ConfigError for another type, shape or rate.
         """
-        self._pushed("hear").voice.hear(pcm, rate_hz)
+        self._pushed("hear")[0].hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | None) -> None:
         """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
 
         Never blocks. Raises ConfigError for another shape.
         """
-        self._pushed("see").sight.see(face)
+        self._pushed("see")[1].see(face)
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
         """Hand over the robot's own speech, as `hear`: the lips follow it, and it is not taken for the person.
@@ -250,7 +212,7 @@ class Robot:
             raise InputError(f'{what}() needs audio="push" or "mic"; this robot listens to {self._hears!r}')
         return self._speech
 
-    def _pushed(self, what: str) -> _PushedPerson:
+    def _pushed(self, what: str) -> tuple[PushedVoice, PushedSight]:
         if self._person is None:
             raise InputError(f'{what}() needs audio="push"; this robot listens to {self._hears!r}')
         return self._person
@@ -263,19 +225,19 @@ class Robot:
         Rises in 0.25 s, falls in 0.35 s, under the same limits as all motion; a newer face starts from the present one.
         Never blocks. Raises InputError for another shape, an unknown channel, or a value that is not finite.
         """
-        self._puppet.show(face58, seconds)
+        self._controls.puppet.show(face58, seconds)
 
     def look_at(self, x_m: float, y_m: float, z_m: float, seconds: float = 2.0) -> None:
         """Look at a point for `seconds`, in metres from the middle of the head: x forward, y to its left, z up.
 
         Eyes first, then the head with its share. Never blocks. Raises InputError for a point that is not finite.
         """
-        self._puppet.look_at(x_m, y_m, z_m, seconds)
+        self._controls.puppet.look_at(x_m, y_m, z_m, seconds)
 
     @property
     def knobs(self) -> LiveKnobs:
         """Regions of the head: `robot.knobs["neck"].intensity = 0.5`, `.style`, 0..2."""
-        return self._knobs
+        return self._controls.knobs
 
     def calm(self, addressed: str | None = None, **per_minute: float | None) -> None:
         """Set the rate of events per minute: `robot.calm(nod=2.2, addressed="assume")`; None: the rate of people.
@@ -283,10 +245,7 @@ class Robot:
         Kinds that are not named keep their rate. It has no effect on a listener that decides no events, nor in virtual
         time once it runs. Raises ConfigError for an unknown kind and an invalid rate.
         """
-        rates = {**self._calmness.model_dump(), **per_minute}
-        self._calmness = parse(Calmness, rates if addressed is None else rates | {"addressed": addressed}, "calm")
-        if self._feed is not None:
-            self._feed.calm(self._calmness)
+        self._controls.calm(per_minute if addressed is None else {**per_minute, "addressed": addressed})
 
     # --- events, state, report ---
 
@@ -310,7 +269,7 @@ class Robot:
         """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
         if self._run is not None and self._run.report is not None:
             return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
-        options, progress = self._options, Progress() if self._run is None else self._run.progress
+        options, now = self._options, self._controls.document()
         return {
             "version": 1,
             "head": Path(options.head).name,
@@ -319,41 +278,26 @@ class Robot:
             "seed": options.seed,
             "exit": "running",
             "torque_unconfirmed": [],
-            "duration_s": 0.0 if progress.seen is None else progress.seen.time_s,
-            "frames": progress.frames,
-            "ticks": progress.ticks,
+            "duration_s": now.get("time_s", 0.0),
+            "frames": now.get("frames", 0),
+            "ticks": now.get("ticks", 0),
             "callbacks_detached": dict(self._events.detached),
         }
 
-    def _begin_listening(self) -> ListenerThread | NamedFeed | None:
-        """Return the listener of a run in real time; in virtual time the run steps one inline."""
-        if self._listener is not None:
-            return ListenerThread(self._listener, self._options.seed)
-        return None if self._options.fast else begin_listening(replace(self._options, calmness=self._calmness))
-
-    def _drive(self, interrupt: Interrupt, halt: HaltLatch, progress: Observer) -> Report:
-        options = self._options
-        source: Source | None = self._source
+    def _drive(self, now: Background) -> Report:
+        options, source = self._options, self._source
+        feed = None
         with ExitStack() as stack:
-            self._feed = self._begin_listening()
-            if self._feed is not None:
-                stack.callback(self._feed.close)
-            if source is None and self._speech is not None:
-                if self._person is not None:
-                    source = self._person.source(options.play)
-                else:
-                    source = open_source(
-                        options.hears, options.face, options.duration_s, agent=self._speech, play=options.play
-                    )
+            if self._listener is not None:
+                feed = ListenerThread(self._listener, options.seed)
+                stack.callback(feed.close)
+            if self._person is not None and self._speech is not None:
+                own = self._speech if options.play is None else open_playback(options.play, self._speech)
+                source = PairedSource(*self._person, own)
                 stack.callback(source.close)
-            return run(
-                options,
-                source=source,
-                feed=self._feed,
-                observers=[progress, self._events],
-                knobs=self._knobs,
-                overlay=self._puppet.overlay,
-                interrupt=interrupt,
-                halt=halt,
-                signals=False,
-            )
+            watchers = [now, self._events]
+            return run(options, source=source, feed=feed, observers=watchers, controls=self._controls, signals=False)
+
+
+def _turned(regions: Mapping[str, float] | None) -> tuple[str, ...]:
+    return tuple(f"{region}={value}" for region, value in (regions or {}).items())

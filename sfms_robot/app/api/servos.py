@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import run_report
+from sfms_robot.app.listen.report import failure, run_report
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
-from sfms_robot.errors import BusError, ConfigError, InputError, ModelError, PortError, RobotError
-from sfms_robot.frames import POSE, Doubles, Floats, Reading, SpeakerFrame
+from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
+from sfms_robot.frames import POSE, Doubles, Floats, Reading
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD: Final = 1e-3  # of the goal sent; the servo itself is behind by its lag
 SLACK_RAD: Final = 1e-9  # so that the end of a range, computed twice, is inside it
 _LOOK_S: Final = 0.01
-_KINDS: Final = {kind.exit_code: kind for kind in (PortError, BusError, ModelError)}
 
 Report = Mapping[str, Any]
 
@@ -41,43 +40,27 @@ Report = Mapping[str, Any]
 # --- a run in its own thread ----------------------------------------------------------------------------------------
 
 
-class Progress(Observer):
-    """An observer that keeps the newest tick and counts; `came` is set at the first tick, or when the run ends."""
-
-    def __init__(self) -> None:
-        self.came = threading.Event()
-        self.seen: Tick | None = None
-        self.ticks = 0
-        self.frames = 0
-
-    def tick(self, seen: Tick) -> None:
-        self.seen = seen
-        self.ticks += 1
-        self.came.set()
-
-    def heard(self, frame: SpeakerFrame) -> None:
-        self.frames += 1
-
-
-class Background:
-    """A run in its own thread: `work` drives a head until the interrupt is set, and returns its report.
+class Background(Observer):
+    """A run in its own thread: `work` drives a head until `interrupt` is set, with this as an observer, and reports.
 
     A program that ends without `stop` is stopped at its exit: the head comes to rest first.
 
     Attributes:
-        progress: the newest tick, and counts.
-        halt: emergency stop.
+        seen: the newest tick.
+        interrupt: ends it; `halt`: emergency stop.
     """
 
-    def __init__(self, work: Callable[[Interrupt, HaltLatch, Observer], Report]) -> None:
+    def __init__(
+        self, work: Callable[[Background], Report], interrupt: Interrupt | None = None, halt: HaltLatch | None = None
+    ) -> None:
         self._work = work
-        self._interrupt = Interrupt()
-        self.halt = HaltLatch()
+        self.interrupt, self.halt = interrupt or Interrupt(), halt or HaltLatch()
         self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
         self._error: Exception | None = None
         self._raised = False
         self._stopping = False
-        self.progress = Progress()
+        self._came = threading.Event()  # the first tick, or the end of the run
+        self.seen: Tick | None = None
         self.report: Report | None = None
 
     @property
@@ -89,21 +72,24 @@ class Background:
             return "stopped"
         if self._stopping:
             return "stopping"
-        seen = self.progress.seen
-        return "starting" if seen is None else seen.state
+        return "starting" if self.seen is None else self.seen.state
 
     @property
     def running(self) -> bool:
         """True from the first tick until the end, or until it is stopped."""
         ended = self._error is not None or self.report is not None or self._stopping
-        return self.progress.came.is_set() and not ended
+        return self._came.is_set() and not ended
+
+    def tick(self, seen: Tick) -> None:
+        self.seen = seen
+        self._came.set()
 
     def start(self) -> None:
         """Start; block until the first tick, all torque on. Raises the error that prevented it, as RobotError."""
         atexit.register(self.stop)
         self._thread.start()
         try:
-            self.progress.came.wait()
+            self._came.wait()
         except BaseException:  # Ctrl-C: the caller gets no object that it could stop
             self.stop()
             raise
@@ -122,14 +108,14 @@ class Background:
         """
         if self._thread.is_alive() and not self._stopping:
             self._stopping = True
-            self._interrupt.ask()
+            self.interrupt.ask()
         self._end()
 
     def release(self) -> None:
         """Torque off now, without coming to rest first. From any thread; does not wait. Raises nothing."""
         self._stopping = True
-        self._interrupt.ask()
-        self._interrupt.ask()
+        self.interrupt.ask()
+        self.interrupt.ask()
 
     def check(self) -> None:
         """Raise the error that ended the run, if there is one; once."""
@@ -148,10 +134,8 @@ class Background:
 
     def _run(self) -> None:
         try:
-            self.report = self._work(self._interrupt, self.halt, self.progress)
-            if self.report["exit"] == "failed":
-                kind = _KINDS.get(self.report.get("exit_code", 1), RobotError)
-                self._error = kind(self.report["error"])
+            self.report = self._work(self)
+            self._error = failure(self.report)
         except RobotError as error:
             self._error = error
         except Exception as error:
@@ -159,7 +143,37 @@ class Background:
             self._error = RobotError(f"{type(error).__name__}: {error}")
             self._error.__cause__ = error
         finally:
-            self.progress.came.set()
+            self._came.set()
+
+
+class Driven:
+    """An object whose `Background` run drives a head; leaving its `with` block stops it.
+
+    An error of the run does not replace an exception that is being raised.
+    """
+
+    _run: Background | None = None
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        try:
+            self.stop()
+        except RobotError as failure:
+            if error is None:
+                raise
+            log.error("%s", failure)
+
+    def stop(self) -> None:
+        """Ease to rest, torque off. Block until then; raise an error of the run once, as RobotError.
+
+        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
+        """
+        if self._run is not None:
+            self._run.stop()
+
+    def release(self) -> None:
+        """Torque off now, without coming to rest, for emergencies. From any thread; does not wait. Raises nothing."""
+        if self._run is not None:
+            self._run.release()
 
 
 def head_name(head: Head | str) -> str:
@@ -194,7 +208,7 @@ def open_bus(head: Head | str, port: str = SIM, *, yes: bool = False, without: S
     return Servos(HeadOptions(head=head_name(head), port=port, yes=yes, without=tuple(without)))
 
 
-class Servos:
+class Servos(Driven):
     """Joints by their angle. Entering the `with` block connects; leaving it comes to rest and takes torque off.
 
     Every angle passes the limits of position, speed, acceleration and jerk of the head's file. Methods may be called
@@ -209,7 +223,6 @@ class Servos:
     def __init__(self, options: HeadOptions) -> None:
         self._options = options
         self._stack = ExitStack()
-        self._run: Background | None = None
         self._target = _Target(np.zeros(0))
 
     def __enter__(self) -> Self:
@@ -223,14 +236,9 @@ class Servos:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        """Stop, and close the ports. An error of it does not replace an exception that is being raised."""
+        """Stop, and close the ports."""
         with self._stack:
-            try:
-                self.stop()
-            except RobotError as failure:
-                if error is None:
-                    raise
-                log.error("%s", failure)
+            super().__exit__(kind, error, trace)
 
     def enable(self) -> None:
         """Torque on, each joint held where it stands; one outside its range comes in. Blocks until all are on.
@@ -261,7 +269,7 @@ class Servos:
         self.write(angles_rad)
         run, target = self._running(), self._target.angles_rad
         for _ in range(round(limit_s / _LOOK_S)):
-            seen = run.progress.seen
+            seen = run.seen
             if seen is not None and np.abs(seen.goals_rad - target).max() < ARRIVED_RAD:
                 return True
             run.wait(_LOOK_S)
@@ -272,21 +280,8 @@ class Servos:
         """Return the newest reading of every joint. Before `enable` it polls the servos and blocks for that."""
         if self._run is None:
             return self._opened.bus.poll(self._opened.clock.now_s())
-        seen = self._running().progress.seen
+        seen = self._running().seen
         return {} if seen is None else seen.readings
-
-    def stop(self) -> None:
-        """Ease to rest, torque off. Block until then; raise an error of the run once.
-
-        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
-        """
-        if self._run is not None:
-            self._run.stop()
-
-    def release(self) -> None:
-        """Torque off now, without coming to rest. From any thread; does not wait. Raises nothing."""
-        if self._run is not None:
-            self._run.release()
 
     def report(self) -> Report | None:
         """Return the report after `stop`, with the keys of `run --json`; None before."""
@@ -311,10 +306,10 @@ class Servos:
             raise InputError(f"{self.joints[worst]} = {angles[worst]:g} rad is not in {low:.4f}..{high:.4f}")
         return np.clip(angles, self.low_rad, self.high_rad)
 
-    def _drive(self, interrupt: Interrupt, halt: HaltLatch, observer: Observer) -> Report:
+    def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
-        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=halt, observers=[observer])
-        drove = drive_head(opened, parts, interrupt, signals=False)
+        parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now])
+        drove = drive_head(opened, parts, now.interrupt, signals=False)
         return run_report(opened, drove, alone, "none", 0)
 
 

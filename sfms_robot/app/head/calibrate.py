@@ -9,25 +9,24 @@ is done: a calibration that is stopped continues there the next time. Only the o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from sfms_robot.app.open_head import build_bus, build_motion, fastest_hz, identify
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.servo.move import SPEED_DEG_S
-from sfms_robot.app.wiring import Opened, open_wires
+from sfms_robot.app.wiring import Opened, calibration_of, open_wires
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.overlay import (
     CalibrateLayer,
     Identity,
     Measured,
-    Overlay,
     head_hash,
     layered,
     load_overlay,
@@ -49,12 +48,8 @@ _TRIES: Final = 20
 _PULSE_US: Final = (500.0, 2500.0)  # the most that a hobby servo may be sent, whatever its board can generate
 
 
-class Talk(Protocol):
-    """The user, by lines. `ask` raises EOFError or KeyboardInterrupt when they have gone."""
-
-    def say(self, text: str) -> None: ...
-
-    def ask(self, prompt: str) -> str: ...
+Say = Callable[[str], object]
+Ask = Callable[[str], str]  # raises EOFError or KeyboardInterrupt when the user has gone
 
 
 class SkippedError(ServoError):
@@ -91,28 +86,22 @@ class CalibrationOutcome:
         return {"version": 1, **vars(self), "file": str(self.file)}
 
 
-def calibrate(name: str, port: str, talk: Talk, joints: Sequence[str] = (), again: bool = False) -> CalibrationOutcome:
-    """Lead through the joints of a head on `port`, or those named.
+def calibrate(
+    name: str, port: str, say: Say, ask: Ask, joints: Sequence[str] = (), again: bool = False
+) -> CalibrationOutcome:
+    """Lead the user of `say` and `ask` through the joints of a head on `port`, or those named.
 
     Emulated servos (`sim`) are for practice: their measurements are kept apart and never used. `again`: also joints
     that are measured already. Raises RobotError.
     """
     head = load_head(name)
     with open_wires(head, HeadOptions(head=name, port=port)) as where:
-        file = overlay_file(head.name, practice=port == SIM)
-        return calibrate_on(name, where, RealClock(), talk, file, date.today(), joints=joints, again=again)
+        file, guide = overlay_file(head.name, practice=port == SIM), Guide(say, ask, date.today())
+        return calibrate_on(name, where, RealClock(), guide, file, joints=joints, again=again)
 
 
 def calibrate_on(
-    name: str,
-    where: Opened,
-    clock: Clock,
-    talk: Talk,
-    file: Path,
-    today: date,
-    *,
-    joints: Sequence[str] = (),
-    again: bool = False,
+    name: str, where: Opened, clock: Clock, guide: Guide, file: Path, *, joints: Sequence[str] = (), again: bool = False
 ) -> CalibrationOutcome:
     """Calibrate as `calibrate` does, on buses that are there, into `file`."""
     head, sha256 = load_head(name), head_hash(name)
@@ -122,8 +111,7 @@ def calibrate_on(
     wanted = list(joints or head.joints)
     outcome = CalibrationOutcome(head=head.name, file=file)
     overlay = load_overlay(head, file)
-    servos = identify(head, wanted, where, clock)
-    guide = _Guide(talk, today)
+    servos, say = identify(head, wanted, where, clock), guide.say
     try:
         if (old := overlay.calibrate) is not None and old.head_sha256 != sha256 and old.joints:
             kept = old.joints if guide.keeps_old() else {}
@@ -131,13 +119,13 @@ def calibrate_on(
         holds = layered(head, overlay, sha256, servos).calibrated
         outcome.before = [joint for joint in wanted if joint in holds and not again]
         todo = [joint for joint in wanted if joint not in outcome.before]
-        talk.say(f"{head.name}: {len(outcome.before)} joints are measured, {len(todo)} to go; saved to {file}")
-        talk.say("Enter takes the first choice; q stops at any question, and the next time continues from there.")
+        say(f"{head.name}: {len(outcome.before)} joints are measured, {len(todo)} to go; saved to {file}")
+        say("Enter takes the first choice; q stops at any question, and the next time continues from there.")
         for number, joint in enumerate(todo, 1):
             config = head.joints[joint]
             note = f" ({config.note})" if config.note else ""
             servo = f"{config.model} id {config.id} on bus {config.bus}"
-            talk.say(f"\n[{number}/{len(todo)}] {joint}{note}: {servo}")
+            say(f"\n[{number}/{len(todo)}] {joint}{note}: {servo}")
             try:
                 identity = servos[joint]
                 if identity is None:
@@ -148,32 +136,36 @@ def calibrate_on(
                     found = guide.measure_until_right(config, identity, at, by_hand)
             except (BusError, ServoError) as reason:
                 outcome.skipped[joint] = str(reason)
-                talk.say(f"  left out: {reason}")
+                say(f"  left out: {reason}")
                 continue
-            overlay = _with(overlay, sha256, joint, found)
+            known = overlay.calibrate.joints if overlay.calibrate is not None else {}
+            layer = CalibrateLayer(head_sha256=sha256, joints={**known, joint: found})
+            overlay = overlay.model_copy(update={"calibrate": layer})
+            if overlay.stored is not None:
+                overlay = overlay.recorded(sha256, joint, found.stored)
             save_overlay(overlay, file)
             outcome.measured.append(joint)
-            talk.say("  saved")
+            say("  saved")
     except KeyboardInterrupt:
         outcome.exit = "interrupted"
     _check(head, sha256, servos, outcome)
     return outcome
 
 
-class _Guide:
+@dataclass(frozen=True)
+class Guide:
     """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the lines."""
 
-    def __init__(self, talk: Talk, today: date) -> None:
-        self._talk, self._today = talk, today
+    say: Say
+    ask: Ask
+    today: date
 
     def keeps_old(self) -> bool:
         """Ask whether measurements for an older head file are kept."""
-        try:
-            return (
-                self._ask("The head's file has changed since. Enter: measure again; k: keep the measurements > ") == "k"
-            )
-        except SkippedError:
-            return False
+        question = "The head's file has changed since. Enter: measure again; k: keep the measurements > "
+        with suppress(SkippedError):
+            return self._ask(question) == "k"
+        return False
 
     def asks_how(self, blind: bool) -> bool:
         """Ask whether the joint is moved by hand; one whose servo reports no position is moved by keys."""
@@ -188,7 +180,7 @@ class _Guide:
             try:
                 return self._measure(joint, identity, at, by_hand)
             except AgainError as reason:
-                self._talk.say(f"  {reason}; once more")
+                self.say(f"  {reason}; once more")
 
     def _measure(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
         rests_at_end = joint.rest_deg in (joint.min_deg, joint.max_deg)
@@ -203,7 +195,7 @@ class _Guide:
             raise AgainError(f"its rest, {rest} ticks, is not between its ends, {low} and {high}")
         sign: Literal[1, -1] = 1 if high > low else -1
         in_file = joint.max_deg - joint.min_deg
-        self._talk.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {in_file:.1f})")
+        self.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {in_file:.1f})")
         if sign != joint.sign:
             turns = "fall" if sign < 0 else "rise"
             said = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "
@@ -211,7 +203,7 @@ class _Guide:
                 raise AgainError("its ends were mixed up")
         self._check_ends(low, high, rest, at)
         return Measured(
-            **identity.model_dump(), date=self._today, min_ticks=low, center_ticks=rest, max_ticks=high, sign=sign
+            **identity.model_dump(), date=self.today, min_ticks=low, center_ticks=rest, max_ticks=high, sign=sign
         )
 
     def _point(self, joint: Joint, point: str, at: JointProbe, by_hand: bool) -> int:
@@ -229,7 +221,7 @@ class _Guide:
             try:
                 at.by(STEPS_DEG[key] if key in STEPS_DEG else float(key))
             except (ValueError, OverflowError):
-                self._talk.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
+                self.say(f"  {key!r} is not a step (+, -, ++, --, a number of degrees, Enter)")
 
     def _check_ends(self, low: int, high: int, rest: int, at: JointProbe) -> None:
         """Move to the ends and to rest slowly, and ask whether that was right. Raises AgainError if not."""
@@ -240,13 +232,13 @@ class _Guide:
             off_deg = abs(at.ticks() - ticks) / at.ticks_per_deg
             if off_deg > ARRIVED_DEG:
                 place = f"at {at.ticks()} ticks in place of {ticks}"
-                self._talk.say(f"  {place}: it is {off_deg:.1f} deg off, is something in its way?")
+                self.say(f"  {place}: it is {off_deg:.1f} deg off, is something in its way?")
         if self._ask("  Was that right? Enter: yes, n: measure again > ") == "n":
             raise AgainError("it was not right")
 
     def _ask(self, prompt: str) -> str:
         try:
-            answer = self._talk.ask(prompt).strip().lower()
+            answer = self.ask(prompt).strip().lower()
         except EOFError:
             answer = "q"
         if answer == "q":
@@ -254,14 +246,6 @@ class _Guide:
         if answer == "s":
             raise SkippedError("skipped")
         return answer
-
-
-def _with(overlay: Overlay, sha256: str, joint: str, found: Measured) -> Overlay:
-    """Return the overlay with a measurement added."""
-    joints = overlay.calibrate.joints if overlay.calibrate is not None else {}
-    layer = CalibrateLayer(head_sha256=sha256, joints={**joints, joint: found})
-    overlay = overlay.model_copy(update={"calibrate": layer})
-    return overlay.recorded(sha256, joint, found.stored) if overlay.stored is not None else overlay
 
 
 def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outcome: CalibrationOutcome) -> None:
@@ -287,21 +271,19 @@ class JointProbe:
 
     Attributes:
         tells: whether its servo reports its position.
-        lowest, highest: ticks it may be sent to.
     """
 
     def __init__(self, name: str, joint: Joint, bus: Bus, clock: Clock) -> None:
         self.name = name
         self.tells = "position" in bus.capabilities[name]
-        self.lowest, self.highest = _travel_ticks(joint)
         self._joint, self._bus, self._clock = joint, bus, clock
-        self._per_rad: float = math.degrees(1.0) * _ticks_per_deg(joint)
+        self._calibration = calibration_of({name: joint})
         self._goal_rad: float | None = None  # with torque, where it is held
 
     @property
     def ticks_per_deg(self) -> float:
         """Ticks per degree of the joint, without direction."""
-        return abs(self._per_rad) / math.degrees(1.0)
+        return math.radians(abs(float(self._calibration.ticks_per_rad[0])))
 
     def ticks(self) -> int:
         """Return its position; of a servo that reports none, its goal. Raises ServoError."""
@@ -321,11 +303,12 @@ class JointProbe:
             raise TorqueError(unconfirmed)
         self._goal_rad = None
 
-    def go(self, ticks: int) -> int:
-        """Move slowly to `ticks`, torque on from where it stands, and hold. Blocks; returns the ticks of the goal."""
+    def go(self, ticks: int) -> None:
+        """Move slowly to `ticks`, torque on from where it stands, and hold. Blocks until then."""
         if self._goal_rad is None:
             self._goal_rad = float(self._bus.enable([self.name])[0])
-        start_rad, to_rad = self._goal_rad, self._angle(min(max(ticks, self.lowest), self.highest))
+        inside = np.clip([ticks], self._calibration.low_ticks, self._calibration.high_ticks)
+        start_rad, to_rad = self._goal_rad, float(self._calibration.to_rad(inside)[0])
         steps = max(1, math.ceil(math.degrees(abs(to_rad - start_rad)) / (SPEED_DEG_S * _PERIOD_S)))
         began_s = self._clock.now_s()
         for k in range(1, steps + 1):
@@ -333,18 +316,14 @@ class JointProbe:
             self._bus.write(np.array([self._goal_rad]), self._clock.now_s())
             self._bus.poll(self._clock.now_s())
             self._clock.wait_until(began_s + k * _PERIOD_S)
-        return self._ticks(to_rad)
 
-    def by(self, step_deg: float) -> int:
+    def by(self, step_deg: float) -> None:
         """Move as `go` does, by a step from the goal, so that a joint that sags still moves. Raises ValueError."""
         here = self.ticks() if self._goal_rad is None else self._ticks(self._goal_rad)
-        return self.go(here + round(step_deg * self.ticks_per_deg))
+        self.go(here + round(step_deg * self.ticks_per_deg))
 
     def _ticks(self, angle_rad: float) -> int:
-        return round(self._joint.zero_ticks + self._per_rad * angle_rad)
-
-    def _angle(self, ticks: int) -> float:
-        return (ticks - self._joint.zero_ticks) / self._per_rad
+        return int(self._calibration.to_ticks(np.array([angle_rad]))[0])
 
 
 @contextmanager
@@ -372,19 +351,13 @@ def probe(
         bus.close()
 
 
-def _ticks_per_deg(joint: Joint) -> float:
-    return joint.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
-
-
-def _travel_ticks(joint: Joint) -> tuple[int, int]:
-    """Return the first and last tick that the servo, or a common one on a board, may be sent to."""
+def _whole_travel(joint: Joint) -> dict[str, float]:
+    """Return the range in which the servo, or a common one on a board, can be sent anywhere; rest is inside."""
     firmware = load_firmware_map(joint.model)
+    ticks = 0, int(firmware.ticks_per_revolution) - 1
     if firmware.pulse_us is not None and firmware.tick_us is not None:
         shortest, longest = max(firmware.pulse_us.min, _PULSE_US[0]), min(firmware.pulse_us.max, _PULSE_US[1])
-        return math.ceil(shortest / firmware.tick_us), math.floor(longest / firmware.tick_us)
-    return 0, int(firmware.ticks_per_revolution) - 1
-
-
-def _whole_travel(joint: Joint) -> dict[str, float]:
-    ends = sorted((ticks - joint.zero_ticks) / _ticks_per_deg(joint) for ticks in _travel_ticks(joint))
+        ticks = math.ceil(shortest / firmware.tick_us), math.floor(longest / firmware.tick_us)
+    per_deg = joint.sign * joint.ratio * firmware.ticks_per_revolution / 360.0
+    ends = sorted((tick - joint.zero_ticks) / per_deg for tick in ticks)
     return {"min_deg": min(ends[0], joint.rest_deg), "max_deg": max(ends[1], joint.rest_deg)}

@@ -9,9 +9,7 @@ faces do. Poses of the head stay at rest, so that a camera in front of it sees t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -19,25 +17,25 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
-from sfms_robot.app.listen.report import Drove
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.listen.report import failure
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import drives
 from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
 from sfms_robot.errors import ConfigError
-from sfms_robot.face.human import HumanHead, load_human
+from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
 from sfms_robot.retarget.channel_mapping import Units
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
-from sfms_robot.runtime.recorder import Recorder
 from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.spaces import bounded_least_squares
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
 FACE_FILES: Final = ("face.csv", "face.csv.gz")
-PRACTICE_NOISE: Final = 0.01
+PRACTICE_NOISE: Final = 0.01  # of a blendshape, 1 sigma
+_PRACTICE_SEED: Final = 1
 ALONE_S: Final = 1.6  # of a channel, up and down again
 TOGETHER_S: Final = 1.0  # from one random face to the next
 AT_ONCE: Final = 6  # channels in a random face
@@ -51,26 +49,17 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
-def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> tuple[Head, Drove]:
-    """Move, and write DIR/run.mcap. Block until then; return the head and the end of the drive.
+def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> dict[str, Any]:
+    """Move, and record the run in a folder. Block until then; return its report.
 
     Raises RobotError, the head at rest.
     """
-    with ExitStack() as stack:
-        opened = stack.enter_context(open_head(options))
-        blind = set(opened.motion.retargeter.blind_channels)
-        faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
-        recorder = Recorder(
-            record,
-            list(opened.config.joints),
-            when_full="wait" if options.fast else "drop",
-            about={"head": opened.config.name},
-        )
-        stack.callback(recorder.close)
-        drove = faces.play(opened, recorder)
-    if drove.error is not None:
-        raise drove.error
-    return opened.config, drove
+    blind = HeadRetargeter(load_head(options.head)).blind_channels
+    faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
+    report = faces.play(options, record=record)
+    if (error := failure(report)) is not None:
+        raise error
+    return report
 
 
 def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceTrack:
@@ -94,46 +83,11 @@ def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceT
 # --- fit --------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """N instants at which joints stood somewhere and a face was seen: angles (N, J) [rad], shapes (N, 52)."""
+def fit_head(name: str, recording: Path, practice: bool = False) -> dict[str, Any]:
+    """Learn from a recording, write the overlay's fit layer, and report both. Raises ConfigError for a bad recording.
 
-    angles_rad: Doubles
-    shapes: Floats
-    delay_s: float
-
-
-@dataclass(frozen=True)
-class FitRow:
-    """One joint: rms errors in joint units on held-out frames, of the seen value against the commanded one.
-
-    `before` with the drive of the file, `after` with the response learnt; None for a joint that hardly moved.
-    """
-
-    joint: str
-    moved: tuple[float, float] | None
-    before: float | None
-    after: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeadFit:
-    """The result of a fit; `file` is where it was written."""
-
-    head: str
-    frames: int
-    delay_s: float
-    before: float
-    after: float
-    joints: Sequence[FitRow]
-    file: str
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:
-    """Learn from a recording and write the overlay's fit layer. Raises ConfigError for a recording that cannot be used.
+    Errors are rms in joint units on held-out frames, of the seen value against the commanded one: `before` with the
+    drive of the file, `after` with the response learnt; None for a joint that hardly moved. `file`: that was written.
 
     `practice`: the track is of the virtual head; the overlay goes beside that of the real one and is never used.
     """
@@ -141,15 +95,15 @@ def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:
     file = overlay_file(shipped.name, practice)
     overlay = load_overlay(shipped, file)
     head = layered(shipped, overlay.model_copy(update={"fit": None}), sha256).head
-    pairs = read_pairs(head, recording)
+    angles_rad, shapes, delay_s = read_pairs(head, recording)
     units = Units.of(head)
-    has, looks = units.values(pairs.angles_rad), looks_like(head, pairs.shapes)
+    has, looks = units.values(angles_rad), looks_like(head, shapes)
     held_out = np.arange(len(has)) // _BLOCK % 5 == 4
     dead = np.array([drive is None for drive in drives(head).values()])
     has[:, dead] = looks[:, dead] = 0.0  # a neck, say: nothing on the face follows it
     trial = fit(has[~held_out], looks[~held_out], units.low, units.high)
     rows = _rows(head, trial, has[held_out], looks[held_out])
-    measured = [row for row in rows if row.before is not None and row.after is not None]
+    measured = [row for row in rows if row["moved"] is not None]
     if not measured:
         raise ConfigError(f"{recording}: no joint moved enough to learn from ({', '.join(head.joints)})")
     learnt = fitted_drives(head, fit(has, looks, units.low, units.high))
@@ -161,32 +115,26 @@ def fit_head(name: str, recording: Path, practice: bool = False) -> HeadFit:
     )
     layered(shipped, changed := overlay.model_copy(update={"fit": layer}), sha256)  # refuses what is not sound
     save_overlay(changed, file)
-    before, after = (rms(np.array([getattr(row, key) for row in measured])) for key in ("before", "after"))
-    return HeadFit(
-        head=head.name,
-        frames=len(has),
-        delay_s=pairs.delay_s,
-        before=before,
-        after=after,
-        joints=rows,
-        file=str(file),
-    )
+    both = {key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")}
+    return {"head": head.name, "frames": len(has), "delay_s": delay_s, **both, "joints": rows, "file": str(file)}
 
 
-def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[FitRow]:
-    rows = []
+def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
     for j, (joint, response) in enumerate(zip(head.joints, responses, strict=True)):
-        if response is None:
-            rows.append(FitRow(joint, None, None, None))
-            continue
-        seen = looks[:, j] - response.offset
-        errors = rms(seen - has[:, j]), rms(seen - response(has[:, j]))
-        rows.append(FitRow(joint, response.moved, *errors))
+        row: dict[str, Any] = {"joint": joint, "moved": None, "before": None, "after": None}
+        if response is not None:
+            seen = looks[:, j] - response.offset
+            row |= {"moved": response.moved, "before": rms(seen - has[:, j]), "after": rms(seen - response(has[:, j]))}
+        rows.append(row)
     return rows
 
 
-def read_pairs(head: Head, folder: Path) -> Pairs:
-    """Return joints and face of a recording at the instants of its face track. Raises ConfigError."""
+def read_pairs(head: Head, folder: Path) -> tuple[Doubles, Floats, float]:
+    """Return angles (N, J) [rad] and faces (N, 52) at the N instants of a recording's face track, and its delay [s].
+
+    Raises ConfigError.
+    """
     run = read_recording(folder)
     if missing := [joint for joint in head.joints if joint not in run.joints]:
         recorded = run.about.get("head", "?")
@@ -206,7 +154,7 @@ def read_pairs(head: Head, folder: Path) -> Pairs:
     if not inside.any():
         ends = f"{run.times_s[0]:.1f}..{run.times_s[-1]:.1f} s"
         raise ConfigError(f"{found[0]}: column time lies outside the run ({ends})")
-    return Pairs(_at(at_s[inside], run.times_s, angles), shapes[inside], delay_s)
+    return _at(at_s[inside], run.times_s, angles), shapes[inside], delay_s
 
 
 def _at(at_s: Doubles, times_s: Doubles, values: Doubles) -> Doubles:
@@ -230,75 +178,50 @@ def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes:
     return round(float(_DELAYS_S[int(np.argmax(scores))]), 3)
 
 
-def see_virtual_face(head: Head, folder: Path, seed: int = 1) -> None:
+def see_virtual_face(name: str, folder: Path) -> None:
     """Write the track of a virtual face, with a random skin, beside a recorded run on emulated servos."""
-    run = read_recording(folder)
+    head, run = load_head(name), read_recording(folder)
     columns = [run.joints.index(joint) for joint in head.joints]
     step = max(1, round(0.04 / float(np.median(np.diff(run.times_s)))))
     angles = np.where(np.isfinite(run.present_rad), run.present_rad, run.goals_rad)[::step, columns]
-    tracker = virtual_tracker(head, Skin.hidden(len(columns), seed), PRACTICE_NOISE)
     motion = np.zeros((len(angles), MOTION_DIM), dtype=np.float32)
-    motion[:, SHAPES] = tracker.seen(Units.of(head).values(angles), np.random.default_rng(seed))
+    tracker = Tracker(head, hidden_skin(len(columns), _PRACTICE_SEED))
+    motion[:, SHAPES] = tracker.seen(Units.of(head).values(angles), np.random.default_rng(_PRACTICE_SEED))
     write_track(folder / FACE_FILES[0], Track(run.times_s[::step], motion, frozenset(BLENDSHAPES)))
-
-
-def virtual_tracker(head: Head, skin: Skin, noise: float = 0.0) -> Tracker:
-    """Return a tracker that sees the virtual face of this head."""
-    return Tracker(looks_like(head, np.eye(len(BLENDSHAPES), dtype=np.float32)).T, skin, noise)
 
 
 # --- a virtual tracker ------------------------------------------------------------------------------------------------
 
+Skin = Callable[[Doubles], Doubles]  # values of joints (N, J) -> their look (N, J), in joint units
 
-@dataclass(frozen=True)
-class Skin:
-    """The response of a skin to each joint's value: gain x (|value| beyond a dead band)^power, on its own side of rest.
 
-    Each is (2, J): below rest, above rest.
-    """
+def hidden_skin(joints: int, seed: int) -> Skin:
+    """Return a random skin: gain x (|value| beyond a dead band)^power for each joint, on its own side of rest."""
+    rng = np.random.default_rng(seed)
+    ranges = (0.85, 1.3), (0.5, 2.0), (0.0, 0.06)
+    parts = [rng.uniform(low, high, (2, joints)) for low, high in ranges]  # below rest, above rest
 
-    gain: Doubles
-    power: Doubles
-    dead_band: Doubles
-
-    @classmethod
-    def plain(cls, joints: int) -> Skin:
-        """Return the skin that the head's file assumes."""
-        ones = np.ones((2, joints))
-        return cls(ones, ones, 0 * ones)
-
-    @classmethod
-    def hidden(cls, joints: int, seed: int) -> Skin:
-        """Return a random skin."""
-        rng = np.random.default_rng(seed)
-        shape = (2, joints)
-        return cls(rng.uniform(0.85, 1.3, shape), rng.uniform(0.5, 2.0, shape), rng.uniform(0.0, 0.06, shape))
-
-    def __call__(self, values: Doubles) -> Doubles:
-        """Return the look (N, J) of values (N, J) in joint units."""
-        gain, power, dead = (np.where(values > 0, each[1], each[0]) for each in (self.gain, self.power, self.dead_band))
+    def look(values: Doubles) -> Doubles:
+        gain, power, dead = (np.where(values > 0, above, below) for below, above in parts)
         beyond = np.maximum(np.abs(values) - dead, 0.0) / (1.0 - dead)
         out: Doubles = np.sign(values) * gain * beyond**power
         return out
 
+    return look
+
 
 class Tracker:
-    """A face tracker before the robot's face: joint values in, blendshapes out.
+    """A face tracker before the virtual face of a head: joint values in, blendshapes out.
 
     It reports the face that explains the look of the joints: of all blendshapes 0..1 that would drive the joints so,
-    those that move the virtual head's skin least. Then it adds noise.
-
-    showing: (J, 52) the value of each joint for each blendshape at 1. noise: of a blendshape, 1 sigma.
+    those that move the virtual head's skin least. skin: None for the one that the head's file assumes.
     """
 
-    def __init__(self, showing: Doubles, skin: Skin, noise: float = 0.0, human: HumanHead | None = None) -> None:
-        self._skin, self._noise = skin, noise
-        motion = skin_motion(human)
-        prices = [
-            np.sqrt(_LEAST_MOTION_PRICE) * np.linalg.cholesky(motion + 1e-9 * np.eye(len(motion))).T,
-            _SIZE_PRICE * np.eye(len(motion)),
-        ]
-        self._matrix = np.concatenate([showing, *prices])
+    def __init__(self, head: Head, skin: Skin | None = None) -> None:
+        self._skin, identity = skin or (lambda values: values), np.eye(len(BLENDSHAPES))
+        showing = looks_like(head, identity.astype(np.float32)).T  # (J, 52)
+        least = np.sqrt(_LEAST_MOTION_PRICE) * np.linalg.cholesky(skin_motion() + 1e-9 * identity).T
+        self._matrix = np.concatenate([showing, least, _SIZE_PRICE * identity])
 
     def face(self, values: Doubles) -> Doubles:
         """Return blendshapes (N, 52) 0..1 for joint values (N, J), without noise."""
@@ -310,15 +233,15 @@ class Tracker:
     def seen(self, values: Doubles, rng: np.random.Generator) -> Floats:
         """Return `face` with noise."""
         face = self.face(values)
-        return np.clip(face + rng.normal(0.0, self._noise, face.shape), 0.0, 1.0).astype(np.float32)
+        return np.clip(face + rng.normal(0.0, PRACTICE_NOISE, face.shape), 0.0, 1.0).astype(np.float32)
 
 
-def skin_motion(human: HumanHead | None = None) -> Doubles:
+def skin_motion() -> Doubles:
     """Return (52, 52) how much two blendshapes move the skin alike; the mean of its diagonal is 1.
 
     For blendshapes b, b skin_motion b is the mean square way of the vertices, in units of that of one shape.
     """
-    deltas = (human or load_human()).deltas.reshape(len(BLENDSHAPES), -1).astype(np.float64)
+    deltas = load_human().deltas.reshape(len(BLENDSHAPES), -1).astype(np.float64)
     gram = deltas @ deltas.T
     out: Doubles = gram * (len(BLENDSHAPES) / np.trace(gram))
     return out

@@ -13,15 +13,14 @@ that explains them while moving the virtual head's skin least); and the loss is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sfms_robot.app.head.fit import Skin, skin_motion, virtual_tracker
+from sfms_robot.app.head.fit import Tracker, skin_motion
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
@@ -37,9 +36,6 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter, Neck
 from sfms_robot.retarget.response_fit import asked
 from sfms_robot.signals.motion_primitives import read_motions
 from sfms_robot.signals.tracks import face_stretches, folder_takes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _TICK_HZ: Final = 100.0
 _PERCENTILE: Final = 99.0
@@ -65,98 +61,46 @@ _ANGLES = slice(0, 3)
 _EVERY = 5  # frames: faces of two neighbours hardly differ
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointCheck:
-    """The demands of recorded faces on one joint.
+def check(
+    name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Check a head by shipped name or folder, on the bundled faces or those in a folder; return the report.
 
-    Attributes:
-        channels: that move it, by its drive or by the neck.
-        used: share of its range that the recorded faces move it through, 0..1.
-        clipped: share of the time it is at an end of its range that is not its rest, 0..1.
-        speed, jerk: 99th percentile of the demand, as a share of its limit; over 1 the limiter lags.
-    """
-
-    joint: str
-    servo: str
-    bus: str
-    id: int
-    min_deg: float
-    rest_deg: float
-    max_deg: float
-    channels: Sequence[str]
-    used: float
-    low_deg: float
-    high_deg: float
-    clipped: float
-    speed: float
-    jerk: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeckCheck:
-    """The reach of a neck along each axis from home [deg or mm], and the share of recorded poses within it.
-
-    `reached` is None where no recorded face moves its head.
-    """
-
-    reach: dict[str, tuple[float, float]]
-    reached: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeadCheck:
-    """The check of one head; one with `problems` has no other values.
-
-    `limitation`: channels that the named listener shows on no head, or None.
-    """
-
-    name: str
-    problems: Sequence[str]
-    joints: Sequence[JointCheck] = ()
-    blind_channels: Sequence[str] = ()
-    dead_joints: Sequence[str] = ()
-    neck: NeckCheck | None = None
-    calibrate_first: bool = False
-    seconds: float = 0.0
-    limitation: str | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def check(name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()) -> HeadCheck:
-    """Check a head by shipped name or folder, on the bundled faces or those in a folder.
+    A head with `problems` has no other values. For each of `joints` there are the `channels` that move it, by its drive
+    or by the neck; `used`: share of its range that the recorded faces move it through; `clipped`: share of the time
+    that it is at an end of its range that is not its rest; `speed`, `jerk`: 99th percentile of the demand, as a share
+    of its limit, over 1 the limiter lags. `neck`: reach along each axis from home [deg or mm], and the share of
+    recorded poses within it, None where no recorded face moves its head. `limitation`: channels that the named
+    listener shows on no head.
 
     `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for a
     listener that is not one.
     """
+    report: dict[str, Any] = {"name": name, "problems": check_head(name), "joints": [], "blind_channels": []}
+    report |= {"dead_joints": [], "neck": None, "calibrate_first": False, "seconds": 0.0, "limitation": None}
     limited = limitation(listener) if listener is not None else None
-    problems = check_head(name)
-    if problems:
-        return HeadCheck(name=name, problems=problems)
+    if report["problems"]:
+        return report
     head = load_head(name)
+    report["name"] = head.name
     try:
         check_safety(head, head.joints)
         retargeter = HeadRetargeter(head, 1.0 / _TICK_HZ)
         scene = scene_of(head, packages)
     except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
-        return HeadCheck(name=head.name, problems=[str(error)])
+        return report | {"problems": [str(error)]}
     if scene and scene.left_out:
-        return HeadCheck(name=head.name, problems=scene.left_out)
+        return report | {"problems": scene.left_out}
     clips = [clip for _, clip in named_faces(data)]
-    angles = [_angles(retargeter, _at_ticks(clip)) for clip in clips]
-    neck = _neck(retargeter.neck, clips) if retargeter.neck else None
-    return HeadCheck(
-        name=head.name,
-        problems=(),
-        joints=_rows(head, retargeter, angles),
-        blind_channels=retargeter.blind_channels,
-        dead_joints=retargeter.dead_joints,
-        neck=neck,
-        calibrate_first=head.calibrate_first,
-        seconds=round(sum(len(clip) for clip in clips) * FRAME_S, 1),
-        limitation=limited,
-    )
+    return report | {
+        "joints": _rows(head, retargeter, [_angles(retargeter, _at_ticks(clip)) for clip in clips]),
+        "blind_channels": retargeter.blind_channels,
+        "dead_joints": retargeter.dead_joints,
+        "neck": _neck(retargeter.neck, clips) if retargeter.neck else None,
+        "calibrate_first": head.calibrate_first,
+        "seconds": round(sum(len(clip) for clip in clips) * FRAME_S, 1),
+        "limitation": limited,
+    }
 
 
 def _at_ticks(clip: Floats) -> Doubles:
@@ -176,7 +120,7 @@ def _angles(retargeter: HeadRetargeter, motion: Doubles) -> Doubles:
     return np.concatenate(parts)
 
 
-def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> list[JointCheck]:
+def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> list[dict[str, Any]]:
     limits = JointLimits.of(head)
     rest = np.array([joint.rest_rad for joint in head.joints.values()])
     every = np.concatenate(clips)
@@ -188,22 +132,18 @@ def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> l
     jerk = _largest(clips, 3) / limits.jerk
     channels = _channels(head, retargeter)
     return [
-        JointCheck(
-            joint=name,
-            servo=joint.model,
-            bus=joint.bus,
-            id=joint.id,
-            min_deg=joint.min_deg,
-            rest_deg=joint.rest_deg,
-            max_deg=joint.max_deg,
-            channels=channels[name],
-            used=float((high[j] - low[j]) / (limits.high[j] - limits.low[j])),
-            low_deg=float(np.degrees(low[j])),
-            high_deg=float(np.degrees(high[j])),
-            clipped=float(at_end[:, j].mean()),
-            speed=float(speed[j]),
-            jerk=float(jerk[j]),
-        )
+        {
+            "joint": name,
+            "servo": joint.model,
+            **{key: getattr(joint, key) for key in ("bus", "id", "min_deg", "rest_deg", "max_deg")},
+            "channels": channels[name],
+            "used": float((high[j] - low[j]) / (limits.high[j] - limits.low[j])),
+            "low_deg": float(np.degrees(low[j])),
+            "high_deg": float(np.degrees(high[j])),
+            "clipped": float(at_end[:, j].mean()),
+            "speed": float(speed[j]),
+            "jerk": float(jerk[j]),
+        }
         for j, (name, joint) in enumerate(head.joints.items())
     ]
 
@@ -239,13 +179,13 @@ def _axes_of(head: Head, neck: Neck, joint: str) -> Sequence[str]:
     )
 
 
-def _neck(neck: Neck, clips: Sequence[Floats]) -> NeckCheck:
+def _neck(neck: Neck, clips: Sequence[Floats]) -> dict[str, Any]:
     poses = np.concatenate([clip[:, : len(POSE_CHANNELS)] for clip in clips]).astype(np.float64)
     shown = np.array([channel in neck.axes for channel in POSE_CHANNELS])
     moved = np.abs(poses).max(axis=1) > 0  # clips without head motion do not count
     wanted = np.where(shown, poses, 0.0)[moved]
     reached = float(neck.solve(wanted).reached.mean()) if len(wanted) else None
-    return NeckCheck(reach={axis: _reach(neck, axis) for axis in POSE_CHANNELS if axis in neck.axes}, reached=reached)
+    return {"reach": {axis: _reach(neck, axis) for axis in POSE_CHANNELS if axis in neck.axes}, "reached": reached}
 
 
 def _reach(neck: Neck, axis: str) -> tuple[float, float]:
@@ -261,37 +201,29 @@ def _reach(neck: Neck, axis: str) -> tuple[float, float]:
 # --- the picture ----------------------------------------------------------------------------------------------------
 
 
-def plot(checked: HeadCheck, png: Path) -> None:
+def plot(checked: Mapping[str, Any], png: Path) -> None:
     """Draw the check of a sound head: ranges, the part that recorded faces use, and the speed and jerk they demand.
 
     Raises ConfigError where the file cannot be written, MissingExtra without matplotlib.
     """
-    figure = new_figure(_WIDTH_IN, 1.3 + _ROW_IN * max(len(checked.joints), 4), _DPI)
+    joints = checked["joints"]
+    figure = new_figure(_WIDTH_IN, 1.3 + _ROW_IN * max(len(joints), 4), _DPI)
     ranges, demand = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    _ranges(ranges, checked)
-    _demand(demand, checked)
-    figure.suptitle(f"{checked.name} on {checked.seconds:.0f} s of recorded faces", color=INK, fontsize=11)
+    for row, joint in enumerate(joints):
+        for low, high, height, color in (("min_deg", "max_deg", 0.7, _RANGE), ("low_deg", "high_deg", 0.35, _USED)):
+            ranges.barh(row, joint[high] - joint[low], left=joint[low], height=height, color=color)
+        ranges.plot([joint["rest_deg"]] * 2, [row - 0.35, row + 0.35], color=INK, linewidth=1)
+        for offset, share, color in ((-0.18, joint["speed"], _SPEED), (0.18, joint["jerk"], _JERK)):
+            demand.barh(row + offset, 100 * share, height=0.32, color=color if share <= 1 else _OVER)
+    ranges.set_yticks(range(len(joints)), [joint["joint"] for joint in joints])
+    ranges.invert_yaxis()
+    ranges.set_xlabel("deg: range, used, and rest", color=INK)
+    demand.axvline(100, color=INK, linewidth=1)
+    demand.set_xlabel("% of the limit: speed (upper), jerk (lower)", color=INK)
+    for axes in (ranges, demand):
+        plain(axes, grid="x")
+    figure.suptitle(f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces", color=INK, fontsize=11)
     save(figure, png)
-
-
-def _ranges(axes: Axes, checked: HeadCheck) -> None:
-    for row, joint in enumerate(checked.joints):
-        axes.barh(row, joint.max_deg - joint.min_deg, left=joint.min_deg, height=0.7, color=_RANGE)
-        axes.barh(row, joint.high_deg - joint.low_deg, left=joint.low_deg, height=0.35, color=_USED)
-        axes.plot([joint.rest_deg] * 2, [row - 0.35, row + 0.35], color=INK, linewidth=1)
-    axes.set_yticks(range(len(checked.joints)), [joint.joint for joint in checked.joints])
-    axes.invert_yaxis()
-    axes.set_xlabel("deg: range, used, and rest", color=INK)
-    plain(axes, grid="x")
-
-
-def _demand(axes: Axes, checked: HeadCheck) -> None:
-    for row, joint in enumerate(checked.joints):
-        for offset, share, color in ((-0.18, joint.speed, _SPEED), (0.18, joint.jerk, _JERK)):
-            axes.barh(row + offset, 100 * share, height=0.32, color=color if share <= 1 else _OVER)
-    axes.axvline(100, color=INK, linewidth=1)
-    axes.set_xlabel("% of the limit: speed (upper), jerk (lower)", color=INK)
-    plain(axes, grid="x")
 
 
 # --- fidelity ---------------------------------------------------------------------------------------------------------
@@ -312,43 +244,33 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, A
 def _fidelity(name: str, faces: dict[str, list[Floats]]) -> list[dict[str, Any]]:
     """Return one row per face, then one for all of them."""
     head = load_head(name)
-    retargeter = HeadRetargeter(head)
-    tracker = virtual_tracker(head, Skin.plain(len(head.joints)))
-    skin = skin_motion()
-    motions = {face: np.concatenate(clips) for face, clips in faces.items()}
-    rows, sums = [], []
-    for face, motion in motions.items():
+    neck, tracker, skin = HeadRetargeter(head).neck, Tracker(head), skin_motion()
+
+    def energy(shapes: Doubles) -> float:
+        return float(np.einsum("ni,ij,nj->", shapes, skin, shapes, optimize=True))
+
+    sums: dict[str, Doubles] = {}  # seconds, expression lost and shown, pose lost and shown
+    for face, clips in faces.items():
+        motion = np.concatenate(clips)
         wanted = motion[::_EVERY, SHAPES].astype(np.float64)
+        turns = np.zeros((len(motion), len(POSE_CHANNELS)))
+        turns[:, _ANGLES] = motion[:, _ANGLES]
+        missing = turns if neck is None else neck.solve(turns).residual_rad  # without a neck, all of it
         lost = tracker.face(asked(head, wanted)) - wanted
-        energy = [_energy(lost, skin), _energy(wanted, skin), *_turns(retargeter, motion[:, POSE])]
-        sums.append(energy)
-        rows.append(_row(head.name, face, len(motion), energy))
-    total = np.sum(sums, axis=0).tolist()
-    return [*rows, _row(head.name, "all", sum(map(len, motions.values())), total)]
-
-
-def _energy(shapes: Doubles, skin: Doubles) -> float:
-    return float(np.einsum("ni,ij,nj->", shapes, skin, shapes, optimize=True))
-
-
-def _turns(retargeter: HeadRetargeter, pose: Floats) -> tuple[float, float]:
-    """Return the sums of squares of the missing angles, and of all; a head without a neck misses them all."""
-    turns = np.zeros((len(pose), len(POSE_CHANNELS)))
-    turns[:, _ANGLES] = pose[:, _ANGLES]
-    wanted = float((turns[:, _ANGLES] ** 2).sum())
-    if retargeter.neck is None:
-        return wanted, wanted
-    return float((retargeter.neck.solve(turns).residual_rad ** 2).sum()), wanted
-
-
-def _row(head: str, face: str, frames: int, energy: Sequence[float]) -> dict[str, Any]:
-    return {
-        "head": head,
-        "face": face,
-        "seconds": round(frames * FRAME_S, 1),
-        "expression": _share(*energy[:2]),
-        "pose": _share(*energy[2:]),
-    }
+        sums[face] = np.array(
+            [len(motion) * FRAME_S, energy(lost), energy(wanted), (missing**2).sum(), (turns**2).sum()]
+        )
+    sums["all"] = np.sum(list(sums.values()), axis=0)
+    return [
+        {
+            "head": head.name,
+            "face": face,
+            "seconds": round(total[0], 1),
+            "expression": _share(*total[1:3]),
+            "pose": _share(*total[3:]),
+        }
+        for face, total in ((face, total.tolist()) for face, total in sums.items())
+    ]
 
 
 def _share(lost: float, wanted: float) -> float | None:

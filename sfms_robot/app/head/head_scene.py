@@ -1,4 +1,4 @@
-"""A head's picture with its forward kinematics."""
+"""A head's picture with its forward kinematics, and the main function of the page's process, which shows it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from sfms_robot.config import Head, load_head
 from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.robot_scene import RobotScene
-from sfms_robot.retarget.head_retargeter import build_neck
 
 _CELL_PX: Final = (300, 290)
 _COLUMNS: Final = 3
@@ -21,8 +20,17 @@ def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene | None:
 
     `packages`: folders outside the head's that meshes may come from.
     """
+    from sfms_robot.retarget.head_retargeter import build_neck  # half a second of imports, later than the page's start
+
     neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
     return RobotScene.of(head, neck, packages)
+
+
+def main() -> None:
+    """See `viewer.page_child`."""
+    from sfms_robot.viewer import page_child  # of the page's process alone
+
+    page_child.main(lambda head, packages: scene_of(load_head(head), packages))
 
 
 def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import logging
-import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
+from sfms_robot.signals.tracks import csv_cells, csv_numbers
 
 POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
 BODY_COLUMN = "body_yaw_rad"
@@ -50,39 +49,17 @@ def solve_poses(head_name: str, file: Path) -> dict[str, Any]:
 
 def read_poses(file: Path) -> tuple[Doubles, Doubles | None]:
     """Read poses (N, 6) and body yaws (N,), None without that column. Other columns are named in the log."""
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            columns = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = columns
-            rows = list(reader)
-    except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{file}: cannot be read: {error}") from error
-    wanted = [*POSE_COLUMNS, BODY_COLUMN] if BODY_COLUMN in columns else list(POSE_COLUMNS)
-    if missing := [name for name in POSE_COLUMNS if name not in columns]:
-        raise ConfigError(f"{file}: no column {', '.join(missing)} (has {', '.join(columns) or 'none'})")
-    if twice := [name for name in wanted if columns.count(name) > 1]:
+    header, rows = csv_cells(file)
+    wanted = [*POSE_COLUMNS, BODY_COLUMN] if BODY_COLUMN in header else list(POSE_COLUMNS)
+    if missing := [name for name in POSE_COLUMNS if name not in header]:
+        raise ConfigError(f"{file}: no column {', '.join(missing)} (has {', '.join(header)})")
+    if twice := [name for name in wanted if header.count(name) > 1]:
         raise ConfigError(f"{file}: column {', '.join(twice)} is there twice")
-    if longer := [line for line, row in enumerate(rows, 2) if None in row]:
-        raise ConfigError(f"{file}:{longer[0]}: has more cells than the header has columns ({len(columns)})")
-    if not rows:
-        raise ConfigError(f"{file}: no poses, only a header")
-    if unused := [name for name in columns if name not in wanted]:
+    if uneven := [number for number, row in enumerate(rows, 2) if len(row) != len(header)]:
+        raise ConfigError(f"{file}: row {uneven[0]}: expected {len(header)} cells, as many as the header has")
+    if unused := [name for name in header if name not in wanted]:
         log.warning("%s: columns not used: %s", file, ", ".join(unused))
-    numbers = np.array([[_number(row, name, line, file) for name in wanted] for line, row in enumerate(rows, 2)])
-    return numbers[:, :6], numbers[:, 6] if BODY_COLUMN in columns else None
-
-
-def _number(row: dict[str, str | None], column: str, line: int, file: Path) -> float:
-    text = row[column]
-    try:
-        number = float(text or "")
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ConfigError.at(f"{file}:{line}", column, text, "is not a number")
-    if abs(number) > _FARTHEST:
-        raise ConfigError.at(f"{file}:{line}", column, number, f"is out of all bounds (at most {_FARTHEST:g})")
-    return number
+    numbers = np.stack([csv_numbers(file, name, [row[header.index(name)] for row in rows]) for name in wanted], axis=1)
+    if np.abs(numbers).max() > _FARTHEST:
+        raise ConfigError(f"{file}: a number is out of all bounds (at most {_FARTHEST:g} rad or m)")
+    return numbers[:, :6], numbers[:, 6] if BODY_COLUMN in header else None

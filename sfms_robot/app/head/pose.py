@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.listen.report import Drove, outcome
-from sfms_robot.app.open_head import OpenHead, open_head
-from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, run_parts
+from sfms_robot.app.listen.report import OUTCOME, failure
+from sfms_robot.app.options import HeadOptions, RunOptions
+from sfms_robot.app.session import Panel, run
+from sfms_robot.config import Head, load_head
 from sfms_robot.errors import ConfigError, TorqueError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE_CHANNELS, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Source, Tick
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import IDLE_FEED
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.safety import EASE_S, Interrupt
+from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.5
@@ -34,13 +35,20 @@ def _both(**values: float) -> dict[str, float]:
     return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
 
 
+# Faces by name, for words of `head pose` and buttons of the page; the page leaves all other channels to the listener.
 EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
     "smile": _both(mouthSmile=0.9, cheekSquint=0.4, eyeSquint=0.2),
-    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "laugh": {**_both(mouthSmile=1.0, cheekSquint=0.8, eyeSquint=0.5), "jawOpen": 0.35, "pitch": -0.08},
     "surprise": {**_both(browOuterUp=0.8, eyeWide=0.8), "browInnerUp": 0.9, "jawOpen": 0.4},
+    "doubt": {"browDownLeft": 0.6, "browOuterUpRight": 0.8, "mouthLeft": 0.4, "roll": 0.12},
+    "frown": _both(mouthFrown=0.8, browDown=0.6),
+    "sad": {**_both(mouthFrown=0.8), "browInnerUp": 0.8, "mouthShrugLower": 0.4, "pitch": 0.15},
     "anger": _both(browDown=1.0, noseSneer=0.6, mouthPress=0.5),
-    "blink": _both(eyeBlink=1.0),
+    "disgust": _both(noseSneer=0.9, mouthUpperUp=0.6, browDown=0.5, eyeSquint=0.4),
     "kiss": {"mouthPucker": 1.0, "mouthFunnel": 0.2},
+    "wink": {"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.6, "mouthSmileLeft": 0.5},
+    "blink": _both(eyeBlink=1.0),
+    "eyes closed": _both(eyeBlink=1.0),
     "nod": {"pitch": 0.2},
     "look_left": {"eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3},
     "look_right": {"eyeLookInLeft": 0.7, "eyeLookOutRight": 0.7, "yaw": -0.3},
@@ -61,19 +69,16 @@ def parse_face(words: Sequence[str]) -> Floats:
             continue
         if name not in CHANNEL_INDEX:
             raise ConfigError.at("head pose", "CHANNEL", name, "is not a channel", CHANNEL_INDEX)
-        motion[CHANNEL_INDEX[name]] = _value(name, text)
+        high = _BOUNDS.get(name, 1.0)
+        low = -high if name in _BOUNDS else 0.0
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise ConfigError.at("head pose", name, text, "is not a number in its range", [f"{low:g}..{high:g}"])
+        motion[CHANNEL_INDEX[name]] = value
     return motion
-
-
-def _value(channel: str, text: str) -> float:
-    low, high = (-_BOUNDS[channel], _BOUNDS[channel]) if channel in POSE_CHANNELS else (0.0, 1.0)
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise ConfigError.at("head pose", channel, text, "is not a number in its range", [f"{low:g}..{high:g}"])
-    return value
 
 
 def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
@@ -81,20 +86,18 @@ def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -
 
     Blocks until then. Raises any other RobotError, the head at rest.
     """
-    face = parse_face(words)
-    timeline = held_face(face, hold_s)
-    with open_head(options) as opened:
-        motion = opened.motion
-        furthest = Furthest(motion.retargeter.joints, motion.rest_rad)
-        drove = timeline.play(opened, furthest)
-    if drove.error is not None and not isinstance(drove.error, TorqueError):
-        raise drove.error
-    shown = [name for name, index in CHANNEL_INDEX.items() if face[index]]
+    face, head = parse_face(words), load_head(options.head)
+    furthest = Furthest(head)
+    report = held_face(face, hold_s).play(options, observers=[furthest])
+    error = failure(report)
+    if error is not None and str(error) != str(TorqueError(report["torque_unconfirmed"])):
+        raise error
+    blind = HeadRetargeter(head).blind_channels
     return {
-        **outcome(opened, drove),
+        **{key: report[key] for key in OUTCOME},
         "face": list(words),
         "joints": furthest.moved(),
-        "blind": [name for name in shown if name in motion.retargeter.blind_channels],
+        "blind": [name for name, index in CHANNEL_INDEX.items() if face[index] and name in blind],
     }
 
 
@@ -112,19 +115,19 @@ class FaceTrack:
 
     def play(
         self,
-        opened: OpenHead,
-        observer: Observer,
-        interrupt: Interrupt | None = None,
+        options: HeadOptions,
+        panel: Panel | None = None,
         *,
-        signals: bool = True,
-        log: RunLog | None = None,
-        **more: Any,
-    ) -> Drove:
-        """Drive a head with this track once, without a person or a listener. `more`: see `run_parts`."""
+        listener: str = "none",
+        record: Path | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> dict[str, Any]:
+        """Run once with this track in place of a person and a listener; return the report. `listener`: its name."""
         alone = NobodyThere()
-        parts = run_parts(opened, alone, alone, timeline=self, observers=[observer], **more)
-        duration_s = self.duration_s
-        return drive_head(opened, parts, interrupt or Interrupt(), duration_s=duration_s, signals=signals, log=log)
+        chosen = RunOptions(
+            **vars(options), listener=listener, duration_s=self.duration_s, record=record, overwrite=True
+        )
+        return run(chosen, panel, source=alone, feed=alone, timeline=self, observers=observers)
 
     def start(self) -> None:
         return None
@@ -173,29 +176,28 @@ class NobodyThere(Source):
 class Furthest(Observer):
     """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
 
-    def __init__(self, joints: Sequence[str], rest_rad: Doubles) -> None:
-        self._joints, self._rest_rad = tuple(joints), rest_rad
-        self._sent = np.zeros(len(rest_rad))
-        self._reached: dict[str, float] = {}
+    def __init__(self, head: Head) -> None:
+        self._joints = tuple(head.joints)
+        self._rest_rad = np.array([joint.rest_rad for joint in head.joints.values()])
+        self._sent, self._reached = np.zeros(len(self._joints)), np.full(len(self._joints), np.nan)
 
     def tick(self, seen: Tick) -> None:
         if seen.time_s < EASE_S:
             return
-        sent = seen.goals_rad - self._rest_rad
-        self._sent = np.where(np.abs(sent) > np.abs(self._sent), sent, self._sent)
-        for joint, rest in zip(self._joints, self._rest_rad, strict=True):
-            at = seen.readings[joint].position_rad if joint in seen.readings else None
-            if at is not None and abs(at - rest) >= abs(self._reached.get(joint, 0.0)):
-                self._reached[joint] = float(at - rest)
+        places = [each and each.position_rad for each in map(seen.readings.get, self._joints)]
+        self._sent = _further(self._sent, seen.goals_rad - self._rest_rad)
+        self._reached = _further(self._reached, np.array(places, np.float64) - self._rest_rad)  # None becomes NaN
 
     def moved(self) -> dict[str, dict[str, float | None]]:
         """Return the joints that were sent away from rest, in degrees; None where a servo reports no position."""
-        rows: dict[str, dict[str, float | None]] = {}
-        for joint, sent in zip(self._joints, np.degrees(self._sent), strict=True):
-            if abs(sent) >= MOVED_DEG:
-                reached = self._reached.get(joint)
-                rows[joint] = {
-                    "sent_deg": round(float(sent), 2),
-                    "reached_deg": None if reached is None else round(math.degrees(reached), 2),
-                }
-        return rows
+        rows = zip(self._joints, np.degrees(self._sent).round(2), np.degrees(self._reached).round(2), strict=True)
+        return {
+            joint: {"sent_deg": float(sent), "reached_deg": None if np.isnan(reached) else float(reached)}
+            for joint, sent, reached in rows
+            if abs(sent) >= MOVED_DEG
+        }
+
+
+def _further(furthest: Doubles, now: Doubles) -> Doubles:
+    """Return whichever is further from 0, joint by joint; NaN counts as not known."""
+    return np.where((np.abs(now) > np.abs(furthest)) | np.isnan(furthest), now, furthest)

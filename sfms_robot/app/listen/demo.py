@@ -26,10 +26,7 @@ _KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "se
 
 
 def demo(
-    options: RunOptions,
-    folder: Path | None = None,
-    panel: session.Panel | None = None,
-    page: PageProcess | None = None,
+    options: RunOptions, folder: Path | None = None, panel: session.Panel | None = None, page: PageProcess | None = None
 ) -> dict[str, Any]:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from threading import Lock
+from threading import RLock
 from typing import Final, get_args
 
 from sfms_robot.config import Calmness, Head, parse
@@ -34,7 +34,7 @@ class Knob:
 
     @intensity.setter
     def intensity(self, value: float) -> None:
-        self._knobs.set("intensity", self._region, value)
+        self._knobs.turn({self._region: value}, {})
 
     @property
     def style(self) -> float:
@@ -43,7 +43,7 @@ class Knob:
 
     @style.setter
     def style(self, value: float) -> None:
-        self._knobs.set("style", self._region, value)
+        self._knobs.turn({}, {self._region: value})
 
     def __repr__(self) -> str:
         return f"Knob({self._region!r}, intensity={self.intensity:g}, style={self.style:g})"
@@ -59,47 +59,41 @@ class LiveKnobs:
 
     def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
         self._face = Face(head)
-        self._lock = Lock()
-        self._regions = tuple(head.regions)
-        self.values = {
+        self._lock = RLock()
+        self.values: dict[str, dict[str, float]] = {
             kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()} for kind in KNOB_KINDS
         }
         self.now: Knobs = self._face.knobs()
-        for kind, given in (("intensity", intensity), ("style", style)):
-            for region, value in given.items():
-                self._region(region)
-                self.set(kind, region, value)
+        self.turn(intensity, style)
 
-    def set(self, kind: str, region: str, value: float) -> None:
-        """Set a value. Raises InputError for one outside 0..2."""
-        if not 0 <= value <= MOST:
-            raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
+    def turn(self, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
+        """Set values of regions. Raises InputError, with nothing changed, for an unknown region or one outside 0..2."""
+        for kind, given in zip(KNOB_KINDS, (intensity, style), strict=True):
+            for region, value in given.items():
+                self[region]
+                if not 0 <= value <= MOST:
+                    raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
         with self._lock:
-            self._turn({**self.values, kind: {**self.values[kind], region: float(value)}})
+            both = [{**self.values[kind], **given} for kind, given in zip(KNOB_KINDS, (intensity, style), strict=True)]
+            self.values, self.now = dict(zip(KNOB_KINDS, both, strict=True)), self._face.knobs(*both)
 
     def turn_all(self, by: float) -> None:
         """Change the intensity of every region by `by`; none leaves 0..2."""
         with self._lock:
-            louder = {name: round(min(max(at + by, 0.0), MOST), 3) for name, at in self.values["intensity"].items()}
-            self._turn({**self.values, "intensity": louder})
-
-    def _turn(self, values: dict[str, dict[str, float]]) -> None:
-        self.values, self.now = values, self._face.knobs(values["intensity"], values["style"])
-
-    def _region(self, name: str) -> str:
-        if name not in self._regions:
-            raise InputError(f"{name!r} is not a region of this head ({', '.join(self._regions) or 'none'})")
-        return name
+            now = self.values["intensity"].items()
+            self.turn({name: round(min(max(at + by, 0.0), MOST), 3) for name, at in now}, {})
 
     def __getitem__(self, region: str) -> Knob:
         """Return a region. Raises InputError for a name that is not one."""
-        return Knob(self, self._region(region))
+        if region not in self.values["style"]:
+            raise InputError(f"{region!r} is not a region of this head ({', '.join(self) or 'none'})")
+        return Knob(self, region)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._regions)
+        return iter(self.values["style"])
 
     def __len__(self) -> int:
-        return len(self._regions)
+        return len(self.values["style"])
 
 
 def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> LiveKnobs:

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
+from sfms_robot.app.head.pose import EXPRESSIONS
 from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.app.listen.report import event_row
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Calmness, Head
 from sfms_robot.config.listener import load_listener
-from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder
 from sfms_robot.ports import Observer, Tick
@@ -36,54 +39,30 @@ _WAITING: Final = 50  # plans that wait for the thread
 _EPS_FRAMES: Final = 1e-6
 
 
-def _both(**values: float) -> dict[str, float]:
-    """Return the values of pairs of channels, left and right."""
-    return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
-
-
-# Faces by name, for buttons of a page: channels of `frames.CHANNELS`, everything else is left to the listener.
-NAMED_EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
-    "smile": _both(mouthSmile=0.8, cheekSquint=0.4, eyeSquint=0.2),
-    "laugh": {**_both(mouthSmile=1.0, cheekSquint=0.8, eyeSquint=0.5), "jawOpen": 0.35, "pitch": -0.08},
-    "surprise": {**_both(browOuterUp=0.9, eyeWide=0.9), "browInnerUp": 0.9, "jawOpen": 0.4},
-    "doubt": {"browDownLeft": 0.6, "browOuterUpRight": 0.8, "mouthLeft": 0.4, "roll": 0.12},
-    "frown": _both(browDown=0.9, eyeSquint=0.3, mouthFrown=0.3),
-    "sad": {**_both(mouthFrown=0.8), "browInnerUp": 0.8, "mouthShrugLower": 0.4, "pitch": 0.15},
-    "disgust": _both(noseSneer=0.9, mouthUpperUp=0.6, browDown=0.5, eyeSquint=0.4),
-    "kiss": {"mouthPucker": 0.9, "mouthFunnel": 0.2},
-    "wink": {"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.6, "mouthSmileLeft": 0.5},
-    "eyes closed": _both(eyeBlink=1.0),
-}
-
-
 def page_facts(
     head: Head,
-    *,
-    port: str,
-    listener: str,
-    speaker: str | None,
-    seed: int,
-    calmness: Calmness,
-    people: Mapping[str, float],
+    options: RunOptions,
     knobs: LiveKnobs,
-    source: Mapping[str, bool],
-    choices: bool,
+    speaker: str | None,
+    *,
+    feeds: Collection[str] = (),
+    choices: bool = False,
 ) -> dict[str, Any]:
-    """Return the `hello` of docs/protocol.md, but for what visitors differ in.
+    """Return the `hello` of docs/protocol.md, but for the entries that differ between visitors.
 
     Args:
         speaker: name of the recorded person; None: a live person.
-        people: see `people_per_minute`.
-        source: what a visitor may bring of the person.
+        feeds: voice and face, if a visitor may bring them.
         choices: another listener, speaker or seed may be chosen.
     """
+    calmness = options.calmness or Calmness()
     return {
         "version": VERSION,
         "head": head.name,
-        "port": port,
-        "listener": Path(listener).name,
+        "port": options.port,
+        "listener": Path(options.listener).name,
         "speaker": speaker,
-        "seed": seed,
+        "seed": options.seed,
         "listeners": _lines(shipped_listeners()) if choices else [],
         "speakers": _lines(shipped_speakers()) if choices else [],
         "joints": [
@@ -97,12 +76,12 @@ def page_facts(
         "urdf": None,
         "channels": list(CHANNELS),
         "regions": list(knobs),
-        "expressions": NAMED_EXPRESSIONS,
+        "expressions": EXPRESSIONS,
         **knobs.values,
         "calmness": calmness.model_dump(exclude={"addressed"}),
-        "people_per_minute": dict(people),
+        "people_per_minute": {},
         "human": "human/head.bin",
-        "source": dict(source),
+        "source": {name: name in feeds for name in ("voice", "face")},
         "replay": False,
     }
 
@@ -191,7 +170,8 @@ class PageObserver(Observer):
         while self._plans:
             self._events.join(self._plans.popleft())
         for event in self._events.news():
-            self._page.say("event", **_event(event))
+            evidence = {name: round(float(value), 3) for name, value in event.evidence.items()}
+            self._page.say("event", **event_row(event), at_s=round(event.start_s, 3), evidence=evidence)
 
     def _read_rad(self, seen: Tick) -> Floats:
         """Return (J,) angles; NaN without a recent one: legs of a platform read at other times fit no pose of now."""
@@ -208,18 +188,6 @@ class PageObserver(Observer):
         if key != self._rare[0]:
             self._rare = (key, rare_json(*key))
         return self._rare[1]
-
-
-def _event(event: ListenerEvent) -> dict[str, Any]:
-    return {
-        "event": event.kind,
-        "at_s": round(event.start_s, 3),
-        "lasts_s": round(event.duration_s, 3),
-        "size": round(event.size, 4),
-        "swings": event.swings,
-        "probability": None if event.probability is None else round(event.probability, 5),
-        "evidence": {name: round(float(value), 3) for name, value in event.evidence.items()},
-    }
 
 
 class PageRecorder(Observer):

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -20,84 +20,28 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs, turned
-from sfms_robot.app.listen.page_observer import (
-    NAMED_EXPRESSIONS,
-    PageObserver,
-    PageRecorder,
-    page_facts,
-    people_per_minute,
-)
+from sfms_robot.app.head.pose import EXPRESSIONS
+from sfms_robot.app.listen.page_observer import PageObserver, PageRecorder, page_facts, people_per_minute
 from sfms_robot.app.listen.report import run_facts
 from sfms_robot.app.options import RunOptions
-from sfms_robot.config import Calmness, load_head, parse
+from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import InputError
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.listeners.remote import NamedFeed, open_feed
+from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.puppet import Puppet
-from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
-from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, open_source, split_kind
+from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, split_kind
 from sfms_robot.viewer.page_process import PageProcess
 
 AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
 LEFT_S: Final = 30.0
 BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it
+_FEEDS: Final = ("voice", "face")  # of a person
 _LOOK_S: Final = 0.5
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(kw_only=True)
-class PageReach:
-    """Commands of a page on a run.
-
-    Attributes:
-        calm: sets how often the listener does what.
-        record: begins a recording, or ends it.
-        release: torque off at once, as a second Ctrl-C does; the run ends with it.
-    """
-
-    halt: HaltLatch
-    puppet: Puppet
-    knobs: LiveKnobs
-    calmness: Calmness
-    calm: Callable[[Calmness], None]
-    record: Callable[[bool], None]
-    release: Callable[[], None]
-
-    def do(self, name: str, values: Mapping[str, Any]) -> None:
-        """Carry out a command. Raises RobotError."""
-        match name:
-            case "halt":
-                self.halt.close(BY_PAGE, BY_PAGE)
-            case "resume":
-                self.halt.resume(BY_PAGE)
-            case "release":
-                self.release()
-            case "neutral":
-                self.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"])
-            case "show":
-                self.puppet.show(values["channels"], values["seconds"])
-            case "expression":
-                if values["name"] not in NAMED_EXPRESSIONS:
-                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(NAMED_EXPRESSIONS)})")
-                self.puppet.show(NAMED_EXPRESSIONS[values["name"]], values["seconds"])
-            case "look_at":
-                self.puppet.look_at(**values)
-            case "knobs":
-                for kind in KNOB_KINDS:
-                    for region, value in values[kind].items():
-                        setattr(self.knobs[region], kind, value)
-            case "calm":
-                self.calmness = parse(Calmness, {**self.calmness.model_dump(), **values["rates"]}, "calm")
-                self.calm(self.calmness)
-            case "record":
-                self.record(values["on"])
 
 
 class PageSession:
@@ -110,64 +54,63 @@ class PageSession:
     Attributes:
         options: of the present run, or of the last one.
         released: a visitor has ended that run.
-        reach: the present run; None: there is none.
+        reach: controls of the present run; None: there is none.
+        recorder: of that run.
     """
 
     def __init__(self, page: PageProcess, options: RunOptions, folder: Path, choices: bool) -> None:
         self.page, self.options, self.released = page, options, False
-        self.reach: PageReach | None = None
+        self.reach: session.RunControls | None = None
+        self.recorder: PageRecorder | None = None
         self._folder, self._choices = folder, choices
         self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
         self._visitor = PageVisitor()
-        self._interrupt: Interrupt | None = None
         self._wanted: RunOptions | None = None
         self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
         page.answered_by(self)
 
     def run(
-        self,
-        panel: session.Panel | None = None,
-        feed: NamedFeed | None = None,
-        observers: Sequence[Observer] = (),
+        self, panel: session.Panel | None = None, feed: NamedFeed | None = None, observers: Sequence[Observer] = ()
     ) -> dict[str, Any]:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 
-        `feed`: a listener of these options that loads already; None: it is started here, and ended.
+        `feed`: a listener of these options that loads already.
         """
-        options = self.options
-        head = load_head(options.head)
-        knobs = turned(head, options.intensity, options.style)
-        calmness = options.calmness or Calmness()
-        watcher = PageObserver(self.page, list(head.joints))
-        self._interrupt = interrupt = Interrupt()
-        self._chosen.clear()
+        options, head = self.options, load_head(self.options.head)
+        joints, by_visitor = list(head.joints), _taken_of_visitors(options)
+        controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
         self.released = False
+        self._chosen.clear()
+        watcher.document, controls.visitor = lambda: controls.document(), self._visitor
         with ExitStack() as stack:
-            if feed is None:
-                listened = options.listener, options.seed, options.calmness, options.router, options.engine
-                feed = stack.enter_context(closing(open_feed(*listened)))
-            halt, puppet = HaltLatch(), Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out if scene else ():
                 logger.warning("%s; the page leaves it out", line)
-            facts = self._facts(head, knobs, calmness)
+            speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
+            facts = page_facts(
+                head,
+                options,
+                controls.knobs,
+                speaker if speaker in speaker_names() else None,
+                feeds=_FEEDS if self._choices else by_visitor,
+                choices=self._choices,
+            )
+            facts["people_per_minute"] = people_per_minute(options.listener)
             self.page.say("begin", scene=str(options.head), packages=options.packages, **facts)
-            recorder = PageRecorder(self.page, self._folder, list(head.joints), run_facts(head, options))
-            lonely = self._lonely(interrupt)
-            stack.callback(recorder.close)
-            self.reach = PageReach(
-                halt=halt, puppet=puppet, knobs=knobs, calmness=calmness, calm=feed.calm, record=recorder.record,
-                release=self._release,
-            )  # fmt: skip
-            stack.callback(self._ended, knobs)
+            self.recorder = PageRecorder(self.page, self._folder, joints, run_facts(head, options))
+            stack.callback(self.recorder.close)
+            self.reach = controls
+            stack.callback(self._ended)
+            lonely = EndsAlone(self.page, controls.interrupt)
+            watchers: list[Observer] = [watcher, self.recorder, *observers]
+            if by_visitor and self._choices:  # nothing else would end it
+                watchers.append(lonely)
             report = session.run(
-                options, _with_status(watcher, panel), source=self._source(stack), feed=feed,
-                observers=[watcher, recorder, *lonely, *observers], knobs=knobs,
-                overlay=puppet.overlay, interrupt=interrupt, halt=halt,
+                options, panel, feed=feed, observers=watchers, controls=controls,
                 more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
-        if report["exit"] == "interrupted" and any(each.ended for each in lonely):  # its proper end
+        if report["exit"] == "interrupted" and lonely.ended:  # its proper end
             report |= {"exit": "done", "exit_code": 0}
         if self._wanted is None:
             self.page.say("end", report=report)
@@ -178,49 +121,22 @@ class PageSession:
 
         `stay`: wait for a choice while there are visitors. Blocks until then, or until there are none for `AWAY_S`.
         """
-        alone_s = 0.0
-        while self._wanted is None and stay and self.page.visited.is_set() and alone_s < AWAY_S:
-            self._chosen.wait(_LOOK_S)
-            alone_s = 0.0 if self.page.visitors else alone_s + _LOOK_S
+        if stay and self.page.visited.is_set():
+            stay_for_visitors(self.page, self._chosen)
         if self._wanted is None:
             return False
         self.options, self._wanted = replace(self._wanted, **self._set), None
         return True
 
-    def _lonely(self, interrupt: Interrupt) -> list[EndsAlone]:
-        """Return what ends a demo of which a visitor is the person: nothing else would end it."""
-        endless = self._choices and any(_taken_of_visitors(self.options).values())
-        return [EndsAlone(self.page, interrupt)] if endless else []
-
-    def _ended(self, knobs: LiveKnobs) -> None:
+    def _ended(self) -> None:
         """Take the run out of reach, and keep what visitors turned in it."""
         reach, self.reach = self.reach, None
         assert reach is not None
         turned_to = {
-            kind: tuple(f"{name}={value}" for name, value in knobs.values[kind].items()) for kind in KNOB_KINDS
+            kind: tuple(f"{name}={value}" for name, value in values.items())
+            for kind, values in reach.knobs.values.items()
         }
         self._set = {**turned_to, "calmness": reach.calmness}
-
-    def _source(self, stack: ExitStack) -> Any:
-        """Return the source of a run whose person is a visitor; None: the run opens what its options name."""
-        options = self.options
-        if not any(_taken_of_visitors(options).values()):
-            return None
-        source = open_source(
-            options.hears, options.face, options.duration_s, agent_audio=options.agent_audio, play=options.play,
-            visitor=self._visitor,
-        )  # fmt: skip
-        return stack.enter_context(closing(source))
-
-    def _facts(self, head: Any, knobs: Any, calmness: Calmness) -> dict[str, Any]:
-        options = self.options
-        by_visitor = _taken_of_visitors(options)
-        speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
-        return page_facts(
-            head, port=options.port, listener=options.listener, seed=options.seed, calmness=calmness,
-            speaker=speaker if speaker in speaker_names() else None, people=people_per_minute(options.listener),
-            knobs=knobs, source={feed: self._choices or by for feed, by in by_visitor.items()}, choices=self._choices,
-        )  # fmt: skip
 
     # --- from visitors; in the page's thread ---
 
@@ -233,7 +149,33 @@ class PageSession:
         elif self.reach is None:
             raise InputError(f"{name}: no run is on")
         else:
-            self.reach.do(name, values)
+            self._do(self.reach, name, values)
+
+    def _do(self, run: session.RunControls, name: str, values: Mapping[str, Any]) -> None:
+        match name:
+            case "halt":
+                run.halt.close(BY_PAGE, BY_PAGE)
+            case "resume":
+                run.halt.resume(BY_PAGE)
+            case "release":
+                self.released = True
+                run.release()
+            case "neutral":
+                run.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"])
+            case "show":
+                run.puppet.show(values["channels"], values["seconds"])
+            case "expression":
+                if values["name"] not in EXPRESSIONS:
+                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(EXPRESSIONS)})")
+                run.puppet.show(EXPRESSIONS[values["name"]], values["seconds"])
+            case "look_at":
+                run.puppet.look_at(**values)
+            case "knobs":
+                run.knobs.turn(values["intensity"], values["style"])
+            case "calm":
+                run.calm(values["rates"])
+            case "record" if self.recorder is not None:
+                self.recorder.record(values["on"])
 
     def person(self, visitor: int, message: bytes) -> None:
         """Take a piece of the voice, or a face, of the visitor that is the person. Raises PacketError."""
@@ -258,27 +200,20 @@ class PageSession:
         self._want(changes[what])
 
     def _feeds(self, visitor: int, feeds: Sequence[str]) -> None:
-        takes = _taken_of_visitors(self._wanted or self.options)
-        if feeds and self._choices and not all(takes.values()):
+        taken = _taken_of_visitors(self._wanted or self.options)
+        if feeds and self._choices and len(taken) < len(_FEEDS):
             self._want({"audio": BROWSER, "face": BROWSER, "duration_s": None})
-        elif missing := [feed for feed in feeds if not takes[feed]]:
+        elif missing := [feed for feed in feeds if feed not in taken]:
             flag = "--audio" if missing[0] == "voice" else "--face"
             raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flag} {BROWSER})")
         self._visitor.came(visitor, feeds)
-
-    def _release(self) -> None:
-        self.released = True
-        if self._interrupt is not None:
-            self._interrupt.ask()
-            self._interrupt.ask()
 
     def _want(self, changes: Mapping[str, Any]) -> None:
         """Ask for another run, with these options; the present one comes to rest."""
         self._wanted = replace(self._wanted or self.options, record=None, **changes)
         self._chosen.set()
-        interrupt = self._interrupt
-        if interrupt is not None and not interrupt():
-            interrupt.ask()
+        if self.reach is not None and not self.reach.interrupt():
+            self.reach.interrupt.ask()
 
 
 class EndsAlone(Observer):
@@ -302,6 +237,13 @@ class EndsAlone(Observer):
             self._interrupt.ask()
 
 
+def stay_for_visitors(page: PageProcess, over: threading.Event) -> None:
+    """Block until `over` is set, or the page has had no visitors for `AWAY_S`."""
+    alone_s = 0.0
+    while alone_s < AWAY_S and not over.wait(_LOOK_S):
+        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+
+
 @contextmanager
 def page_session(page: PageProcess, options: RunOptions, choices: bool = False) -> Iterator[PageSession]:
     """Run behind a page whose process has begun, while inside. Blocks until the page can be opened.
@@ -314,16 +256,8 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
         yield PageSession(page, options, Path(folder), choices)
 
 
-def _taken_of_visitors(options: RunOptions) -> dict[str, bool]:
-    """Return which of voice and face a visitor brings."""
-    return {"voice": split_kind(options.hears)[0] == BROWSER, "face": split_kind(options.face)[0] == BROWSER}
-
-
-def _with_status(watcher: PageObserver, panel: session.Panel | None) -> session.Panel:
-    """Return a panel that gives the page the status document, and shows `panel` too."""
-
-    def shown(document: session.Document, interrupt: Interrupt, halt: HaltLatch, turn: Callable[[float], None]) -> Any:
-        watcher.document = document
-        return nullcontext() if panel is None else panel(document, interrupt, halt, turn)
-
-    return shown
+def _taken_of_visitors(options: RunOptions) -> list[str]:
+    """Return the feeds that a visitor brings."""
+    return [
+        feed for feed, kind in zip(_FEEDS, (options.hears, options.face), strict=True) if split_kind(kind)[0] == BROWSER
+    ]

@@ -16,7 +16,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from typing import Any, Final, TextIO
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -24,8 +25,10 @@ from rich.table import Table
 from rich.text import Text
 
 from sfms_robot.app.listen.knobs import STEP
-from sfms_robot.runtime.halt import HaltLatch, resume_here
-from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.runtime.halt import resume_here
+
+if TYPE_CHECKING:
+    from sfms_robot.app.session import RunControls
 
 try:
     import termios
@@ -58,38 +61,33 @@ _ESCAPE: Final = "\x1b"
 _LOOK_S: Final = 0.2  # between two looks at whether this program has come to the foreground
 _LOCAL, _CONTROL = 3, 6  # places in the list of `tcgetattr`
 
-Document = Callable[[], Mapping[str, Any]]
-Turn = Callable[[float], None]
-
 
 @contextmanager
-def live_panel(document: Document, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> Iterator[None]:
-    """Show the panel while inside, and restore the terminal afterwards. Main thread only.
-
-    turn: changes the intensity of all regions by so much.
-    """
+def live_panel(run: RunControls) -> Iterator[None]:
+    """Show the panel while inside, and restore the terminal afterwards. Main thread only."""
     console = Console(stderr=True)
     if not console.is_terminal or console.is_dumb_terminal:
         yield
         return
-    found = keyboard(sys.stdin)
+    single = termios is not None and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
+    found = Keyboard(sys.stdin.fileno()) if single else None
     with ExitStack() as stack:
-        screen = stack.enter_context(_drawing(console, document, interrupt, found is not None))
+        screen = stack.enter_context(_drawing(console, run, found is not None))
         stack.enter_context(_suspending(screen, found))  # before the terminal is taken, until it is given back
         if found is not None:
-            stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, interrupt, halt, turn)))
+            stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, run)))
         yield
 
 
-def _pressed(key: str, screen: _Screen, interrupt: Interrupt, halt: HaltLatch, turn: Turn) -> None:
+def _pressed(key: str, screen: _Screen, run: RunControls) -> None:
     if key in (" ", "h", _ESCAPE):
-        halt.close("key")
+        run.halt.close("key")
     elif key == "r":
-        resume_here(halt)
-    elif key == "q" and not interrupt():  # a key that is held down interrupts once, and releases nothing
-        interrupt.ask()
+        resume_here(run.halt)
+    elif key == "q" and not run.interrupt():  # a key that is held down interrupts once, and releases nothing
+        run.interrupt.ask()
     elif key in "+=-":  # "=": the key of "+", without shift
-        turn(-STEP if key == "-" else STEP)
+        run.knobs.turn_all(-STEP if key == "-" else STEP)
     elif key == "?":
         screen.help = not screen.help
     screen.look.set()
@@ -103,11 +101,11 @@ class _Screen:
         look: set to draw at once.
     """
 
-    def __init__(self, console: Console, document: Document, interrupt: Interrupt, keys: bool) -> None:
+    def __init__(self, console: Console, run: RunControls, keys: bool) -> None:
         self.help = False
         self.look = threading.Event()
         self.lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-        self._console, self._document, self._interrupt, self._keys = console, document, interrupt, keys
+        self._console, self._run, self._keys = console, run, keys
         self._live = Live(
             console=console,
             auto_refresh=False,
@@ -125,8 +123,7 @@ class _Screen:
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)
             if not in_background(self._console.file.fileno()):
                 keys = _NO_KEYS if not self._keys else _HELP if self.help else _KEYS
-                ending = self._interrupt()
-                self._live.update(view(self._document(), self._console, keys, ending))
+                self._live.update(view(self._run.document(), self._console, keys, self._run.interrupt()))
                 self._live.start()
                 self._live.refresh()
 
@@ -144,9 +141,9 @@ class _Screen:
 
 
 @contextmanager
-def _drawing(console: Console, document: Document, interrupt: Interrupt, keys: bool) -> Iterator[_Screen]:
+def _drawing(console: Console, run: RunControls, keys: bool) -> Iterator[_Screen]:
     """Draw in a thread while inside. The thread erases too: a second Ctrl-C interrupts the main thread."""
-    screen, over = _Screen(console, document, interrupt, keys), threading.Event()
+    screen, over = _Screen(console, run, keys), threading.Event()
 
     def work() -> None:
         try:
@@ -250,23 +247,22 @@ def _title(document: Mapping[str, Any], ending: bool) -> Text:
     state = "stopping" if ending else str(document["state"])
     why = ", ".join(document.get("why") or ())
     time_s, duration_s = document.get("time_s") or 0.0, document.get("duration_s")
-    clock = _clock(time_s) if duration_s is None else f"{_clock(time_s)} of {_clock(duration_s)}"
+    clock = " of ".join(str(timedelta(seconds=int(each))) for each in (time_s, duration_s) if each is not None)
     names = "  ".join(str(document[key]) for key in ("head", "listener") if key in document)
     return Text.assemble(
         (f" {state} ", _COLORS.get(state, "")), f" {why} " if why else "", f" {clock}  ", (names, "dim")
     )
 
 
-def _clock(time_s: float) -> str:
-    minutes, seconds = divmod(int(time_s), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}" if minutes >= 60 else f"{minutes}:{seconds:02d}"
-
-
 def _level(level_db: float | None, width: int, console: Console) -> str:
-    """Return a meter from -60 dB to full scale."""
-    full, empty = ("#", ".") if console.options.ascii_only else ("\u2588", "\u2591")
-    filled = 0 if level_db is None else round(width * min(1.0, max(0.0, 1.0 - level_db / _QUIET_DB)))
-    return full * filled + empty * (width - filled) + ("  no sound" if level_db is None else f" {level_db:5.0f} dB")
+    bar = level_bar(_QUIET_DB if level_db is None else level_db, width, "#." if console.options.ascii_only else "█░")
+    return bar + ("  no sound" if level_db is None else f" {level_db:5.0f} dB")
+
+
+def level_bar(level_db: float, width: int, glyphs: str) -> str:
+    """Return a meter from -60 dB to full scale; `glyphs`: of its full and its empty part."""
+    filled = round(width * min(1.0, max(0.0, 1.0 - level_db / _QUIET_DB)))
+    return glyphs[0] * filled + glyphs[1] * (width - filled)
 
 
 def _intensity(regions: Mapping[str, float]) -> str:
@@ -363,13 +359,6 @@ def in_background(fd: int) -> bool:
         return hasattr(os, "tcgetpgrp") and os.tcgetpgrp(fd) != os.getpgrp()
     except OSError:
         return False
-
-
-def keyboard(stream: TextIO | None) -> Keyboard | None:
-    """Return the keyboard of a terminal; None where `stream` is not a terminal, and on Windows."""
-    if termios is None or stream is None or stream.closed or not stream.isatty():
-        return None
-    return Keyboard(stream.fileno())
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,7 +17,7 @@ import yaml
 
 from sfms_robot import __version__
 from sfms_robot.config import Head, load_listener
-from sfms_robot.errors import INTERRUPTED, ConfigError
+from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, PortError, RobotError
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from sfms_robot.app.options import RunOptions
 
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
+# The head, its port and how the drive ended: keys of every report.
+OUTCOME: Final = ("version", "head", "port", "exit", "exit_code", "error", "torque_unconfirmed")
+_KINDS: Final = {kind.exit_code: kind for kind in (ConfigError, PortError, BusError, ModelError)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +53,12 @@ class Drove:
         return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
-def outcome(opened: OpenHead, drove: Drove) -> dict[str, Any]:
-    """Return the head, its port and the end of a drive, which begin every report."""
+def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
+    """Return version 1 of the report. In virtual time wall-clock figures are null."""
+    log = drove.log
+    heard = dict(feed.statistics())
+    timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
+    plans = _counts(timeline, ("held", "eased", "late", "refused"))
     return {
         "version": 1,
         "head": opened.config.name,
@@ -59,17 +67,6 @@ def outcome(opened: OpenHead, drove: Drove) -> dict[str, Any]:
         "exit_code": drove.exit_code,
         "error": None if drove.error is None else str(drove.error),
         "torque_unconfirmed": drove.log.torque_unconfirmed,
-    }
-
-
-def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
-    """Return version 1 of the report. In virtual time wall-clock figures are null."""
-    log = drove.log
-    heard = dict(feed.statistics())
-    timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
-    plans = _counts(timeline, ("held", "eased", "late", "refused"))
-    return {
-        **outcome(opened, drove),
         "listener": listener,
         "seed": seed,
         "duration_s": round(log.listened_s, 4),
@@ -95,6 +92,13 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
         "observers_detached": dict(log.detached),
         "priority": drove.priority,
     }
+
+
+def failure(report: Mapping[str, Any]) -> RobotError | None:
+    """Return the error that ended a run, by its report; None for a run that was not ended by one."""
+    if report["exit"] != "failed":
+        return None
+    return _KINDS.get(report["exit_code"], RobotError)(report["error"])
 
 
 def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]:
@@ -203,7 +207,16 @@ class OutletObserver:
         self._events.close()
 
     def _event(self, event: ListenerEvent) -> None:
-        sent = {"lasts_s": round(event.duration_s, 3), "size": round(event.size, 4), "swings": event.swings}
-        if event.probability is not None:
-            sent["probability"] = round(event.probability, 5)
-        self._outlet.tells("event", event.start_s, event=event.kind, **sent)
+        sent = {key: value for key, value in event_row(event).items() if value is not None}
+        self._outlet.tells("event", event.start_s, **sent)
+
+
+def event_row(event: ListenerEvent) -> dict[str, Any]:
+    """Return an event as it is sent to programs and pages, but for its time."""
+    return {
+        "event": event.kind,
+        "lasts_s": round(event.duration_s, 3),
+        "size": round(event.size, 4),
+        "swings": event.swings,
+        "probability": None if event.probability is None else round(event.probability, 5),
+    }

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from sfms_robot.app.listen.panel import level_bar
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, Floats
 from sfms_robot.signals.audio import energy_db
@@ -25,10 +26,8 @@ NOISY_DB: Final = 10.0  # speech closer to the noise than this is hard to unders
 SILENT_DB: Final = -95.0  # quieter than any room or microphone
 _NOISE_PERCENT, _SPEECH_PERCENT = 10, 95  # of the frames, by their level
 _POLL_S: Final = 0.01
-_QUIETEST_DB: Final = -60.0  # an empty meter
 _WIDTH: Final = 40
 _LOUD_DB: Final = -12.0
-_FALLS_DB_S: Final = 20.0  # of the mark at the loudest level, as meters do
 
 
 def check_sound(
@@ -98,41 +97,27 @@ def _findings(found: dict[str, Any]) -> list[str]:
 # --- a level meter on one line ----------------------------------------------------------------------------------------
 
 
-class LevelMeter:
-    """A level meter on stderr, removed at the end; nothing is shown where stderr is not a terminal."""
+@contextmanager
+def level_meter() -> Iterator[Callable[[float, bool], None]]:
+    """Show a level meter on stderr while inside, and yield the function that moves it, for `check_sound`.
 
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._loudest_db, self._since_s = _QUIETEST_DB, 0.0
-        self._clipped = False
+    Nothing is shown where stderr is not a terminal.
+    """
+    console, clipped = Console(stderr=True), False
+    live = Live(console=console, auto_refresh=False, transient=True)
 
-    def __enter__(self) -> LevelMeter:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
+    def show(level_db: float, clips: bool) -> None:
+        nonlocal clipped
+        clipped |= clips
+        if live.is_started:
+            live.update(meter_line(level_db, clipped), refresh=True)
 
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def __call__(self, level_db: float, clips: bool) -> None:
-        """Show the level of the newest frame, and whether any has clipped."""
-        now_s = time.monotonic()
-        self._loudest_db = max(level_db, self._loudest_db - _FALLS_DB_S * (now_s - self._since_s))
-        self._since_s = now_s
-        self._clipped |= clips
-        if self._live.is_started:
-            self._live.update(meter_line(level_db, self._loudest_db, self._clipped), refresh=True)
+    with live if console.is_terminal else nullcontext():
+        yield show
 
 
-def meter_line(level_db: float, loudest_db: float, clipped: bool) -> Text:
-    """Return a bar from -60 to 0 dB of full scale, a mark at the loudest level, and a note after clipping."""
-    full, mark = _cells(level_db), max(_cells(loudest_db) - 1, 0)
-    cells = ["█" if cell < full else " " for cell in range(_WIDTH)]
-    cells[mark] = "│" if mark >= full else cells[mark]
+def meter_line(level_db: float, clipped: bool) -> Text:
+    """Return a bar from -60 to 0 dB of full scale, and a note after clipping."""
     colour = "red" if clipped else "yellow" if level_db > _LOUD_DB else "green"
-    return Text.assemble(("".join(cells), colour), f" {level_db:6.1f} dBFS", (" clips" if clipped else "", "bold red"))
-
-
-def _cells(level_db: float) -> int:
-    return round(_WIDTH * min(max(1.0 - level_db / _QUIETEST_DB, 0.0), 1.0))
+    bar = level_bar(level_db, _WIDTH, "█ ")
+    return Text.assemble((bar, colour), f" {level_db:6.1f} dBFS", (" clips" if clipped else "", "bold red"))

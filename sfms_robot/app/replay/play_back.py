@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,24 +17,19 @@ import numpy as np
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
-from sfms_robot.app.listen.report import figures_so_far, outcome
-from sfms_robot.app.open_head import open_head
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.listen.page_session import stay_for_visitors
+from sfms_robot.app.listen.report import OUTCOME
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
-from sfms_robot.app.session import Panel, run_log
-from sfms_robot.config import Calmness, load_head
+from sfms_robot.app.session import Panel
+from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
-from sfms_robot.runtime.halt import HaltLatch, halt_signals
-from sfms_robot.runtime.observers import RunStatus
-from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-LEFT_S: Final = 5.0  # without a visitor, after which the page ends
-_LOOK_S: Final = 0.5
 FAULTY: Final = "faulty"  # the name of every fault: a recording has only whether there was one
 
 
@@ -63,30 +57,14 @@ def play_back(
     head = head or recording.about.get("head")
     if head is None:
         raise ConfigError(f"{folder}: does not say which head it is of: --head NAME or DIR")
-    interrupt, halt = Interrupt(), HaltLatch()
-    servos = HeadOptions(head=head, port=port, fast=fast, yes=yes)
-    with signals_to(interrupt), halt_signals(halt), open_head(servos) as opened:
-        log, knobs = run_log(opened), turned(opened.config)
-
-        def figures() -> dict[str, Any]:
-            intensity = knobs.values["intensity"]
-            return {**figures_so_far(log, opened.rate_hz, real=not fast), "intensity": intensity}
-
-        facts = {"head": opened.config.name, "listener": "recorded", "duration_s": recording.listened_s}
-        status = RunStatus(list(opened.config.joints), facts, figures)
-        face = recorded_face(recording)
-        with panel(status.document, interrupt, halt, knobs.turn_all) if panel is not None else nullcontext():
-            drove = face.play(opened, status, interrupt, signals=False, log=log, knobs=lambda: knobs.now, halt=halt)
-            status.ended(log.states[-1][1])
+    options = HeadOptions(head=head, port=port, fast=fast, yes=yes)
+    report = recorded_face(recording).play(options, panel, listener="recorded")
     return {
-        **outcome(opened, drove),
+        **{key: report[key] for key in (*OUTCOME, "ticks", "motion", "joints")},
         "recorded_s": round(recording.listened_s, 3),
-        "duration_s": round(log.listened_s, 3),
+        "duration_s": round(report["duration_s"], 3),
         "whole": recording.whole,
-        "ticks": log.ticks,
-        "limits": {"violations": log.audited.violations if log.audited else 0},
-        "motion": log.motion_report(),
-        "joints": log.joint_report(),
+        "limits": {"violations": report["limits"]["violations"]},
     }
 
 
@@ -108,12 +86,9 @@ def show_recording(folder: Path, page: PageProcess) -> None:
 
 
 def wait_for_visitors(page: PageProcess) -> None:
-    """Block until a visitor has come, and all have been away for `LEFT_S`. Ctrl-C ends it."""
-    alone_s, pause = 0.0, threading.Event()
+    """Block until a visitor has come, and all have been away for some seconds. Ctrl-C ends it."""
     page.visited.wait()
-    while alone_s < LEFT_S:
-        pause.wait(_LOOK_S)
-        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+    stay_for_visitors(page, threading.Event())
 
 
 def pictures(recording: RunRecording) -> Iterator[bytes]:
@@ -146,16 +121,6 @@ def _facts(recording: RunRecording) -> dict[str, Any]:
     if tuple(head.joints) != recording.joints:
         raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
     speaker = about.get("audio")
-    facts = page_facts(
-        head,
-        port=about["port"],
-        listener=about["listener"],
-        seed=int(about["seed"]),
-        speaker=DEFAULT_SPEAKER if speaker == "default" else speaker,
-        calmness=Calmness(),
-        people={},
-        knobs=turned(head),
-        source={"voice": False, "face": False},
-        choices=False,
-    )
+    options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
+    facts = page_facts(head, options, turned(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
     return facts | {"replay": True}

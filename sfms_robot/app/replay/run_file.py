@@ -6,7 +6,6 @@ import base64
 import json
 import math
 import struct
-from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,9 @@ from sfms_robot.runtime.recorder import RUN_FILE, parts_of
 
 _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
 _FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
+_FRAME_BYTES = 2 * FRAME_SAMPLES
+
+_Rows = defaultdict[str, list[Any]]  # by topic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +44,10 @@ class RunRecording:
         faults: (N, J) a named fault is there.
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
         agent_audio: (M * 640,) voice of the head itself, sample by sample beside `audio`; None where the recording has
-            none, as those of version 0.1.
+            none.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen. speaker_jaw_rad: (M, 3) NaN where no jaw was.
         plans: how many the listener made.
-        states: (time_s, name, why) of every change, in order; none in a file of version 0.1.
+        states: (time_s, name, why) of every change, in order.
         events: (start_s, kind) of the nods, blinks and smiles that plans held.
         servos_s: (K,) times of the other readings. servos: (K, J) by name, such as temperature_C; NaN if not reported.
         whole: the file has its end.
@@ -121,29 +123,27 @@ def read_recording(folder: Path | str) -> RunRecording:
     if not parts:
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
         raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
-    found, file = _Found(), parts[0]
+    about: Mapping[str, str] = {}
+    joints: tuple[str, ...] = ()
+    rows, whole = _Rows(list), False
     try:
         for file in parts:
-            for kind, value in _records(file):
-                found.take(kind, value)
-    except (EndOfFile, struct.error) as error:
-        if not found.ticks:
-            raise ConfigError(f"{file}: holds no tick: the file is cut off") from error
+            for topic, body in _records(file):
+                if topic == "about":  # at the beginning of every part
+                    about, joints, whole = about or body, tuple(json.loads(body["joints"])), False
+                elif topic == "end":
+                    whole = True
+                else:
+                    rows[topic].append(_row(topic, body, joints))
+    except (EndOfFile, struct.error):
+        whole = False  # it was cut off
     except McapError as error:
         raise ConfigError(f"{file}: not a recorded run: {error}") from error
     except Exception as error:  # a broken chunk: each compressor has errors of its own
         raise ConfigError(f"{file}: damaged: {error}") from error
-    if not found.ticks:
-        raise ConfigError(
-            f"{file}: holds no tick: " + ("the run never began" if found.whole else "the file is cut off")
-        )
-    return found.recording()
-
-
-def states_of(folder: Path) -> list[tuple[float, str, tuple[str, ...]]]:
-    """Return (time_s, name, why) of every change of state in a recorded run."""
-    records = (each for file in parts_of(folder) for each in _records(file))
-    return [_state(value) for kind, value in records if kind == "/state"]
+    if not rows["/face"] or not rows["/joints"]:
+        raise ConfigError(f"{file}: holds no tick: " + ("the run never began" if whole else "the file is cut off"))
+    return _arrays(rows, about, joints, whole)
 
 
 def summary(recording: RunRecording) -> dict[str, Any]:
@@ -183,123 +183,81 @@ def _records(file: Path) -> Iterator[tuple[str, Any]]:
                 yield "end", None
 
 
-class _Found:
-    """The values read so far, as flat arrays by name: messages take twenty times as much memory."""
+def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
+    """Return what is kept of a message: numbers in arrays, since messages take twenty times as much memory.
 
-    def __init__(self) -> None:
-        self.about: dict[str, str] = {}
-        self.whole = False
-        self._joints: tuple[str, ...] = ()
-        self._plans = 0
-        self._doubles: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
-        self._floats: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
-        self._servos: dict[str, array[float]] = {}
-        self._faults, self._pcm16, self._agent_pcm16 = bytearray(), bytearray(), bytearray(2 * FRAME_SAMPLES)
-        self._speaks = False
-        self._states: list[tuple[float, str, tuple[str, ...]]] = []
-        self._events: list[tuple[float, str]] = []
-
-    @property
-    def ticks(self) -> int:
-        """Number of whole ticks: a cut may fall between the face and the joints of one."""
-        return min(len(self._doubles["times_s"]), len(self._floats["motion"]) // MOTION_DIM)
-
-    def take(self, kind: str, value: Any) -> None:
-        """Add one record of `_records`."""
-        if kind == "about":  # at the beginning of every part
-            self.about, self.whole = self.about or value, False
-            self._joints = tuple(json.loads(value["joints"]))
-        elif kind == "end":
-            self.whole = True
-        elif kind == "/plan":
-            self._plans += 1
-        elif kind == "/face":
-            self._floats["motion"].extend(_by_channel(value))
-        elif kind == "/joints":
-            joints = [value["joints"][name] for name in self._joints]
-            self._doubles["times_s"].append(value["time_s"])
-            self._floats["goals_rad"].extend(joint["goal_rad"] for joint in joints)
-            self._floats["present_rad"].extend(_read_rad(joint) for joint in joints)
-            self._faults += bytes(joint["fault"] is not None for joint in joints)
-        elif kind == "/speaker":
-            for name in ("time_s", "energy_db"):
-                self._doubles[name].append(value[name])
-            self._floats["speaker"].extend(_by_channel(value["face"]))
-            self._floats["jaw_rad"].extend(value.get("jaw_rad") or [math.nan] * 3)  # no key before version 0.2
-            said = value.get("agent_audio_pcm16")
-            self._speaks |= said is not None
-            self._pcm16 += _samples(value["audio_pcm16"])
-            self._agent_pcm16 += _samples(said or "")
-        elif kind == "/state":
-            self._states.append(_state(value))
-        elif kind == "/event":
-            self._events.append((value["start_s"], value["kind"]))
-        elif kind == "/servos":
-            self._take_servos(value["time_s"], value["servos"])
-
-    def _take_servos(self, time_s: float, servos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add a row of J for every name that any servo has reported, NaN before its first value."""
-        before = len(self._doubles["servos_s"]) * len(self._joints)
-        for name in {name for reported in servos.values() for name in reported} - {"fault", *self._servos}:
-            self._servos[name] = array("f", [math.nan] * before)
-        for name, values in self._servos.items():
-            values.extend(_or_nan(servos.get(joint, {}).get(name)) for joint in self._joints)
-        self._doubles["servos_s"].append(time_s)
-
-    def recording(self) -> RunRecording:
-        """Return all that was read."""
-        count, ticks = len(self._joints), self.ticks
-        times = {name: np.array(self._doubles[name]) for name in ("times_s", "time_s", "energy_db", "servos_s")}
-
-        def rows(values: array[float], width: int) -> Floats:
-            return np.array(values, dtype=np.float32).reshape(-1, width)
-
-        return RunRecording(
-            about=self.about,
-            joints=self._joints,
-            times_s=times["times_s"][:ticks],
-            motion=rows(self._floats["motion"], MOTION_DIM)[:ticks],
-            goals_rad=rows(self._floats["goals_rad"], count)[:ticks],
-            present_rad=rows(self._floats["present_rad"], count)[:ticks],
-            faults=np.frombuffer(self._faults, dtype=np.bool_).reshape(-1, count)[:ticks],
-            heard_s=times["time_s"],
-            audio=_sound(self._pcm16),
-            # A frame holds the robot's sound after it: the sound of the frame itself is in the one before.
-            agent_audio=_sound(self._agent_pcm16)[: len(times["time_s"]) * FRAME_SAMPLES] if self._speaks else None,
-            energy_db=times["energy_db"],
-            speaker=rows(self._floats["speaker"], MOTION_DIM),
-            speaker_jaw_rad=rows(self._floats["jaw_rad"], 3),
-            plans=self._plans,
-            states=self._states,
-            events=self._events,
-            servos_s=times["servos_s"],
-            servos={name: rows(values, count) for name, values in self._servos.items()},
-            whole=self.whole,
-        )
+    None becomes NaN.
+    """
+    match topic:
+        case "/face":
+            return _by_channel(body)
+        case "/joints":  # (J, 4): goal, position, its age, fault
+            servos = [body["joints"][name] for name in joints]
+            return body["time_s"], np.array(
+                [(each["goal_rad"], each["present_rad"], each["age_s"], each["fault"] is not None) for each in servos],
+                np.float32,
+            )
+        case "/speaker":
+            jaw_rad = np.array(body["jaw_rad"] or [None] * 3, np.float32)
+            sound, said = (body[key] and _pcm16(body[key]) for key in ("audio_pcm16", "agent_audio_pcm16"))
+            return body["time_s"], body["energy_db"], _by_channel(body["face"]), jaw_rad, sound, said
+        case "/state":
+            return body["time_s"], body["state"], tuple(body["why"])
+        case "/event":
+            return body["start_s"], body["kind"]
+        case "/servos":
+            return body
+    return None  # a plan: only counted
 
 
-def _state(value: Mapping[str, Any]) -> tuple[float, str, tuple[str, ...]]:
-    return value["time_s"], value["state"], tuple(value["why"])
+def _arrays(rows: _Rows, about: Mapping[str, str], joints: tuple[str, ...], whole: bool) -> RunRecording:
+    """Return the rows of each topic as a recording. A cut may fall between the face and the joints of one tick."""
+    times_s, moved = zip(*rows["/joints"][: len(rows["/face"])], strict=True)
+    goals_rad, present_rad, ages_s, faults = np.moveaxis(np.stack(moved), 2, 0)
+    present_rad[ages_s > AWAY_S] = math.nan
+    heard_s, energy_db, faces, jaws_rad, sound, said = (
+        zip(*rows["/speaker"], strict=True) if rows["/speaker"] else [()] * 6
+    )
+    servos = rows["/servos"]
+    names = {name for body in servos for reported in body["servos"].values() for name in reported} - {"fault"}
+    return RunRecording(
+        about=about,
+        joints=joints,
+        times_s=np.array(times_s),
+        motion=np.stack(rows["/face"][: len(times_s)]),
+        goals_rad=goals_rad,
+        present_rad=present_rad,
+        faults=faults != 0,
+        heard_s=np.array(heard_s),
+        audio=_sound(sound),
+        # A frame holds the robot's sound after it: the sound of the frame itself is in the one before.
+        agent_audio=_sound([None, *said[:-1]]) if any(said) else None,
+        energy_db=np.array(energy_db),
+        speaker=np.array(faces, np.float32).reshape(-1, MOTION_DIM),
+        speaker_jaw_rad=np.array(jaws_rad, np.float32).reshape(-1, 3),
+        plans=len(rows["/plan"]),
+        states=rows["/state"],
+        events=rows["/event"],
+        servos_s=np.array([body["time_s"] for body in servos]),
+        servos={
+            name: np.array(
+                [[body["servos"].get(joint, {}).get(name) for joint in joints] for body in servos], np.float32
+            )
+            for name in names
+        },
+        whole=whole,
+    )
 
 
-def _by_channel(body: Mapping[str, float | None] | None) -> list[float]:
-    return [math.nan if body is None else _or_nan(body[name]) for name in CHANNELS]
+def _by_channel(body: Mapping[str, float | None] | None) -> Floats:
+    return np.array([(body or {}).get(name) for name in CHANNELS], np.float32)
 
 
-def _read_rad(joint: Mapping[str, Any]) -> float:
-    """Return a position, NaN where it is so old that the servo counts as away."""
-    return math.nan if (joint.get("age_s") or 0.0) > AWAY_S else _or_nan(joint["present_rad"])
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _samples(pcm16: str) -> bytes:
+def _pcm16(text: str) -> bytes:
     """Return the samples of one frame, always 640 of them, so that they stay in step with the clock."""
-    size = 2 * FRAME_SAMPLES
-    return base64.b64decode(pcm16)[:size].ljust(size, b"\0")
+    return base64.b64decode(text)[:_FRAME_BYTES].ljust(_FRAME_BYTES, b"\0")
 
 
-def _sound(pcm16: bytearray) -> Floats:
-    return np.frombuffer(pcm16, dtype="<i2").astype(np.float32) / np.float32(32767)
+def _sound(frames: Sequence[bytes | None]) -> Floats:
+    pcm16 = b"".join(frame or bytes(_FRAME_BYTES) for frame in frames)
+    return np.frombuffer(pcm16, "<i2").astype(np.float32) / np.float32(32767)

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -38,31 +38,30 @@ if TYPE_CHECKING:
 
 FIGURES_LIMIT_S: Final = 2.0  # for the figures of a process; later, its last ones count
 CLOSE_LIMIT_S: Final = 1.0
-_MS: Final = 1e-3
 
 Send = Callable[[str, bytes], None]
 Reply = Callable[[bytes], None]
 
 log = logging.getLogger(__name__)
 
-# Name, kind, what it says, where in the statistics of `StreamServer`, and the factor to the unit of the name.
-_FIGURES: Final[tuple[tuple[str, str, str, tuple[str, ...], float], ...]] = (
-    ("heads", "gauge", "Heads that are listened for", ("heads",), 1.0),
-    ("heads_most", "gauge", "Heads that could be answered in time", ("most_heads",), 1.0),
-    ("plans", "counter", "Plans made", ("plans",), 1.0),
-    ("deadline_misses", "counter", "Plans later than the deadline", ("deadline_misses",), 1.0),
-    ("deadline_seconds", "gauge", "Promised from a frame to its plan", ("deadline_ms",), _MS),
-    ("plan_delay_p50_seconds", "gauge", "Median from a frame to its plan, of the last plans", ("delay_ms", "p50"), _MS),
-    ("plan_delay_p99_seconds", "gauge", "99th percentile of the same", ("delay_ms", "p99"), _MS),
-    ("batches", "counter", "Batches stepped", ("batches",), 1.0),
-    ("steps", "counter", "Frames stepped, over all heads", ("steps",), 1.0),
-    ("batch_size_p50", "gauge", "Median of the heads in a batch", ("batch_size", "p50"), 1.0),
-    ("batch_size_p99", "gauge", "99th percentile of the same", ("batch_size", "p99"), 1.0),
-    ("frames_skipped", "counter", "Frames left out, since too many were waiting", ("skipped_frames",), 1.0),
-    ("frames_lost", "counter", "Frames that never came", ("lost_frames",), 1.0),
-    ("refused", "counter", "Robots that were refused", ("refused",), 1.0),
-    ("malformed", "counter", "Messages that could not be read", ("malformed",), 1.0),
-    ("cost_scale", "gauge", "How much longer batches take than measured at the start", ("cost_scale",), 1.0),
+# Name, kind, what it says, where in the statistics of `StreamServer`; those in seconds are in milliseconds there.
+_FIGURES: Final = (
+    ("heads", "gauge", "Heads that are listened for", "heads"),
+    ("heads_most", "gauge", "Heads that could be answered in time", "most_heads"),
+    ("plans", "counter", "Plans made", "plans"),
+    ("deadline_misses", "counter", "Plans later than the deadline", "deadline_misses"),
+    ("deadline_seconds", "gauge", "Promised from a frame to its plan", "deadline_ms"),
+    ("plan_delay_p50_seconds", "gauge", "Median from a frame to its plan, of the last plans", "delay_ms.p50"),
+    ("plan_delay_p99_seconds", "gauge", "99th percentile of the same", "delay_ms.p99"),
+    ("batches", "counter", "Batches stepped", "batches"),
+    ("steps", "counter", "Frames stepped, over all heads", "steps"),
+    ("batch_size_p50", "gauge", "Median of the heads in a batch", "batch_size.p50"),
+    ("batch_size_p99", "gauge", "99th percentile of the same", "batch_size.p99"),
+    ("frames_skipped", "counter", "Frames left out, since too many were waiting", "skipped_frames"),
+    ("frames_lost", "counter", "Frames that never came", "lost_frames"),
+    ("refused", "counter", "Robots that were refused", "refused"),
+    ("malformed", "counter", "Messages that could not be read", "malformed"),
+    ("cost_scale", "gauge", "How much longer batches take than measured at the start", "cost_scale"),
 )
 
 
@@ -124,8 +123,8 @@ class WorkerPool:
             serving = [each for each in self._workers if each.capacity is not None]
             if not serving:
                 return
-            known = [each for each in serving if client in each.clients_to_be]
-            worker = min(known or serving, key=lambda each: len(each.clients_to_be))
+            known = [each for each in serving if client in each.clients_to_be()]
+            worker = min(known or serving, key=lambda each: len(each.clients_to_be()))
             number = next(self._numbers)
             worker.requests[number] = (client, reply)
         worker.child.send((None, message, number))
@@ -156,8 +155,9 @@ class WorkerPool:
 
     def _take(self, worker: _Worker, message: Any) -> None:
         """Handle a message of a process, in the thread that reads it."""
-        said: tuple[str, Any] = ("ended", message.code) if isinstance(message, Ended) else message
-        kind, value = said
+        kind: str
+        value: Any
+        kind, value = ("ended", message.code) if isinstance(message, Ended) else message
         if kind == "send":
             for stream, plan in value:
                 self._send(stream, plan)
@@ -212,7 +212,6 @@ class _Worker:
         self.figures: Figures | None = None
         self.child = Child("sfms_robot.app.serve.batch_process:main", served, name="serve", take=partial(take, self))
 
-    @property
     def clients_to_be(self) -> set[str | None]:
         """Return the clients that it has, or will have."""
         return {*self.clients.values(), *(client for client, _ in self.requests.values())}
@@ -225,49 +224,6 @@ def _client(message: bytes) -> str | None:
     except PacketError:
         return None
     return words.client if isinstance(words, Join) else None
-
-
-class ZenohService:
-    """A `WorkerPool` on zenoh's keys. Serves from construction, which blocks for some seconds, until `close`.
-
-    Raises PortError, and as `WorkerPool`.
-    """
-
-    def __init__(self, served: Served, config: zenoh.Config, processes: int | None) -> None:
-        self._name = served.name
-        self._session = serve_session(config)
-        try:
-            self.pool = WorkerPool(served, self._publish, processes)
-        except BaseException:
-            close_session(self._session)
-            raise
-        self._session.declare_queryable(join_key(self._name), self._on_join)
-        self._session.declare_subscriber(f"{ROOT}/{self._name}/*/up", self._on_frame)
-
-    def close(self) -> None:
-        """End the processes and close the session. Idempotent."""
-        self.pool.close()
-        close_session(self._session)
-
-    def _on_join(self, query: zenoh.Query) -> None:
-        payload = query.payload
-        if payload is not None:
-            self.pool.join(payload.to_bytes(), lambda answer: query.reply(join_key(self._name), answer))
-
-    def _on_frame(self, sample: zenoh.Sample) -> None:
-        stream = str(sample.key_expr).split("/")[-2]
-        self.pool.receive(stream, sample.payload.to_bytes())
-
-    def _publish(self, stream: str, message: bytes) -> None:
-        import zenoh
-
-        self._session.put(
-            down_key(self._name, stream),
-            message,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-        )
 
 
 def serve(
@@ -296,14 +252,32 @@ def serve(
     from sfms_robot.runtime.observers import ServiceManager
 
     check_zenoh()
+    import zenoh
+
     name = check_name(served.name, "listener")
     config = session_config("serve", Router(router, insecure))
     service_manager = ServiceManager()
     with ExitStack() as stack:
         figures = None if metrics is None else stack.enter_context(closing(metrics_server(metrics)))
-        service = ZenohService(served, config, processes)
-        stack.callback(service.close)
-        pool = service.pool
+        session = serve_session(config)
+        stack.callback(close_session, session)
+        now: dict[str, Any] = {
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "priority": zenoh.Priority.REAL_TIME,
+            "express": True,
+        }
+        pool = WorkerPool(served, lambda to, message: session.put(down_key(name, to), message, **now), processes)
+        stack.callback(pool.close)
+
+        def join(query: zenoh.Query) -> None:
+            if query.payload is not None:
+                pool.join(query.payload.to_bytes(), lambda answer: query.reply(join_key(name), answer))
+
+        def receive(sample: zenoh.Sample) -> None:
+            pool.receive(str(sample.key_expr).split("/")[-2], sample.payload.to_bytes())
+
+        session.declare_queryable(join_key(name), join)
+        session.declare_subscriber(f"{ROOT}/{name}/*/up", receive)
         if figures is not None:
             figures.begin(pool.statistics)
             say(f"metrics: {figures.url}")
@@ -363,14 +337,12 @@ class _Collector:
         """Yield one metric for each figure that the statistics hold now."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        told = self._statistics()
-        for name, kind, text, keys, factor in _FIGURES:
-            value: Any = told
-            for key in keys:
-                value = value[key]
-            if value is None:
-                continue
-            family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
-            metric = family(f"sfms_{name}", text, labels=["listener", "server"])
-            metric.add_metric([told["listener"], told["server"]], float(value) * factor)
-            yield metric
+        statistics = self._statistics()
+        for name, kind, text, place in _FIGURES:
+            value: Any = reduce(lambda found, key: found[key], place.split("."), statistics)
+            if value is not None:
+                family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
+                metric = family(f"sfms_{name}", text, labels=["listener", "server"])
+                factor = 1e-3 if name.endswith("_seconds") else 1.0
+                metric.add_metric([statistics["listener"], statistics["server"]], float(value) * factor)
+                yield metric

@@ -6,8 +6,10 @@ good to know or is corrected by the run itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from itertools import chain
 from shlex import quote
 from typing import Any, Final, Literal, cast
 
@@ -16,6 +18,7 @@ from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
+from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.policy import counts
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
@@ -23,6 +26,7 @@ from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradi
 Severity = Literal["error", "warning", "note"]
 
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
+DEFAULT_RATE_HZ: Final = 100.0
 FAST_ENOUGH_MS: Final = 1
 _ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
 _POLOLU: Final = "1ffb"
@@ -79,26 +83,50 @@ class Wanted:
         return not counts(fault, self.faults, measured)
 
 
-@dataclass(frozen=True)
-class Command:
-    """Commands that can be pasted. `port`: of one bus; `ports`: of the whole head, where it has several."""
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """One port to look at, and what is expected on it.
 
-    port: str
+    Attributes:
+        shown: Its name in commands.
+        ports: The ports of the whole head, as `--port` named them.
+    """
+
+    device: str
+    shown: str
     family: str
+    baud: int | None = None
+    rate_hz: float = DEFAULT_RATE_HZ
+    wanted: dict[int, Wanted] = field(default_factory=dict)
+    bus: str | None = None
     head: str | None = None
     ports: str | None = None
+    crc: bool = False
+
+    @property
+    def first_baud(self) -> int:
+        return self.baud or servo_families()[self.family].bauds[0]
+
+    @property
+    def is_terminal(self) -> bool:
+        """It is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
+        return os.path.realpath(self.device).startswith("/dev/pts/")
 
     @property
     def fix(self) -> str:
         """The command that mends stored values against the head's file."""
-        return f"sfms-robot doctor --port {self.ports or self.port}{self._of_head or self._of_family} --fix"
+        return f"sfms-robot doctor --port {self.ports or self.shown}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         """Return a `servo` command for this port."""
         rate = f" --baud {baud}" if baud is not None else ""
         # Which emulated servos there are, and at what rate, is their head's to say.
-        which = self._of_head if self.port == SIM and self.head else f"{rate}{self._of_family}"
-        return f"sfms-robot servo {words} --port {self.port}{which}"
+        which = self._of_head if self.shown == SIM and self.head else f"{rate}{self._of_family}"
+        return f"sfms-robot servo {words} --port {self.shown}{which}"
+
+    def name(self, servo: int) -> str:
+        """Return a servo with its joint, for people."""
+        return f"id {servo} ({self.wanted[servo].joint})" if servo in self.wanted else f"id {servo}"
 
     @property
     def _of_head(self) -> str:
@@ -112,17 +140,15 @@ class Command:
 # --- the port ---------------------------------------------------------------------------------------------------
 
 
-def judge_port(path: str, problem: str | None, group: str, ports: Sequence[SerialDevice]) -> Iterator[Finding]:
-    """Yield the problem of a path that cannot be opened as a port."""
-    if problem is None:
-        return
+def judge_port(path: str, problem: str, group: str, ports: Sequence[SerialDevice]) -> Finding:
+    """Return the problem of a path that cannot be opened as a port, with its cure."""
     there = ", ".join(each.by_id or each.path for each in ports)
     fix = f"use one of: {there}" if there else "plug the adapter in; `dmesg | tail` says whether it was recognised"
     if is_address(path):
         fix = "correct --port"
     elif "permission" in problem:
         fix = f"sudo usermod -aG {group} $USER, then log out and in again"
-    yield Finding("error", path, problem, fix)
+    return Finding("error", path, problem, fix)
 
 
 def judge_opening(path: str, failure: str, held_by: Sequence[Holder]) -> Iterator[Finding]:
@@ -172,12 +198,7 @@ def udev_rule(device: SerialDevice) -> str | None:
 
 
 def judge_presence(
-    wanted: Mapping[int, Wanted],
-    here: Mapping[int, FoundServo],
-    elsewhere: Mapping[int, FoundServo],
-    baud: int,
-    command: Command,
-    hint: str = "",
+    line: Line, here: Mapping[int, FoundServo], elsewhere: Mapping[int, FoundServo], baud: int, hint: str = ""
 ) -> Iterator[Finding]:
     """Yield ids of the head that are silent, at another rate, or of another model; and ids that the head does not name.
 
@@ -186,29 +207,30 @@ def judge_presence(
         elsewhere: Servos that answer at another one.
         hint: The protocol to which servos answer instead.
     """
-    if wanted and not here and not elsewhere:
-        problem = f"no answer at any rate: none of {len(wanted)} servos{f'; {hint}' if hint else ''}"
+    if line.wanted and not here and not elsewhere:
+        problem = f"no answer at any rate: none of {len(line.wanted)} servos{f'; {hint}' if hint else ''}"
         yield Finding("error", "bus", problem, "check power, cable, data direction of the adapter, and --port")
         return
-    for servo, want in wanted.items():
-        about, seen = _name(servo, want), here.get(servo)
-        if seen is not None:
+    for servo, want in line.wanted.items():
+        problem, fix = "", ""
+        if (seen := here.get(servo)) is not None:
             if want.model_number is not None and seen.model_number not in (None, want.model_number):
                 said = f"the head says {want.model} ({want.model_number})"
+                problem = f"{seen.model} ({seen.model_number}) answers, {said}"
                 fix = "two cables swapped, or the head's file names the wrong model or id"
-                yield Finding("error", about, f"{seen.model} ({seen.model_number}) answers, {said}", fix, servo=servo)
         elif servo in elsewhere:
             rate = elsewhere[servo].baud
-            fix = command.servo(f"set-baud {{id}} {baud}", rate)
-            yield Finding("error", about, f"set to {rate} baud, the head says {baud}", fix, servo=servo)
+            problem = f"set to {rate} baud, the head says {baud}"
+            fix = line.servo(f"set-baud {{id}} {baud}", rate)
         else:
-            look, change = command.servo("scan"), command.servo("set-id OLD NEW")
-            fix = f"check its cable; if it has another id: {look}, then {change}"
-            yield Finding("error", about, "no answer, at any rate", fix, servo=servo)
+            problem, look = "no answer, at any rate", line.servo("scan")
+            fix = f"check its cable; if it has another id: {look}, then {line.servo('set-id OLD NEW')}"
+        if problem:
+            yield Finding("error", line.name(servo), problem, fix, servo=servo)
     for servo, seen in sorted({**elsewhere, **here}.items()):
-        if wanted and servo not in wanted:
+        if line.wanted and servo not in line.wanted:
             problem = f"{seen.model} at {seen.baud} baud is not in the head's file"
-            yield Finding("warning", f"id {servo}", problem, servo=servo)
+            yield Finding("warning", line.name(servo), problem, servo=servo)
 
 
 def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
@@ -224,46 +246,36 @@ def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
 Judged = Iterator[tuple[Severity, str, str]]  # severity, problem, fix
 
 
-def judge_servo(state: ServoState, want: Wanted | None, command: Command) -> Iterator[Finding]:
+def judge_servo(state: ServoState, line: Line) -> Iterator[Finding]:
     """Yield the problems of settings and health of a servo whose registers were read."""
-    seen, table = state.seen, state.seen.table
-    about = _name(seen.id, want)
-    if table is None:
-        yield Finding("error" if want else "warning", about, f"model {seen.model} has no firmware map", servo=seen.id)
-        return
-    for judged in (
-        _firmware(seen, table),
-        _faults(state, table, want, command),
-        _measured(state, want),
-        _settings(state, table, command),
-        _stored(state, want, command),
-    ):
-        for severity, problem, fix in judged:
-            yield Finding(severity, about, problem, fix, servo=seen.id)
+    seen, want = state.seen, line.wanted.get(state.seen.id)
+    judged: Judged = iter([("error" if want else "warning", f"model {seen.model} has no firmware map", "")])
+    if seen.table is not None:
+        judged = chain(_health(state, seen.table, want, line), _stored(state, seen.table, want, line))
+    for severity, problem, fix in judged:
+        yield Finding(severity, line.name(seen.id), problem, fix, servo=seen.id)
 
 
-def _firmware(seen: FoundServo, table: Table) -> Judged:
-    first, last = table.firmware
+def _health(state: ServoState, table: Table, want: Wanted | None, line: Line) -> Judged:
+    """Yield what a servo's firmware, faults, supply and temperature say."""
+    seen, (first, last) = state.seen, table.firmware
     if seen.firmware and not first <= seen.firmware <= last and table.family == "dynamixel":
         problem = f"firmware {seen.firmware} has no map of its own, that of {first}..{last} is used"
         yield "warning", problem, "update it with ROBOTIS' DYNAMIXEL Wizard"
     if seen.firmware is not None and table.watchdog == "flags_only":
         why = "its bus watchdog does not stop the motor if the computer dies"
         yield "note", f"firmware {seen.firmware} of {seen.model}: {why}", ""
-
-
-def _faults(state: ServoState, table: Table, want: Wanted | None, command: Command) -> Judged:
     names = [name for name in state.faults().split(", ") if name]
     masked = [name for name in names if want and want.lives_with(name, state)]
     if masked:
         yield "note", f"{', '.join(masked)}: the head's file says to live with it", ""
     if named := ", ".join(name for name in names if name not in masked):
         power = "remove the cause, then switch its supply off and on"
-        fix = command.servo("reboot {id}", state.seen.baud) if table.protocol == 2 else power
-        yield "error", f"hardware error: {named}", fix
-
-
-def _measured(state: ServoState, want: Wanted | None) -> Judged:
+        yield (
+            "error",
+            f"hardware error: {named}",
+            line.servo("reboot {id}", seen.baud) if table.protocol == 2 else power,
+        )
     volt, low, high = (state.in_unit(name) for name in ("voltage", "min_voltage_limit", "max_voltage_limit"))
     tolerated = want is not None and want.lives_with("input voltage", state)
     if volt is not None and low is not None and high is not None and not (low <= volt <= high or tolerated):
@@ -274,32 +286,32 @@ def _measured(state: ServoState, want: Wanted | None) -> Judged:
         yield "warning", f"{warm:.0f} degC, it switches off at {limit:.0f}", "let it cool down"
 
 
-def _settings(state: ServoState, table: Table, command: Command) -> Judged:
+def _stored(state: ServoState, table: Table, want: Wanted | None, line: Line) -> Judged:
+    """Yield settings that slow a bus down, and stored values that are not what the joint needs.
+
+    Without a head, values are compared with one another.
+    """
+    seen, severities = state.seen, {"refused": "error", "set": "note", "told": "warning"}
     delay, level = table.role("return_delay"), table.role("status_level")
     if delay is not None and (waits := state.in_unit("return_delay")):
-        fix = command.servo(f"write {{id}} {delay.name} 0", state.seen.baud)
+        fix = line.servo(f"write {{id}} {delay.name} 0", seen.baud)
         yield "note", f"return delay of {waits:.0f} us before every answer (a run sets it to 0)", fix
     if level is not None and (now := state.value("status_level")) is not None and now < 1:
-        fix = command.servo(f"write {{id}} {level.name} {level.high}", state.seen.baud)
+        fix = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud)
         yield "warning", f"status return level {now}: answers pings only", fix
     if state.torque():
         yield "note", "torque is on", ""
-
-
-def _stored(state: ServoState, want: Wanted | None, command: Command) -> Judged:
-    """Yield each stored value that is not what its joint needs; without a head, against itself."""
-    seen, severities = state.seen, {"refused": "error", "set": "note", "told": "warning"}
     for each in stored_contradictions(state, want):
         severity, fix = cast(Severity, severities[each.then]), ""
         if each.in_file and want is None:  # no head's file that it could contradict
             severity = "warning"
         elif each.fixable and not each.in_file and seen.registers()[each.register].writable:
-            fix = command.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
+            fix = line.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
             if state.torque():
                 severity = "error" if each.then == "set" else severity
-                fix = f"{command.servo('write {id} torque_enable 0', seen.baud)}, then {fix}"
+                fix = f"{line.servo('write {id} torque_enable 0', seen.baud)}, then {fix}"
         elif each.fixable:
-            fix = command.fix
+            fix = line.fix
         yield severity, str(each), fix
 
 
@@ -321,39 +333,7 @@ def stored_contradictions(state: ServoState, want: Wanted | None) -> list[Contra
 # --- the bus ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TickCost:
-    """Cost of one tick, rounded. `hz`: how often that fits into a second."""
-
-    bytes: int
-    ms: float
-    hz: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """Wire budget of a bus at one baud; data per servo and tick in bytes.
-
-    Attributes:
-        write_only: Goals alone.
-        plain: Goals, and every servo read: one sync read, or one by one where the family has none; None of a board.
-        fast: Goals, and every servo read by one fast sync read; None where there is no such thing.
-    """
-
-    servos: int
-    baud: int
-    return_delay_us: float
-    latency_ms: float
-    write_bytes_per_servo: int
-    read_bytes_per_servo: int
-    write_only: TickCost
-    plain: TickCost | None
-    fast: TickCost | None
-
-    @property
-    def usual(self) -> TickCost:
-        """The cost of a tick of a run."""
-        return self.plain or self.write_only
+Budget = dict[str, Any]
 
 
 def wire_budget(
@@ -368,7 +348,10 @@ def wire_budget(
     together: bool = True,
     crc: bool = False,
 ) -> Budget:
-    """Return the budget of a bus.
+    """Return the budget of a bus: bytes, ms and Hz of a tick that writes goals, and of one that reads every servo too.
+
+    `plain` is one sync read, or one read after the other where the family has none, and None of a board; `fast` one
+    fast sync read, None where there is no such thing.
 
         tick = 10 bits x bytes / baud + return delay of every answer + latency of the adapter of every request answered
 
@@ -387,50 +370,56 @@ def wire_budget(
     goals = framing.goals(servos, write_bytes) + crc * servos
     way: Way = "together" if together and family != "dynamixel1" else "one by one"  # AX cannot be read together
 
-    def tick(size: int, answers: int = 0, waits: int = 0) -> TickCost:
+    def tick(size: int, answers: int = 0, waits: int = 0) -> dict[str, float]:
         ms = size * 1e3 * BITS / baud + answers * return_delay_us / 1e3 + waits * latency_ms
-        return TickCost(size, round(ms, 3), round(1e3 / ms, 1))
+        return {"bytes": size, "ms": round(ms, 3), "hz": round(1e3 / ms, 1)}
 
     reads = goals + framing.reads(servos, read_bytes, way)
-    return Budget(
-        servos=servos,
-        baud=baud,
-        return_delay_us=return_delay_us,
-        latency_ms=latency_ms,
-        write_bytes_per_servo=(framing.goal if write_bytes is None else write_bytes)
-        if framing.read
-        else goals // servos,
-        read_bytes_per_servo=read_bytes,
-        write_only=tick(goals),
-        plain=tick(reads, servos, 1 if way == "together" else servos) if framing.read else None,
-        fast=tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1) if together and framing.fast else None,
-    )
-
-
-def judge_rate(budget: Budget, rate_hz: float, fast_works: bool | None, command: Command) -> Iterator[Finding]:
-    """Yield a finding where goals and answers of all servos do not fit into a tick."""
-    if budget.usual.hz >= _ROUND * rate_hz:
-        return
-    hertz = f"{budget.usual.hz:.0f} Hz"
-    if budget.fast is not None and fast_works and budget.fast.hz >= _ROUND * rate_hz:
-        yield Finding("note", "bus", f"plain reads reach {hertz} of {rate_hz:g}, fast sync read {budget.fast.hz:.0f}")
-        return
-    causes = {
-        "return delay": budget.servos * budget.return_delay_us / 1e3,
-        "adapter latency": budget.latency_ms,
-        "baud": budget.usual.bytes * 10e3 / budget.baud,
+    return {
+        "servos": servos,
+        "baud": baud,
+        "return_delay_us": return_delay_us,
+        "latency_ms": latency_ms,
+        "write_bytes_per_servo": write_bytes or (framing.goal if framing.read else goals // servos),
+        "read_bytes_per_servo": read_bytes,
+        "write_only": tick(goals),
+        "plain": tick(reads, servos, 1 if way == "together" else servos) if framing.read else None,
+        "fast": tick(goals + framing.reads(servos, read_bytes, "fast"), 1, 1) if together and framing.fast else None,
     }
-    slow = max(causes, key=causes.__getitem__)
-    fix = {
-        "return delay": "set every return delay to 0 (see the notes)",
-        "adapter latency": "set the adapter's latency timer to 1 ms (see above)",
-        "baud": f"set servos and head file to a higher rate than {budget.baud} baud: "
-        f"{command.servo('set-baud ID RATE', budget.baud)}; or lower rate_hz in the head's file",
-    }[slow]
-    if budget.plain is None:
-        fix = "lower rate_hz in the head's file, or set board and head file to a higher baud"
-    done = "every servo read" if budget.plain else "every channel written"
-    yield Finding("warning", "bus", f"reaches {hertz} of {rate_hz:g} with {done} ({slow} takes most)", fix)
+
+
+def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> Iterator[Finding]:
+    """Yield a finding where goals and answers of all servos do not fit into a tick."""
+    usual, least_hz = budget["plain"] or budget["write_only"], _ROUND * line.rate_hz
+    if usual["hz"] >= least_hz:
+        return
+    reached = f"{usual['hz']:.0f} Hz of {line.rate_hz:g}"
+    if fast_works and budget["fast"] and budget["fast"]["hz"] >= least_hz:
+        yield Finding("note", "bus", f"plain reads reach {reached}, fast sync read {budget['fast']['hz']:.0f}")
+        return
+    set_baud = line.servo("set-baud ID RATE", budget["baud"])
+    slow, _, fix = max(
+        (
+            "return delay",
+            budget["servos"] * budget["return_delay_us"] / 1e3,
+            "set every return delay to 0 (see the notes)",
+        ),
+        ("adapter latency", budget["latency_ms"], "set the adapter's latency timer to 1 ms (see above)"),
+        (
+            "baud",
+            usual["bytes"] * 10e3 / budget["baud"],
+            f"set servos and head file to a higher rate than {budget['baud']} baud: {set_baud}; "
+            "or lower rate_hz in the head's file",
+        ),
+        key=lambda cause: cause[1],
+    )
+    done = "every servo read"
+    if budget["plain"] is None:
+        done, fix = (
+            "every channel written",
+            "lower rate_hz in the head's file, or set board and head file to a higher baud",
+        )
+    yield Finding("warning", "bus", f"reaches {reached} with {done} ({slow} takes most)", fix)
 
 
 def judge_board(family: str, channels: int, answers: bool, device: SerialDevice) -> Iterator[Finding]:
@@ -446,7 +435,7 @@ def judge_board(family: str, channels: int, answers: bool, device: SerialDevice)
 # --- all together -----------------------------------------------------------------------------------------------
 
 
-def grouped(findings: Sequence[Finding]) -> list[Finding]:
+def grouped(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings, worst first; the same problem of several servos is one finding, and its fix one command."""
     same: dict[object, list[Finding]] = {}
     for finding in findings:
@@ -469,12 +458,3 @@ def ids_text(ids: Sequence[int]) -> str:
         else:
             runs.append([servo])
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
-
-
-def _name(servo: int, want: Wanted | None) -> str:
-    return f"id {servo} ({want.joint})" if want else f"id {servo}"
-
-
-def summary(findings: Sequence[Finding]) -> dict[str, int]:
-    """Return the number of findings of each severity."""
-    return {name: sum(each.severity == name for each in findings) for name in SEVERITIES}

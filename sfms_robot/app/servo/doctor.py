@@ -6,16 +6,16 @@ another rate, of another model or not in the file, and whether the bus reaches t
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any, Final, cast
 
 from sfms_robot.app.servo.diagnosis import (
+    SEVERITIES,
     Budget,
-    Command,
     Finding,
+    Line,
     Wanted,
     grouped,
     judge_adapter,
@@ -27,22 +27,12 @@ from sfms_robot.app.servo.diagnosis import (
     judge_rate,
     judge_servo,
     stored_contradictions,
-    summary,
     udev_rule,
     wire_budget,
 )
-from sfms_robot.app.servo.serial_line import (
-    SIM,
-    Confirm,
-    FoundServo,
-    Wire,
-    check_baud,
-    only_port,
-    protocol_hint,
-    table_of,
-)
+from sfms_robot.app.servo.serial_line import SIM, Confirm, FoundServo, Wire, check_baud, only_port, protocol_hint
 from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
-from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config import Head, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
@@ -52,13 +42,10 @@ from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
-from sfms_robot.servo.families import family_named, servo_families
-from sfms_robot.servo.policy import BusServo
+from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
-from sfms_robot.servo.registers import Table
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
-DEFAULT_RATE_HZ: Final = 100.0
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
 DEFAULT_FAMILY: Final = "dynamixel2"
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
@@ -67,36 +54,6 @@ _READ: Final = ("present_position", "present_speed", "present_load", "present_cu
 
 OpenPort = Callable[[str, int], Port]
 Found = Mapping[int, FoundServo]  # by id
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """One port to look at, and what is expected on it.
-
-    Attributes:
-        shown: Its name in commands.
-        ports: The ports of the whole head, as `--port` named them.
-    """
-
-    device: str
-    shown: str
-    family: str
-    baud: int | None
-    rate_hz: float
-    wanted: dict[int, Wanted]
-    bus: str | None = None
-    head: str | None = None
-    ports: str | None = None
-    crc: bool = False
-
-    @property
-    def first_baud(self) -> int:
-        return self.baud or servo_families()[self.family].bauds[0]
-
-    @property
-    def is_terminal(self) -> bool:
-        """It is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
-        return os.path.realpath(self.device).startswith("/dev/pts/")
 
 
 def examine(
@@ -119,9 +76,7 @@ def examine(
     for key, value in (("--family", family), ("--baud", baud)):
         if head is not None and value is not None:
             raise ConfigError(f"{key} {value}: head {head!r} says that of each of its buses; leave out one of the two")
-    family = DEFAULT_FAMILY if family is None else family
-    if family not in servo_families():
-        raise ConfigError.at("doctor", "family", family, "is unknown", servo_families())
+    family = family or DEFAULT_FAMILY
     check_baud(family, baud)
     clock = RealClock()
     with ExitStack() as stack:
@@ -145,17 +100,15 @@ def examine_line(
     path, problem = line.device, access_problem(line.device)
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
-    findings = list(judge_port(path, problem, group_of(path), list_ports()))
     if problem is not None:
-        return _finished(report, findings, PORT_FAILED)
+        return _finished(report, [judge_port(path, problem, group_of(path), list_ports())], PORT_FAILED)
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port(path, line.first_baud)
     except PortError as error:
-        return _finished(report, [*findings, *judge_opening(path, str(error), held_by)], PORT_FAILED)
+        return _finished(report, judge_opening(path, str(error), held_by), PORT_FAILED)
     with closing(port):
         adapter = describe(path)  # after opening, which may have set the latency
-        findings += judge_adapter(adapter, held_by)
         report["adapter"] = asdict(adapter)
         try:
             if family_named(line.family).board:
@@ -166,12 +119,12 @@ def examine_line(
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
         else:
             report |= {**facts, "udev_rule": udev_rule(adapter)}
-    return _finished(report, [*findings, *found])
+    return _finished(report, [*judge_adapter(adapter, held_by), *found])
 
 
-def _finished(report: dict[str, Any], findings: Sequence[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
+def _finished(report: dict[str, Any], findings: Iterable[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
     together = grouped(findings)
-    counts = summary(together)
+    counts = {name: sum(each.severity == name for each in together) for name in SEVERITIES}
     found = [each.plain() for each in together]
     return {**report, "findings": found, "counts": counts, "exit_code": failed if counts["error"] else FINE}
 
@@ -182,7 +135,7 @@ def _finished(report: dict[str, Any], findings: Sequence[Finding], failed: int =
 def _lines(port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack) -> Iterator[Line]:
     if head is None:
         device = port or only_port()
-        yield Line(device=device, shown=device, family=family, baud=baud, rate_hz=DEFAULT_RATE_HZ, wanted={})
+        yield Line(device=device, shown=device, family=family, baud=baud)
         return
     from sfms_robot.app.options import HeadOptions  # slow to load, and only a head needs it
     from sfms_robot.app.wiring import open_wires
@@ -209,21 +162,11 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
 
 def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
     """Return the servos of a bus as the head's file describes them, by id."""
-    from sfms_robot.app.wiring import calibration_of, firmware_maps
+    from sfms_robot.app.open_head import bus_servos
+    from sfms_robot.app.wiring import calibration_of
 
     joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    maps = firmware_maps(joints)
-    servos = [
-        BusServo(
-            joint=name,
-            id=joint.id,
-            table=Table.of(maps[joint.model]),
-            min_rad=joint.min_rad,
-            max_rad=joint.max_rad,
-            safety=head.safety_of(name),
-        )
-        for name, joint in joints.items()
-    ]
+    servos = bus_servos(head, joints)
     return {
         servo.id: Wanted(
             joint=servo.joint,
@@ -243,11 +186,10 @@ def _look(
     line: Line, wire: Wire, adapter: SerialDevice, progress: Progress, fix: Confirm | None
 ) -> tuple[list[Finding], dict[str, Any]]:
     """Return findings and facts that need the open port."""
-    command = Command(line.shown, line.family, line.head, line.ports)
     here, elsewhere = _present(wire, line, progress)
     baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
     hint = "" if here or elsewhere else protocol_hint(wire)
-    findings = list(judge_presence(line.wanted, here, elsewhere, baud, command, hint))
+    findings = list(judge_presence(line, here, elsewhere, baud, hint))
     fixed: list[str] = []
     states: list[ServoState] = []
     double: list[int] = []
@@ -263,19 +205,19 @@ def _look(
             states.append(state)
         except ServoError as error:
             level = seen.table.role("status_level") if seen.table else None
-            cure = command.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
+            cure = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
             findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
     findings += judge_duplicate_ids(double)
     for state in states:
-        findings += judge_servo(state, line.wanted.get(state.seen.id), command)
+        findings += judge_servo(state, line)
     members = [state for state in states if state.seen.id in here and state.seen.table is not None]
     wire.at(baud)
     fast = _fast_read_works(wire, members)
     budget = _budget(line, baud, members, adapter)
     if budget is not None:
-        findings += judge_rate(budget, line.rate_hz, fast, command)
+        findings += judge_rate(budget, line, fast)
     facts = {"baud": baud, "rate_hz": line.rate_hz, "servos": [_servo_row(state, line) for state in states]}
-    return findings, facts | {"fixed": fixed, "fast_sync_read": fast, "budget": budget and asdict(budget)}
+    return findings, facts | {"fixed": fixed, "fast_sync_read": fast, "budget": budget}
 
 
 def _present(wire: Wire, line: Line, progress: Progress) -> tuple[Found, Found]:
@@ -306,17 +248,8 @@ def _at_this_rate(wire: Wire, line: Line, ids: Sequence[int]) -> dict[int, Found
         for servo in ids:
             if servo not in found and (seen := wire.ping(servo)) is not None:
                 found[servo] = seen
-    return {servo: _as_wanted(seen, line) for servo, seen in found.items()}
-
-
-def _as_wanted(seen: FoundServo, line: Line) -> FoundServo:
-    """Return a servo with the map of the head's file: some models have no number of their own, or share one."""
-    want = line.wanted.get(seen.id)
-    if want is None or want.model_number not in (None, seen.model_number):
-        return seen
-    if want.model_number is None:
-        return replace(seen, table=Table.of(load_firmware_map(want.model)))
-    return replace(seen, table=table_of(line.family, seen.model_number, seen.firmware, want.model))
+    wanted = line.wanted
+    return {id_: seen.taken_for(wanted[id_].model) if id_ in wanted else seen for id_, seen in found.items()}
 
 
 def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
@@ -385,10 +318,8 @@ def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: Seria
 
 def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
     want = line.wanted.get(state.seen.id)
-    units = {"voltage_V": "voltage", "temperature_degC": "temperature", "return_delay_us": "return_delay"}
-    measured = {key: None if (x := state.in_unit(role)) is None else round(x, 1) for key, role in units.items()}
-    joint = want.joint if want else None
-    return {**state.seen.row(), "joint": joint, **measured, "torque": state.torque(), "faults": state.faults()}
+    measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
+    return {**state.seen.row(), "joint": want and want.joint, **measured, **state.health()}
 
 
 # --- a board of hobby servos ----------------------------------------------------------------------------------------
@@ -400,8 +331,8 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
     budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)
     answers = _board_answers(line, port)
     found = judge_board(line.family, len(line.wanted), answers, adapter)
-    findings = [*found, *judge_rate(budget, line.rate_hz, None, Command(line.shown, line.family))]
-    facts = {"baud": budget.baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": asdict(budget)}
+    findings = [*found, *judge_rate(budget, line)]
+    facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
     return findings, facts
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import re
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-from sfms_robot.config import FirmwareMap, load_firmware_map, load_head
+from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch, wait
 from sfms_robot.endpoint import whole_number
@@ -26,10 +26,7 @@ USUAL_BAUD: Final = 1_000_000
 _BOARD_BAUDS: Final = {"maestro": 115_200, "ssc32": 9_600}
 _MORE_IDS: Final = re.compile(r"\d+(-\d+)?")
 _CHANGE: Final = re.compile(r"(?P<ids>[0-9,-]+)(:(?P<register>\w+))?=(?P<value>-?\d+)")
-_FORMS: Final = {
-    "stored": "IDS:REGISTER=VALUE, as in 3:min_position_limit=1900",
-    "start": "IDS=TICKS, as in 3=4150",
-}
+_FORMS: Final = {"stored": "IDS:REGISTER=VALUE, as in 3:min_position_limit=1900", "start": "IDS=TICKS, as in 3=4150"}
 
 
 @contextmanager
@@ -53,9 +50,8 @@ def emulators(
     The arguments are the options of `cli.emulate_command`. Raises ConfigError, BusError.
     """
     settings = {key: value for key, value in (("baud", baud), ("supply_v", voltage)) if value is not None}
-    wires = _servos(
-        head, servo, settings, [*(("stored", each) for each in stored), *(("start", each) for each in starts)]
-    )
+    changes = [("stored", each) for each in stored] + [("start", each) for each in starts]
+    wires = _servos(head, servo, settings, changes)
     specs = _faults(faults)
     with ExitStack() as stack:
         chains = {}
@@ -108,30 +104,28 @@ def _servos(
         wires = plugged_in(head, load_head(head))
     else:
         wires = {"servos": parse_servos(servo or "")}
-    out = {bus: [replace(each, **settings) for each in servos] for bus, servos in wires.items()}
+    for servos in wires.values():
+        servos[:] = [replace(each, **settings) for each in servos]
     for option, text in changes:
-        ids, register, value = _change(option, text, out)
-        for servos in out.values():
-            servos[:] = [_changed(each, register, value) if each.id in ids else each for each in servos]
-    return out
+        _change(option, text, wires.values())
+    return wires
 
 
-def _changed(servo: EmulatedServo, register: str | None, value: int) -> EmulatedServo:
-    if register is None:
-        return replace(servo, start_ticks=value)
-    return replace(servo, registers={**servo.registers, register: value})
-
-
-def _change(option: str, text: str, wires: Mapping[str, Sequence[EmulatedServo]]) -> tuple[set[int], str | None, int]:
-    """Return (ids, register, value) of an option. Raises ConfigError for a bad one, and for ids of no servo."""
+def _change(option: str, text: str, wires: Collection[list[EmulatedServo]]) -> None:
+    """Carry an option out. Raises ConfigError for a bad one, and for ids of no servo."""
     found = _CHANGE.fullmatch(text.strip())
     if found is None or (found["register"] is None) != (option == "start"):
         raise ConfigError.at("emulate", option, text, f"cannot be read: {_FORMS[option]}")
-    there = {servo.id for servos in wires.values() for servo in servos}
-    ids = _ids(option, text, found["ids"])
+    there = {servo.id for servos in wires for servo in servos}
+    ids, value = _ids(option, text, found["ids"]), whole_number(found["value"])
     if missing := sorted(ids - there):
         raise ConfigError.at("emulate", option, text, f"names {missing[0]}, which no servo has", sorted(there))
-    return ids, found["register"], whole_number(found["value"])
+    for servos in wires:
+        for place, each in enumerate(servos):
+            if each.id in ids and found["register"] is None:
+                servos[place] = replace(each, start_ticks=value)
+            elif each.id in ids:
+                servos[place] = replace(each, registers={**each.registers, found["register"]: value})
 
 
 def _ids(option: str, text: str, ids: str) -> set[int]:
@@ -153,23 +147,16 @@ def parse_servos(text: str) -> list[EmulatedServo]:
                 form = "MODEL:IDS, as in xl330-m288:1-9"
                 raise ConfigError.at("emulate", "servo", text, f"has no id for {part.strip()!r}: {form}")
         table = load_firmware_map(model)
-        numbers = sorted(_ids("servo", text, ids))
-        out += [EmulatedServo(i, model, _baud(table), table.center_ticks) for i in numbers]
+        rates = table.baud_codes.values() or {_BOARD_BAUDS.get(table.family, USUAL_BAUD)}
+        baud = USUAL_BAUD if USUAL_BAUD in rates else max(rates)
+        out += [EmulatedServo(i, model, baud, table.center_ticks) for i in sorted(_ids("servo", text, ids))]
     return out
-
-
-def _baud(table: FirmwareMap) -> int:
-    rates = table.baud_codes.values()
-    if not rates:
-        return _BOARD_BAUDS.get(table.family, USUAL_BAUD)
-    return USUAL_BAUD if USUAL_BAUD in rates else max(rates)
 
 
 def _faults(texts: Sequence[str]) -> list[str]:
     """Return specs unchanged, and those of a file: one in a line, `#` starts a comment."""
     out: list[str] = []
     for text in texts:
-        file = Path(text)
-        lines = file.read_text().splitlines() if file.is_file() else None
-        out += [text] if lines is None else [spec for line in lines if (spec := line.partition("#")[0].strip())]
+        lines = Path(text).read_text().splitlines() if Path(text).is_file() else [text]
+        out += [spec for line in lines if (spec := line.partition("#")[0].strip())]
     return out

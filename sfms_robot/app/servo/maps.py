@@ -5,7 +5,7 @@ Mistakes within a map are found when it is loaded (`config.firmware`); this chec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,29 +26,36 @@ Loaded = dict[Path, FirmwareMap]
 
 def check_maps(more: Iterable[Path] = ()) -> list[MapProblem]:
     """Return the mistakes of the shipped maps, and of the files and folders of `more`."""
-    loaded, findings = _load([*map_files(), *_expand(more)])
+    loaded: Loaded = {}
+    findings = []
+    for file in [*map_files(), *_expand(more)]:
+        try:
+            loaded[file] = load(FirmwareMap, file)
+        except ConfigError as error:
+            findings.append(MapProblem(str(file), str(error).removeprefix(f"{file}: ")))
     return [*findings, *_names(loaded), *_references(loaded), *_collisions(loaded)]
 
 
 def list_maps(more: Iterable[Path] = ()) -> list[dict[str, Any]]:
     """Return one row per model for `servo maps`. Raises ConfigError for a map that does not load."""
-    return [_row(load(FirmwareMap, file)) for file in [*map_files(), *_expand(more)]]
-
-
-def _row(each: FirmwareMap) -> dict[str, Any]:
-    low, high = each.firmware.min, each.firmware.max
-    return {
-        "model": each.model,
-        "vendor": each.vendor,
-        "family": each.family,
-        "protocol": each.protocol,
-        "number": each.model_number,
-        "firmware": "any" if (low, high) == (0, 255) else f"{low}.." if high == 255 else f"..{high}",
-        "registers": len(each.registers) or None,
-        "channels": each.channels,
-        "ticks_per_turn": each.ticks_per_revolution,
-        "watchdog": each.watchdog,
-    }
+    rows = []
+    for each in (load(FirmwareMap, file) for file in [*map_files(), *_expand(more)]):
+        low, high = each.firmware.min, each.firmware.max
+        rows.append(
+            {
+                "model": each.model,
+                "vendor": each.vendor,
+                "family": each.family,
+                "protocol": each.protocol,
+                "number": each.model_number,
+                "firmware": "any" if (low, high) == (0, 255) else f"{low}.." if high == 255 else f"..{high}",
+                "registers": len(each.registers) or None,
+                "channels": each.channels,
+                "ticks_per_turn": each.ticks_per_revolution,
+                "watchdog": each.watchdog,
+            }
+        )
+    return rows
 
 
 def _expand(more: Iterable[Path]) -> list[Path]:
@@ -60,16 +67,6 @@ def _expand(more: Iterable[Path]) -> list[Path]:
             raise ConfigError(f"{path}: holds no firmware map (*.yaml)")
         files += found
     return files
-
-
-def _load(files: Sequence[Path]) -> tuple[Loaded, list[MapProblem]]:
-    loaded, findings = {}, []
-    for file in files:
-        try:
-            loaded[file] = load(FirmwareMap, file)
-        except ConfigError as error:
-            findings.append(MapProblem(str(file), str(error).removeprefix(f"{file}: ")))
-    return loaded, findings
 
 
 def _names(loaded: Loaded) -> Iterator[MapProblem]:

@@ -136,13 +136,11 @@ def _settled(seen: FoundServo, present: Field, target: int) -> int:
     """Return the position once the servo is close to `target`. Raises ServoError."""
     clock = seen.wire.clock
     end_s = clock.now_s() + SETTLE_S
-    while True:
-        now = seen.read(present)
-        if abs(now - target) <= _ticks(seen.registers(), CLOSE_DEG):
-            return now
+    while abs((now := seen.read(present)) - target) > _ticks(seen.registers(), CLOSE_DEG):
         if clock.now_s() >= end_s:
             raise ServoError(f"id {seen.id} stopped at {now}, its goal is {target}")
         clock.wait_until(clock.now_s() + STEP_S)
+    return now
 
 
 def _ticks(table: Table, degrees: float) -> float:
@@ -170,7 +168,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     Joints on a bus whose port fails are unconfirmed. Raises PortError and BusError if no bus could be used.
     """
     rows: list[dict[str, Any]] = []
-    failures: list[PortError | BusError] = []
+    failures: list[RobotError] = []
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
         names = {joint.id: key for key, joint in joints.items()}

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final
 
@@ -19,7 +19,6 @@ from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, ping_replies, verified_write
-from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.discovery import access_problem, is_address, list_ports
 from sfms_robot.servo.families import BusFamily, family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
@@ -60,6 +59,17 @@ class FoundServo:
             known = [*sorted(file.stem for file in map_files()), "or --model MODEL"]
             raise ConfigError.at(f"servo {self.id}", "model number", self.model_number, "has no firmware map", known)
         return self.table
+
+    def taken_for(self, model: str) -> FoundServo:
+        """Return it with the map of `model`, unless its model number is of another one.
+
+        Some models have no number of their own, or share one.
+        """
+        number = load_firmware_map(model).model_number
+        if number is not None and self.model_number not in (None, number):
+            return self
+        table = number and table_of(self.wire.family, self.model_number, self.firmware, model)
+        return replace(self, table=table or Table.of(load_firmware_map(model)))
 
     def named(self, name: str) -> Field:
         """Return a register by its name or its role. Raises ConfigError with the names there are."""
@@ -297,61 +307,30 @@ def _family(name: str) -> BusFamily:
 
 # --- another protocol -----------------------------------------------------------------------------------------------
 
-_LISTEN_S: Final = 0.08  # answers come by id, 3 ms apart: those of the first two dozen ids
 _FIRST_IDS: Final = 20
 _ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
 _RATES: Final = 3  # of each family, those met most often
-_DXL2_HEADER: Final = b"\xff\xff\xfd\x00"
 
 
 def protocol_hint(wire: Wire) -> str:
     """Return the `--family` to type where servos answer to another protocol, or nothing.
 
-    One broadcast ping per rate and frame, and a short listen: Dynamixel 2.0 and Feetech answer it. Dynamixel 1.0 does
-    not, so there the first twenty ids are asked. Takes at most 3 s on a silent wire, and leaves it at its rate.
+    Each family is tried at its usual rates, the wire's own first: by a broadcast ping, or for protocol 1, whose frames
+    the families share, by the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
     """
     before = wire.baud
     try:
-        for baud in dict.fromkeys(baud for family in servo_families().values() for baud in family.bauds[:_RATES]):
-            try:
-                wire.at(baud)
-            except PortError:
-                continue
-            family = _spoken(wire, baud)
-            if family == wire.family:
-                return ""
-            if family is not None:
-                return f"these servos answer {servo_families()[family].title} at {baud} baud: --family {family}"
+        for name in sorted(servo_families(), key=lambda name: name != wire.family):
+            family = servo_families()[name]
+            for baud in family.bauds[:_RATES]:
+                with suppress(PortError):  # of an adapter that cannot do this rate
+                    wire.at(baud)
+                    other = Wire(wire.port, name, wire.clock, baud, fixed=True)
+                    other.link.silence_s = _ID_S
+                    ids = None if family.protocol == 2 else range(1, _FIRST_IDS + 1)
+                    if any(seen.table is not None for seen in other.answering(ids)):
+                        same = name == wire.family
+                        return "" if same else f"these servos answer {family.title} at {baud} baud: --family {name}"
     finally:
         wire.at(before)
     return ""
-
-
-def _spoken(wire: Wire, baud: int) -> str | None:
-    """Return the family that answers at the port's rate."""
-    if _DXL2_HEADER in _reply(wire.port, dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING)):
-        return "dynamixel2"
-    frames = protocol1.salvage(bytearray(_reply(wire.port, protocol1.encode(protocol1.BROADCAST, protocol1.PING))))
-    if not frames and baud in servo_families()["dynamixel1"].bauds[:2]:  # these answer only to their own id
-        link = Wire(wire.port, "dynamixel1", wire.clock, baud, fixed=True).link
-        link.silence_s = _ID_S
-        if any(link.ping(servo) is not None for servo in range(1, _FIRST_IDS + 1)):
-            return "dynamixel1"
-    for servo in {frame.servo for frame in frames}:
-        for family in ("feetech", "dynamixel1"):
-            found = Wire(wire.port, family, wire.clock, baud, fixed=True).ping(servo, tries=1)
-            if found is not None and found.table is not None:
-                return family
-    return None
-
-
-def _reply(port: Port, request: bytes) -> bytes:
-    """Return what comes within `_LISTEN_S`, without the echo of an adapter that hears itself."""
-    port.discard_input()
-    port.write(request)
-    data, end_s = bytearray(), port.now_s() + _LISTEN_S
-    while part := port.read(4096, end_s):
-        data += part
-        if port.now_s() >= end_s:
-            break
-    return bytes(data).removeprefix(request)

@@ -17,7 +17,7 @@ import yaml
 
 from sfms_robot.app.output_paths import checked_file
 from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
-from sfms_robot.config.base import Model, load
+from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
@@ -55,8 +55,8 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
     """
     for servo in ids or ():
         wire.check_id(servo)
-    asked: list[list[int] | None] = [[servo] for servo in (range(wire.kind.max_id + 1) if ids is None else ids)]
-    asked = [None] if ids is None and wire.kind.broadcast else asked
+    one_by_one = range(wire.kind.max_id + 1) if ids is None else ids
+    asked = [None] if ids is None and wire.kind.broadcast else [[servo] for servo in one_by_one]
     found: list[FoundServo] = []
     total = len(wire.bauds) * len(asked)
     for baud in wire.reachable():
@@ -125,18 +125,25 @@ class ServoState:
         value = self.value("torque_enable")
         return None if value is None else bool(value)
 
-    def row(self, faults: str | None = None) -> dict[str, Any]:
-        """Return the row of `servo monitor`, with other `faults` for a servo that was not read."""
-        units = {
-            "position_deg": "present_position",
-            "current_mA": "present_current",
-            "load_percent": "present_load",
-            "voltage_V": "voltage",
-            "temperature_degC": "temperature",
-        }
-        measured = {key: None if (x := self.in_unit(role)) is None else round(x, 2) for key, role in units.items()}
+    def measured(self, digits: int, **roles: str) -> dict[str, float | None]:
+        """Return values in their units, each under the name of its argument; None for one that was not read."""
+        return {key: None if (x := self.in_unit(role)) is None else round(x, digits) for key, role in roles.items()}
+
+    def health(self) -> dict[str, Any]:
+        return {"torque": self.torque(), "faults": self.faults()}
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of `servo monitor`."""
+        measured = self.measured(
+            2,
+            position_deg="present_position",
+            current_mA="present_current",
+            load_percent="present_load",
+            voltage_V="voltage",
+            temperature_degC="temperature",
+        )
         who = {"id": self.seen.id, "model": self.seen.model, "position": self.value("present_position")}
-        return {**who, **measured, "torque": self.torque(), "faults": self.faults() if faults is None else faults}
+        return {**who, **measured, **self.health()}
 
 
 def read_all(seen: FoundServo) -> ServoState:
@@ -165,54 +172,46 @@ def watched(seen: FoundServo) -> dict[str, Any]:
     """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
     names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
     if seen.table is None or not names:
-        return ServoState(seen, {}).row("no firmware map")
+        return ServoState(seen, {}).row() | {"faults": "no firmware map"}
     start, length = seen.table.span(names)
     answer = seen.wire.at(seen.baud).read(seen.id, start, length)
     if answer is None or seen.wire.link.refusal(answer):
-        return ServoState(seen, {}).row("silent")
+        return ServoState(seen, {}).row() | {"faults": "silent"}
     return ServoState.of(seen, start, answer.data, answer.error).row()
 
 
 # --- registers --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Value:
-    """One register of one servo, as read."""
-
-    field: Field
-    raw: int
-
-    def row(self) -> dict[str, Any]:
-        """Return the row of `servo read`."""
-        field = self.field
-        return {
-            "register": field.name,
-            "raw": self.raw,
-            "value": round(field.to_unit(self.raw), 6),
-            "unit": field.unit,
-            "address": field.address,
-            "size": field.size,
-            "access": field.access,
-            "area": field.area,
-            "min": field.low if field.writable else None,
-            "max": field.high if field.writable else None,
-        }
+def register_row(field: Field, raw: int) -> dict[str, Any]:
+    """Return the row of `servo read`."""
+    return {
+        "register": field.name,
+        "raw": raw,
+        "value": round(field.to_unit(raw), 6),
+        "unit": field.unit,
+        "address": field.address,
+        "size": field.size,
+        "access": field.access,
+        "area": field.area,
+        "min": field.low if field.writable else None,
+        "max": field.high if field.writable else None,
+    }
 
 
-def read_registers(seen: FoundServo, names: Sequence[str]) -> list[Value]:
-    """Read registers by name, or `all` of them. Raises ServoError where one cannot be read."""
+def read_registers(seen: FoundServo, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Read registers by name, or `all` of them, into rows. Raises ServoError where one cannot be read."""
+    fields = [seen.named(name) for name in names if name != "all"]
     if "all" in names:
         fields = sorted(seen.registers().fields.values(), key=lambda each: each.address)
-    else:
-        fields = [seen.named(name) for name in names]
-    return [Value(field, seen.read(field)) for field in fields]
+    return [register_row(field, seen.read(field)) for field in fields]
 
 
-def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> tuple[Value | None, Value]:
-    """Write one register; return (before, after). `text` is a raw number, or one with the register's unit: 90deg.
+def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> dict[str, Any]:
+    """Write one register; return the row of `servo write`.
 
-    The status return level is written without reading it first: a servo at level 0 answers no read.
+    `text`: a raw number, or one with the register's unit: 90deg. The status return level is written without reading it
+    first: a servo at level 0 answers no read.
 
     Raises ConfigError for a value that the register does not take, ServoError when the servo refuses.
     """
@@ -224,12 +223,12 @@ def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> 
         raise ConfigError.at(table.model, "register", name, "is read-only", writable)
     raw = parse_value(table.model, field, text)
     mute = field == table.role("status_level")
-    before = None if mute else Value(field, seen.read(field))
+    before = None if mute else seen.read(field)
     if field.eeprom:
-        change = f"{field.name} := {raw}" if before is None else f"{field.name} {before.raw} -> {raw}"
-        seen.guard(change, confirm, mute)
+        seen.guard(f"{field.name} := {raw}" if mute else f"{field.name} {before} -> {raw}", confirm, mute)
     seen.put(field, raw)
-    return before, Value(field, raw)
+    row = register_row(field, raw)
+    return {"register": field.name, "before": before, **{key: row[key] for key in ("raw", "value", "unit")}}
 
 
 def parse_value(model: str, field: Field, text: str) -> int:
@@ -392,26 +391,18 @@ def dump(servos: Sequence[FoundServo]) -> Dump:
 
 
 def check_new(file: Path) -> None:
-    """Raise ConfigError, as `save_dump` does, where a dump cannot be written, or a file is there already."""
+    """Raise ConfigError where a dump cannot be written or a file exists: it may be the only copy of such settings."""
     if file.exists():
         raise ConfigError(f"{file}: is there already, name another file")
     checked_file(file, "servo dump")
 
 
 def save_dump(what: Dump, file: Path) -> None:
-    """Write a dump. Raises ConfigError for a file that exists: it may hold the only copy of a servo's settings."""
+    """Write a dump. Raises ConfigError as `check_new`."""
+    check_new(file)
     text = "# Registers of servos, raw; `sfms-robot servo restore` writes the lasting ones back.\n"
-    text += yaml.safe_dump(what.model_dump(mode="json"), sort_keys=False)
-    try:
-        with file.open("x", encoding="utf-8") as out:
-            out.write(text)
-    except FileExistsError:
-        raise ConfigError(f"{file}: is there already, name another file") from None
-
-
-def load_dump(file: Path) -> Dump:
-    """Read a dump. Raises ConfigError."""
-    return load(Dump, file)
+    with file.open("x", encoding="utf-8") as out:
+        out.write(text + yaml.safe_dump(what.model_dump(mode="json"), sort_keys=False))
 
 
 def differences(seen: FoundServo, was: DumpedServo) -> list[tuple[str, int, int]]:
@@ -438,21 +429,16 @@ def restore(seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool
     wire, table, changes = seen.wire, seen.registers(), differences(seen, was)
     if changes:
         seen.guard(", ".join(f"{name} {now} -> {then}" for name, now, then in changes), confirm)
-    rows: list[dict[str, Any]] = []
-
-    def report(register: str, before: int, raw: int) -> None:
-        rows.append({"id": seen.id, "register": register, "before": before, "raw": raw})
-
-    for name, now, then in changes:
+    for name, _, then in changes:
         seen.put(table[name], then)
-        report(name, now, then)
+    rows = [{"id": seen.id, "register": name, "before": now, "raw": then} for name, now, then in changes]
     if identity:
         if was.id != seen.id:
-            report("id", seen.id, was.id)
+            rows.append({"id": seen.id, "register": "id", "before": seen.id, "raw": was.id})
             seen = set_id(seen, was.id, confirm)
         code = table.role("baud_rate")
         rate = table.baud_codes.get(was.registers.get(code.name, -1)) if code is not None else None
         if rate is not None and rate != wire.baud:
-            report("baud", wire.baud, rate)
+            rows.append({"id": seen.id, "register": "baud", "before": wire.baud, "raw": rate})
             set_baud(seen, rate, confirm)
     return rows

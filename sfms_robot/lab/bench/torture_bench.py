@@ -31,7 +31,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.replay.run_file import read_recording, states_of
+from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain, launch
@@ -203,7 +203,7 @@ def _strike(victim: _Victim, order: Sequence[str], duration_s: float, seed: int,
 
 
 def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torque: Sequence[int]) -> dict[str, Any]:
-    recording, states = read_recording(folder), states_of(folder)
+    recording = read_recording(folder)
     by_kind = {kind: [blow for blow in blows if blow.kind == kind] for kind in KINDS}
 
     def missed(of: Sequence[Blow]) -> dict[str, float]:
@@ -212,7 +212,8 @@ def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torq
     def recorded(blow: Blow) -> bool:
         until_s = blow.at_s + LONGEST_S[blow.kind] + _TOLERANCE_S
         return any(
-            state == "degraded" and blow.at_s <= at_s <= until_s and blow.why in why for at_s, state, why in states
+            state == "degraded" and blow.at_s <= at_s <= until_s and blow.why in why
+            for at_s, state, why in recording.states
         )
 
     counts = {

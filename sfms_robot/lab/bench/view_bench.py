@@ -29,7 +29,7 @@ from websockets.sync.client import ClientConnection, connect
 from sfms_robot.app.listen.page_observer import PageObserver
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.options import RunOptions, begin_page
-from sfms_robot.app.session import Document, run
+from sfms_robot.app.session import Document, RunControls, run
 from sfms_robot.config import load_head
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.frames import Plan, SpeakerFrame
@@ -182,9 +182,9 @@ def _windows() -> list[Window]:
         turns = _Turns(watcher)
 
         @contextmanager
-        def sampled(document: Document, *_: object) -> Iterator[None]:
-            watcher.document = document
-            threading.Thread(target=_sample, args=(document, turns, page, look, found), daemon=True).start()
+        def sampled(controls: RunControls) -> Iterator[None]:
+            watcher.document = controls.document
+            threading.Thread(target=_sample, args=(controls.document, turns, page, look, found), daemon=True).start()
             yield
 
         duration_s = _SETTLE_S + (2 * _PAIRS + 1) * (_PAUSE_S + _WINDOW_S) + _PAUSE_S
