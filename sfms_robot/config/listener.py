@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -441,35 +439,7 @@ class Arig(ListenerSettings):
         return EVENT_STATES if self.events else STATES
 
 
-@dataclass(frozen=True)
-class ListenerKind:
-    """A kind of listener that a folder may hold. Listeners of other packages are no folders of ours: see `plugins`.
-
-    Attributes:
-        settings: the model of config.yaml.
-        package: of the kind, imported when such a listener is loaded; it has `load` and `export_graphs`.
-    """
-
-    settings: type[ListenerSettings]
-    package: str
-
-    def load_folder(self, folder: Path, engine: str = "auto", threads: int | None = None) -> Any:
-        """Return the listener of a folder (`ports.BatchListener`), computed by `engine` (`engine.EngineName`).
-
-        Raises ConfigError or ModelError.
-        """
-        return import_module(self.package).load(folder, engine, threads)
-
-    def export_folder(self, folder: Path, out: Path, int8: bool) -> list[Path]:
-        """Write ONNX graphs of a folder's networks below `out`, in 8 bits too; return the files written."""
-        files: list[Path] = import_module(self.package).export_graphs(folder, out, int8)
-        return files
-
-
-LISTENER_KINDS: Final[Mapping[str, ListenerKind]] = {
-    "sfms": ListenerKind(Sfms, "sfms_robot.listeners.sfms"),
-    "arig": ListenerKind(Arig, "sfms_robot.listeners.arig"),
-}
+LISTENER_KINDS: Final[Mapping[str, type[ListenerSettings]]] = {"sfms": Sfms, "arig": Arig}
 
 
 def load_listener(file: Path) -> ListenerSettings:
@@ -482,4 +452,4 @@ def parse_listener(raw: Any, file: Path | str) -> ListenerSettings:
     name = str(raw.get("kind")) if isinstance(raw, dict) else ""
     if name not in LISTENER_KINDS:
         raise ConfigError.at(file, "kind", name, "is not a kind of listener", LISTENER_KINDS)
-    return parse(LISTENER_KINDS[name].settings, raw, file)
+    return parse(LISTENER_KINDS[name], raw, file)

@@ -32,13 +32,16 @@ _BISECTIONS: Final = 20
 
 
 def step_each(
-    listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]
+    listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], *controls: Sequence[Any]
 ) -> list[tuple[Plan | None, Any]]:
-    """Step each stream once; in one batch where the listener can (`ports.BatchListener`)."""
+    """Step each stream once; in one batch where the listener can (`ports.BatchListener`).
+
+    `controls`: one sequence of them, for a listener that takes control.
+    """
     together = getattr(listener, "step_each", None)
     if together is None:
-        return [listener.step(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]
-    found: list[tuple[Plan | None, Any]] = together(speakers, memories)
+        return [listener.step(*each) for each in zip(speakers, memories, *controls, strict=True)]
+    found: list[tuple[Plan | None, Any]] = together(speakers, memories, *controls)
     return found
 
 

@@ -11,6 +11,7 @@ or to weights of other shapes is reported in one line before anything runs.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import hashlib
 import json
@@ -75,14 +76,32 @@ class Engine(Protocol):
 
 
 class RunsOnEngine:
-    """A `ports.BatchListener` whose networks an engine runs. It has no state but the weights, held by the engine."""
+    """A `ports.BatchListener` whose networks an engine runs. It has no state but the weights, held by the engine.
+
+    Attributes:
+        hop: frames from one plan to the next; hops: those that `at_hop` takes.
+        horizon: frames of a plan.
+        control_frames: rows of control that a step takes, up to the newest frame and after it; (0, 0) without events.
+    """
 
     engine: Engine
+    hop: int = 1
+    hops: Sequence[int] = (1,)
+    horizon: int = 1
+    control_frames: tuple[int, int] = (0, 0)
 
-    def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], controls: Sequence[Floats | None] | None
-    ) -> Sequence[tuple[Plan | None, Any]]:
-        """Move N streams one frame on; with a single speaker, all of them had the same from the start."""
+    def at_hop(self, hop: int) -> Self:
+        """Return a listener of the same weights that plans every `hop` frames, one of `hops`."""
+        other = copy.copy(self)
+        other.hop = hop
+        return other
+
+    def is_due(self, memory: Any) -> bool:
+        """Return whether the next frame brings a plan."""
+        return True
+
+    def start(self, seed: int) -> Any:
+        """Return the memory of a new stream."""
         raise NotImplementedError
 
     def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]:
@@ -93,7 +112,7 @@ class RunsOnEngine:
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """
-        return self._stepped([speaker], [memory], None if control is None else [control])[0]
+        return self.step_each([speaker], [memory], [control])[0]
 
     def step_each(
         self,
@@ -102,19 +121,7 @@ class RunsOnEngine:
         controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, Any]]:
         """Step several streams, see `ports.BatchListener`; controls as of `step`."""
-        if len(speakers) != len(memories):
-            raise ValueError(f"{len(speakers)} frames for {len(memories)} streams")
-        return [*self._stepped(speakers, memories, controls)]
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats | None] | None = None
-    ) -> tuple[list[Plan], list[Any]]:
-        """Step streams that began together with the same speaker; return their plans, none where none is due.
-
-        As `step_each`, but features of the speaker are computed once.
-        """
-        found = self._stepped([speaker], memories, controls)
-        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
+        raise NotImplementedError
 
     def standardise(self, motion: Floats) -> Floats:
         """Return motion (..., C) of the motion space in the units of the model."""
@@ -374,7 +381,6 @@ def engine_of(
     settings: config.ListenerSettings,
     wanted: EngineName,
     torch_engine: Callable[[], Engine],
-    precision: str = "fp32",
     threads: int | None = None,
 ) -> Engine:
     """Load the engine of a listener's folder.
@@ -384,12 +390,11 @@ def engine_of(
         settings: of the listener.
         wanted: the engine, or auto.
         torch_engine: makes torch's, with the folder's weights.
-        precision: of large layers: fp32, int8, or auto, which is int8 where there are graphs of it.
         threads: None for one, and with torch for the number that it uses.
 
     Raises ModelError, and ConfigError where a package that `wanted` needs is not installed.
     """
-    graphs = _graphs(folder, settings, wanted, precision)
+    graphs = _graphs(folder, settings, wanted)
     if graphs is not None:
         file, shapes = folder / WEIGHTS, graphs.wanted
         return OnnxEngine(folder, graphs, lambda: stored_tensors(file, shapes), threads or 1)
@@ -400,10 +405,11 @@ def engine_of(
     return engine
 
 
-def _graphs(folder: Path, settings: config.ListenerSettings, wanted: EngineName, precision: str) -> GraphFolder | None:
-    """Return the graphs to run; None for torch."""
+def _graphs(folder: Path, settings: config.ListenerSettings, wanted: EngineName) -> GraphFolder | None:
+    """Return the graphs to run; None for torch. `precision: auto` takes 8 bits where there are graphs of it."""
     if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
         return None
+    precision = settings.precision if isinstance(settings, config.Arig) else "fp32"
     try:
         graphs = read_graphs(folder, settings, integers=precision != "fp32")
     except ModelError as error:

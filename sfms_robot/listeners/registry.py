@@ -1,4 +1,4 @@
-"""Listeners by name: the kinds of `config.listener_kinds`, imported only when chosen."""
+"""Listeners by name: shipped ones, folders, and those of other packages. torch is imported only where it is needed."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from sfms_robot.config.listener import LISTENER_KINDS, Calmness
+from sfms_robot import config
+from sfms_robot.config.listener import Calmness
+from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import load_config
-from sfms_robot.listeners.engine import Engine, EngineName
-from sfms_robot.listeners.eventful import EventfulListener, MotionModel
+from sfms_robot.listeners.engine import Engine, EngineName, engine_of
+from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.idle import FILE as IDLE_FILE
 from sfms_robot.listeners.idle import IdleMotion
+from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
@@ -39,15 +42,31 @@ def load_listener(
     folder = listener_folder(str(name))
     if folder is None:
         return load_plugin(str(name))
-    settings = load_config(folder)
-    listener = cast(Listener, LISTENER_KINDS[settings.kind].load_folder(folder, engine, threads))
-    if settings.events:
+    moves = load_folder(folder, engine, threads)
+    listener: Listener = moves
+    if moves.settings.events:
         resting = folder / IDLE_FILE
         idle = IdleMotion.load(resting) if resting.is_file() else None
-        listener = EventfulListener(cast(MotionModel, listener), EventModel.load(), calmness, idle)
+        listener = EventfulListener(moves, EventModel.load(), calmness, idle)
     if graphs:
         build_graphs(listener)
     return listener
+
+
+def load_folder(folder: Path, engine: EngineName = "auto", threads: int | None = None) -> SfmsListener | ArigListener:
+    """Return the model of motion of a folder with config.yaml and model.safetensors. Raises ConfigError, ModelError."""
+    settings = load_config(folder)
+
+    def torch_engine() -> Engine:
+        from sfms_robot.listeners.torch_engine import load_model, torch_engine
+
+        return torch_engine(load_model(folder))
+
+    runs = engine_of(folder, settings, engine, torch_engine, threads)
+    if isinstance(settings, config.Sfms):
+        return SfmsListener(settings, runs, folder)
+    assert isinstance(settings, config.Arig)
+    return ArigListener(settings, runs, folder)
 
 
 def engine_name(listener: Listener) -> str | None:

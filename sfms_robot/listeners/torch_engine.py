@@ -21,8 +21,15 @@ from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
-from sfms_robot.listeners.checkpoint import WEIGHTS, Array
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.networks import large_layers, with_precision
+from sfms_robot.listeners.arig.networks import networks as arig_networks
+from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
 from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Examples, digest
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.model import networks as sfms_networks
+from sfms_robot.listeners.sfms.stream import SfmsListener
 
 Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
 
@@ -81,6 +88,29 @@ class TorchEngine:
         torch.set_num_threads(threads)
 
 
+def new_model(settings: config.ListenerSettings) -> SfmsModel | ArigModel:
+    """Return the model of a configuration with weights drawn by torch's seed."""
+    if isinstance(settings, config.Sfms):
+        return SfmsModel(settings)
+    assert isinstance(settings, config.Arig)
+    return ArigModel(settings)
+
+
+def load_model(folder: Path) -> SfmsModel | ArigModel:
+    """Load the torch model of a listener's folder. Raises ConfigError or ModelError."""
+    model = new_model(load_config(folder))
+    load_weights(folder / WEIGHTS, model)
+    return model.eval()
+
+
+def torch_engine(model: SfmsModel | ArigModel) -> TorchEngine:
+    """Return an engine for a model in memory, in the precision of its settings. Raises ModelError."""
+    if isinstance(model, ArigModel):
+        model = with_precision(model, model.settings.precision)
+        return TorchEngine(model, arig_networks(model))
+    return TorchEngine(model, sfms_networks(model))
+
+
 def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
     """Return arrays as tensors of the same memory; read-only ones, which torch does not know, are copied."""
     return tuple(torch.from_numpy(each if each.flags.writeable else each.copy()) for each in arrays)
@@ -105,25 +135,25 @@ def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
 #        their content, which `engine` hands to the session (`_written`).
 
 
-def export(
-    folder: Path,
-    settings: config.ListenerSettings,
-    networks: Networks,
-    examples: Examples,
-    integers: Iterable[str] = (),
-) -> list[Path]:
-    """Write the graphs of a listener into its folder and return the files. Takes half a minute to two.
+def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
+    """Write the graphs of a listener's folder below `out` and return the files. Takes half a minute to two.
 
-    Args:
-        folder: of the listener.
-        settings: of the listener.
-        networks: modules with the model as their attribute `model`.
-        examples: inputs of every network, of several streams.
-        integers: weights of layers, by name, for a second graph of each network that has them in 8 bits.
+    `int8`: a second graph of each network has its large layers in 8 bits. SFMS, whose layers are small, has none.
 
-    Raises MissingExtra, and ModelError where the folder cannot be written.
+    Raises ConfigError, MissingExtra, and ModelError where `out` cannot be written.
     """
-    layers = list(integers)
+    settings = load_config(folder)
+    model = new_model(settings).eval()
+    listener: SfmsListener | ArigListener
+    networks: Networks
+    if isinstance(model, ArigModel):
+        networks, layers = arig_networks(model, kept=False), large_layers(model) if int8 else []
+        listener = ArigListener(model.settings, TorchEngine(model, networks))
+    else:
+        networks, layers = sfms_networks(model), []
+        unheard = model.settings.model_copy(update={"wav2vec2": None})  # examples need no model of sound
+        listener = SfmsListener(unheard, TorchEngine(model, networks))
+    examples = listener.examples(EXAMPLE_STREAMS)
     graphs: dict[str, Any] = {}
     for name, network in networks.items():
         example = dict(zip(examples[name], _tensors(examples[name].values()), strict=True))
@@ -132,14 +162,14 @@ def export(
             graphs[name] = _graph(network.eval(), example, several=name != ONE_STREAM)
         if layers:
             graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
-    state: dict[str, Tensor] = next(iter(networks.values())).get_submodule("model").state_dict()
+    state: dict[str, Tensor] = model.state_dict()
     known: dict[str, Any] = {}
     files: list[Path] = []
     try:
-        (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
         for name, graph in graphs.items():
             data, known[name] = _written(graph, state)
-            files.append(folder / FOLDER / f"{name}.onnx")
+            files.append(out / FOLDER / f"{name}.onnx")
             files[-1].write_bytes(data)
         manifest = {
             "format": FORMAT,
@@ -147,10 +177,10 @@ def export(
             "tensors": {name: (list(value.shape), value.is_floating_point()) for name, value in state.items()},
             "networks": known,
         }
-        files.append(folder / FOLDER / MANIFEST)
+        files.append(out / FOLDER / MANIFEST)
         files[-1].write_text(json.dumps(manifest, indent=0) + "\n", encoding="utf-8")
     except OSError as error:
-        raise ModelError(f"{folder / FOLDER}: cannot be written: {error.strerror}") from error
+        raise ModelError(f"{out / FOLDER}: cannot be written: {error.strerror}") from error
     return files
 
 

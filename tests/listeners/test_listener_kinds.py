@@ -13,4 +13,4 @@ def test_a_kind_that_is_none_is_one_line_with_the_choices():
 
 @pytest.mark.parametrize("name", LISTENER_KINDS)
 def test_our_settings_say_their_own_kind(name):
-    assert LISTENER_KINDS[name].settings.model_fields["kind"].annotation.__args__ == (name,)
+    assert LISTENER_KINDS[name].model_fields["kind"].annotation.__args__ == (name,)

@@ -129,13 +129,13 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
 
 def _in_bf16(where: Path, settings: config.Arig) -> Listener:
     """Return an ARIG on torch with its large layers in bf16. No configuration asks for it: its row shows why."""
-    from sfms_robot.listeners.arig import networks, torch_engine
+    from sfms_robot.listeners.arig import networks
+    from sfms_robot.listeners.torch_engine import TorchEngine
 
     found = load_listener(where, graphs=False, engine="torch", threads=1)
     how = _how(found)
-    how.engine = torch_engine(
-        settings.model_copy(update={"precision": "fp32"}), networks.with_layers(how.model, networks.Bf16Linear)
-    )
+    model = networks.with_layers(how.model, networks.Bf16Linear)
+    how.engine = TorchEngine(model, networks.networks(model))
     how.build_graphs()
     return found
 
@@ -173,9 +173,9 @@ def _sfms_paper() -> dict[str, Row]:
     """Measure the paper's size of SFMS with seeded weights, on torch."""
     import torch
 
-    from sfms_robot.listeners.sfms import torch_engine
     from sfms_robot.listeners.sfms.model import SfmsModel
     from sfms_robot.listeners.sfms.stream import SfmsListener
+    from sfms_robot.listeners.torch_engine import torch_engine
 
     training = config.load_training(data_dir("configs") / "training" / f"{PAPER}.yaml")
     if not isinstance(training, config.Training):
@@ -185,7 +185,7 @@ def _sfms_paper() -> dict[str, Row]:
         model = SfmsModel(training.listener)
     streams: dict[str, Stream] = {}
     for way in (EAGER, "torch"):
-        found = SfmsListener(training.listener, torch_engine(training.listener, model))
+        found = SfmsListener(training.listener, torch_engine(model))
         streams[way] = Stream(found if way == EAGER else found.build_graphs(), found.start(0))
     take_turns(streams, talk())
     params = sum(each.numel() for each in model.parameters())

@@ -194,6 +194,7 @@ class SfmsModel(nn.Module):
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
+        self.settings = settings
         width, bins = len(settings.channels), SHAPES[settings.audio][1]
         self.motion_mean = nn.Buffer(torch.zeros(width))
         self.motion_std = nn.Buffer(torch.ones(width))
@@ -233,9 +234,9 @@ class Network(nn.Module):
 
     free: tuple[str, ...] = ()
 
-    def __init__(self, model: SfmsModel, settings: config.Sfms) -> None:
+    def __init__(self, model: SfmsModel) -> None:
         super().__init__()
-        self.model = model
+        self.model, settings = model, model.settings
         self.future = settings.future_frames
         self.codes = [group.codes for group in settings.groups.values()]
 
@@ -318,7 +319,7 @@ def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
     return model.tokenizer.encode(model.standardise(still), mask[None])[0]
 
 
-def networks(model: SfmsModel, settings: config.Sfms) -> dict[str, Network]:
+def networks(model: SfmsModel) -> dict[str, Network]:
     """Return all networks by name."""
     kinds = {"rest": Rest, "hear": Hear, "ahead": Ahead, "next": Next, "decode": Decode}
-    return {name: kind(model, settings).eval() for name, kind in kinds.items()}
+    return {name: kind(model).eval() for name, kind in kinds.items()}

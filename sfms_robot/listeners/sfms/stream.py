@@ -11,9 +11,9 @@ Between plans nothing is computed: frames are kept, and become features with the
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -102,22 +102,24 @@ class SfmsMemory:
 class SfmsListener(RunsOnEngine):
     """SFMS as a stream; its engine runs `model.networks`."""
 
-    def __init__(
-        self,
-        settings: config.Sfms,
-        engine: Engine,
-        space: MotionSpace | None = None,
-        frontend: AudioFrontend | None = None,
-    ) -> None:
+    def __init__(self, settings: config.Sfms, engine: Engine, folder: Path | None = None) -> None:
+        """Take what the settings name (a matrix, a model of sound) from the listener's `folder`.
+
+        Raises ConfigError or ModelError.
+        """
         self.settings = settings
         self.engine = engine
-        self.space = space or MotionSpace.of(settings)
-        self.frontend = frontend or AudioFrontend.of(settings)
+        self.space = MotionSpace.of(settings, folder)
+        self.frontend = AudioFrontend.of(settings, folder)
         self._scales = engine.tensors
         self.sway = HeadSway(settings, engine.tensors)
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
+        self.hop, self.horizon = settings.hop_frames, settings.future_frames
+        self.hops = range(1, self.horizon + 1) if settings.hop == "auto" else (self.hop,)
+        if settings.events:
+            self.control_frames = (settings.past_frames, self.horizon)
         # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
         mask = neutral_mask(settings.past_frames, len(settings.groups))
@@ -126,6 +128,16 @@ class SfmsListener(RunsOnEngine):
         groups = settings.groups.values()
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
+        p = settings.past_frames
+        self._unheard = SpeakerState(
+            audio=self.frontend.start(),
+            rows=np.zeros(self.frontend.shape, np.float32),
+            voice=np.zeros((p, settings.predictor_width), np.float32),
+            heard=np.zeros(p, np.bool_),
+            phase=np.zeros((p, self.frontend.phase_features), np.float32),
+            face=np.zeros((p, self.space.dim), np.float32),
+            face_known=np.zeros(p, np.bool_),
+        )
         reach = CodeReach(codes, own, sizes, self._scales["motion_speed"], bounded)
         self.sampler = Sampler(settings, engine, reach, self._courses(codes))
 
@@ -148,48 +160,19 @@ class SfmsListener(RunsOnEngine):
             courses.append(EventCourse(how, list(self.settings.groups).index(group), values))
         return courses
 
-    @property
-    def hop(self) -> int:
-        """Return the frames from one plan to the next."""
-        return self.settings.hop_frames
-
-    @property
-    def hops(self) -> Sequence[int]:
-        """Return the hops that `at_hop` takes."""
-        return range(1, self.horizon + 1) if self.settings.hop == "auto" else (self.hop,)
-
-    def at_hop(self, hop: int) -> SfmsListener:
-        """Return a listener of the same weights that plans every `hop` frames."""
-        other = copy.copy(self)
-        other.settings = self.settings.model_copy(update={"hop": hop})
-        return other
-
-    @property
-    def horizon(self) -> int:
-        """Return the frames of a plan."""
-        return self.settings.future_frames
-
-    @property
-    def control_frames(self) -> tuple[int, int]:
-        """Return how many control rows `step` takes, up to the newest frame and after it; (0, 0) without events."""
-        return (self.settings.past_frames, self.horizon) if self._columns else (0, 0)
-
     def start(self, seed: int) -> SfmsMemory:
         """Return the memory of a stream without sound so far and with a neutral face."""
-        p = self.settings.past_frames
-        speaker = SpeakerState(
-            audio=self.frontend.start(),
-            rows=np.zeros(self.frontend.shape, np.float32),
-            voice=np.zeros((p, self.settings.predictor_width), np.float32),
-            heard=np.zeros(p, np.bool_),
-            phase=np.zeros((p, self.frontend.phase_features), np.float32),
-            face=np.zeros((p, self.space.dim), np.float32),
-            face_known=np.zeros(p, np.bool_),
-        )
         tokens, path = self.at_rest()
         control = np.zeros((len(tokens), self._columns), np.float32)
-        sway = self.sway.start(seed)
-        return SfmsMemory(seed=seed, frames=0, speaker=speaker, tokens=tokens, control=control, path=path, sway=sway)
+        return SfmsMemory(
+            seed=seed,
+            frames=0,
+            speaker=self._unheard,
+            tokens=tokens,
+            control=control,
+            path=path,
+            sway=self.sway.start(seed),
+        )
 
     def at_rest(self) -> tuple[Tokens, Floats]:
         """Return tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
@@ -219,17 +202,23 @@ class SfmsListener(RunsOnEngine):
         """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
 
-    def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None
+    def step_each(
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[SfmsMemory],
+        controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together."""
-        heard = [_listened(speaker, memory.speaker) for speaker, memory in zip(speakers, memories, strict=False)]
-        if len(speakers) < len(memories):
-            speakers, heard = [*speakers] * len(memories), heard * len(memories)
-        found: list[tuple[Plan | None, SfmsMemory]] = [
-            (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
-            for memory, speaker in zip(memories, heard, strict=True)
-        ]
+        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together.
+
+        Streams that began together with the same speaker share its state, so its features are computed once.
+        """
+        heard: dict[tuple[int, int], SpeakerState] = {}
+        found: list[tuple[Plan | None, SfmsMemory]] = []
+        for speaker, memory in zip(speakers, memories, strict=True):
+            same = id(speaker), id(memory.speaker)
+            if same not in heard:
+                heard[same] = _listened(speaker, memory.speaker)
+            found.append((None, changed(memory, frames=memory.frames + 1, speaker=heard[same])))
         due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
             control = self.told([None if controls is None else controls[row] for row in due])

@@ -7,8 +7,8 @@ from sfms_robot.config.listener import parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.arig import load
 from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.registry import load_folder
 
 LISTENERS = data_dir("configs") / "listeners"
 
@@ -56,7 +56,7 @@ def test_a_folder_is_loaded_again_as_it_was_saved(tmp_path):
     checkpoint.save_config(tmp_path, settings)
     model = ArigModel(settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
-    loaded = load(tmp_path)
+    loaded = load_folder(tmp_path)
     assert loaded.settings == settings
     assert all((loaded.model.state_dict()[name] == value).all() for name, value in model.state_dict().items())
 
@@ -69,7 +69,7 @@ def test_weights_in_fewer_bits_make_a_frame_that_differs_by_little_of_its_spread
     exact.model.motion_std.fill_(0.02)
     checkpoint.save_config(tmp_path, exact.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, exact.model, bits)
-    shorter, memory, frames = load(tmp_path), exact.start(1), []
+    shorter, memory, frames = load_folder(tmp_path), exact.start(1), []
     for frame in talk(40):
         other, _ = shorter.step(frame, memory)
         plan, memory = exact.step(frame, memory)

@@ -130,7 +130,7 @@ def test_several_streams_of_one_speaker_are_what_each_is_alone(told):
     for index, frame in enumerate(speaker):
         rows = [control[index : index + 2] for control in controls]
         alone = [told.step(frame, memory, row) for memory, row in zip(memories, rows, strict=True)]
-        plans, memories = told.step_many(frame, memories, rows)
+        plans, memories = zip(*told.step_each([frame] * 3, memories, rows), strict=True)
         for plan, memory, (own_plan, own) in zip(plans, memories, alone, strict=True):
             np.testing.assert_allclose(plan.frames, own_plan.frames, atol=1e-4)
             assert (memory.state, memory.sojourn) == (own.state, own.sojourn)

@@ -12,10 +12,10 @@ from sfms_robot.config.listener import STATES
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
-from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.listeners.torch_engine import torch_engine
 
 ABLATIONS = [
     {},
@@ -61,7 +61,7 @@ def shipped(name: str, **changes) -> ArigListener:
     settings = settings.model_copy(update={"events": False, "draws": "motion", **changes})
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return ArigListener(settings, torch_engine(settings, ArigModel(settings)))
+        return ArigListener(settings, torch_engine(ArigModel(settings)))
 
 
 SHIPPED = ["arig-small", pytest.param("arig-paper", marks=pytest.mark.slow)]
@@ -222,4 +222,4 @@ def test_silence_leaves_the_face_where_it_may_be():
 def test_features_that_nothing_here_computes_cannot_be_run():
     model = arig_model(sound="wav2vec2")
     with pytest.raises(ModelError, match="'wav2vec2': such a model can be trained and evaluated, not run"):
-        ArigListener(model.settings, torch_engine(model.settings, model))
+        ArigListener(model.settings, torch_engine(model))

@@ -130,10 +130,12 @@ def test_streams_side_by_side_do_what_each_does_alone(tiny):
     alone = [plans_of(tiny, speaker, seed) for seed in seeds]
     memories = [tiny.start(seed) for seed in seeds]
     for index, frame in enumerate(speaker):
-        plans, memories = tiny.step_many(frame, memories)
-        assert len(plans) == (3 if index in alone[0] else 0)
-        for plan, own in zip(plans, alone, strict=False):
-            np.testing.assert_allclose(plan.frames, own[index].frames, atol=1e-5)
+        plans, memories = zip(*tiny.step_each([frame] * 3, memories), strict=True)
+        assert len({id(memory.speaker) for memory in memories}) == 1
+        for plan, own in zip(plans, alone, strict=True):
+            assert (plan is None) == (index not in own)
+            if plan is not None:
+                np.testing.assert_allclose(plan.frames, own[index].frames, atol=1e-5)
 
 
 def test_one_seed_repeats_and_two_differ(tiny):
