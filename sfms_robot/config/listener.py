@@ -396,7 +396,7 @@ class Arig(ListenerSettings):
         draws: target of the sampler: the `motion` of a frame, as in the paper; the `step` from the frame before, whose
             errors are small where a face is still, but add up; or the `innovation` of a first-order autoregression
             fitted on the data, a step that is forgotten as fast as people's motion returns to its mean.
-        precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
+        precision: of large layers on onnxruntime; auto: int8 where the folder has such graphs. torch computes in fp32.
     """
 
     kind: Literal["arig"]

@@ -19,7 +19,7 @@ import logging
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -29,12 +29,11 @@ from typing import Any, Final, Literal, Protocol, Self
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.errors import ModelError, optional
+from sfms_robot.errors import ModelError
 from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
-Examples = Mapping[str, Mapping[str, Array]]  # inputs of every network, by the names of network and input
 
 KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
 ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
@@ -64,12 +63,6 @@ class Engine(Protocol):
         `inputs` are (N, ...) in the network's order; one of (1, ...) is the same for all streams.
         """
         ...
-
-    def build_graphs(self, examples: Examples) -> None:
-        """Make calls for a single stream, as in `examples`, as fast as possible; the weights must not change any more.
-
-        Takes a second with torch, nothing with onnx.
-        """
 
     def set_threads(self, threads: int) -> None:
         """Use this many threads from now on."""
@@ -136,15 +129,6 @@ class RunsOnEngine:
         except AttributeError:
             name = self.engine.name
             raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
-
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        raise NotImplementedError
-
-    def build_graphs(self) -> Self:
-        """Build the engine's graphs and return this listener."""
-        self.engine.build_graphs(self.examples(1))
-        return self
 
 
 def stacked(parts: Sequence[Array]) -> Array:
@@ -250,17 +234,15 @@ class OnnxEngine:
     """An `Engine` on onnxruntime.
 
     Args:
-        folder: of the listener, for messages.
+        folder: of the listener; its weights are read again whenever the number of threads changes.
         graphs: of its networks.
-        weights: returns the tensors of model.safetensors with their names, one after another; called again whenever the
-            number of threads changes.
         threads: that each network may use.
+
+    Raises ModelError as `checkpoint.stored_tensors`, and for a graph that onnxruntime does not take.
     """
 
-    def __init__(
-        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Iterable[tuple[str, Array]]], threads: int = 1
-    ) -> None:
-        self._folder, self._graphs, self._weights = folder, graphs, weights
+    def __init__(self, folder: Path, graphs: GraphFolder, threads: int = 1) -> None:
+        self._folder, self._graphs = folder, graphs
         self.tensors: Mapping[str, Array] = {}
         self._threads = 0
         self._sessions: dict[str, tuple[Any, list[str]]] = {}  # of each network, with the names of its inputs
@@ -271,9 +253,6 @@ class OnnxEngine:
         """Return "onnx", the precision and the threads."""
         precision = " int8" if self._graphs.in_integers else ""
         return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
-
-    def build_graphs(self, examples: Examples) -> None:
-        """Do nothing: the networks are graphs already."""
 
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `Engine.run`."""
@@ -292,7 +271,7 @@ class OnnxEngine:
         plain = {name for graph in graphs.values() for name in {*graph.weights} - {*graph.rounded}}
         rounded = {name for graph in graphs.values() for name in graph.rounded}
         values, small = {}, {}
-        for name, weight in self._weights():
+        for name, weight in stored_tensors(self._folder / WEIGHTS, self._graphs.wanted):
             if name in plain:
                 values[name] = _value(weight)
             if name in rounded:
@@ -371,52 +350,25 @@ def whole_integers() -> bool:
 
 # --- Choice of an engine ----------------------------------------------------------------------------------------------
 #
-# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process_child`) measures
-# whether one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two
-# seconds and 200 MB.
+# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process`) measures whether
+# one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two seconds
+# and 200 MB.
 
 
-def engine_of(
-    folder: Path,
-    settings: config.ListenerSettings,
-    wanted: EngineName,
-    torch_engine: Callable[[], Engine],
-    threads: int | None = None,
-) -> Engine:
-    """Load the engine of a listener's folder.
+def graphs_to_run(folder: Path, settings: config.ListenerSettings, wanted: EngineName) -> GraphFolder | None:
+    """Return the graphs to run; None for torch. `precision: auto` takes 8 bits where there are graphs of it.
 
-    Args:
-        folder: of the listener.
-        settings: of the listener.
-        wanted: the engine, or auto.
-        torch_engine: makes torch's, with the folder's weights.
-        threads: None for one, and with torch for the number that it uses.
-
-    Raises ModelError, and ConfigError where a package that `wanted` needs is not installed.
+    Raises ModelError.
     """
-    graphs = _graphs(folder, settings, wanted)
-    if graphs is not None:
-        file, shapes = folder / WEIGHTS, graphs.wanted
-        return OnnxEngine(folder, graphs, lambda: stored_tensors(file, shapes), threads or 1)
-    with optional(f"{folder}: a listener without graphs of engine onnx"):
-        engine = torch_engine()
-    if threads is not None:
-        engine.set_threads(threads)
-    return engine
-
-
-def _graphs(folder: Path, settings: config.ListenerSettings, wanted: EngineName) -> GraphFolder | None:
-    """Return the graphs to run; None for torch. `precision: auto` takes 8 bits where there are graphs of it."""
-    if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
-        return None
     precision = settings.precision if isinstance(settings, config.Arig) else "fp32"
-    try:
-        graphs = read_graphs(folder, settings, integers=precision != "fp32")
-    except ModelError as error:
-        if wanted == "onnx" or find_spec("torch") is None:
-            raise
-        log.warning("torch in place of onnx: %s", error)
-        return None
-    if precision == "int8" and not graphs.in_integers:
+    found = None
+    if wanted == "onnx" or (wanted == "auto" and has_graphs(folder)):
+        try:
+            found = read_graphs(folder, settings, integers=precision != "fp32")
+        except ModelError as error:
+            if wanted == "onnx" or find_spec("torch") is None:
+                raise
+            log.warning("torch in place of onnx: %s", error)
+    if precision == "int8" and (found is None or not found.in_integers):
         raise ModelError(f"{folder}: precision int8, and no graphs in 8 bits: sfms-robot export --int8 {folder}")
-    return graphs
+    return found

@@ -38,7 +38,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Floats, ListenerEvent, Plan, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.engine import RunsOnEngine
 from sfms_robot.listeners.events.model import AT_PERSON, Decision, EventMemory, EventModel
 from sfms_robot.listeners.idle import IdleMotion, IdleStream
@@ -57,7 +57,6 @@ class EventfulMemory:
 
     Attributes:
         when, how: memories of the event model and of the motion model.
-        events: decided, and not over for longer than the model looks back; the last gaze shift always.
         news: decided since the last plan.
         gaze: state of the eyes after the newest frame, then after every further frame of the plan in force.
         idle: the stream's own idle motion; None: it has none.
@@ -65,7 +64,6 @@ class EventfulMemory:
 
     when: EventMemory
     how: Any
-    events: tuple[ListenerEvent, ...] = ()
     news: tuple[ListenerEvent, ...] = ()
     gaze: tuple[GazeState, ...]
     idle: IdleStream | None = None
@@ -78,32 +76,13 @@ class EventfulListener:
         self, how: RunsOnEngine, when: EventModel, calmness: Calmness | None = None, idle: IdleMotion | None = None
     ) -> None:
         self.how, self.when, self.calmness, self.idle = how, when, calmness or Calmness(), idle
-
-    @property
-    def hop(self) -> int:
-        """Return the frames from one plan to the next."""
-        return self.how.hop
-
-    @property
-    def horizon(self) -> int:
-        """Return the frames of a plan."""
-        return self.how.horizon
-
-    @property
-    def hops(self) -> Sequence[int]:
-        """Return the hops that `at_hop` takes."""
-        return self.how.hops
+        self.engine, self.hop, self.hops, self.horizon = how.engine, how.hop, how.hops, how.horizon
 
     def at_hop(self, hop: int) -> Self:
         """Return the same listener, planning every `hop` frames."""
         other = copy.copy(self)
-        other.how = self.how.at_hop(hop)
+        other.how, other.hop = self.how.at_hop(hop), hop
         return other
-
-    def build_graphs(self) -> Self:
-        """Compile the networks; their weights must not change any more. Return the listener."""
-        self.how.build_graphs()
-        return self
 
     def start(self, seed: int) -> EventfulMemory:
         """Return the memory of a new stream, before any frame and any event."""
@@ -131,12 +110,11 @@ class EventfulListener:
         found: list[EventfulMemory] = []
         controls: list[Floats | None] = []
         for speaker, memory, (decision, when) in zip(speakers, memories, decided, strict=True):
-            events = _remembered((*memory.events, *decision.events), speaker.time_s - past * FRAME_S)
             gaze = memory.gaze[1:] or memory.gaze  # past the end of a plan the eyes stay
-            found.append(changed(memory, when=when, events=events, news=memory.news + decision.events, gaze=gaze))
+            found.append(changed(memory, when=when, news=memory.news + decision.events, gaze=gaze))
             # Control rows of frames t - P + 1 to t + A, where frame t brings a plan.
             due, first = self.how.is_due(memory.how), frame_of(speaker) + 1 - past
-            controls.append(control_track(events, first, past + ahead) if due else None)
+            controls.append(control_track(when.decided.done, first, past + ahead) if due else None)
         moved = self.how.step_each([*map(_believed, speakers)], [memory.how for memory in found], controls)
         return [
             self._looking(plan, decision, changed(memory, how=how))
@@ -149,7 +127,7 @@ class EventfulListener:
         """Return the plan with eyes, idle motion and the new events, and the memory after it."""
         if plan is None:
             return None, memory
-        shifts = [event for event in memory.events if event.target_rad is not None]
+        shifts = [event for event in memory.when.decided.done if event.target_rad is not None]
         targets = [target_at(shifts, time_s) for time_s in plan.times_s.tolist()]
         head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, memory.gaze[0])
         frames = plan.frames.copy()
@@ -182,15 +160,3 @@ def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, fl
         if event.target_rad is not None and event.start_s <= time_s + 1e-9:
             return event.target_rad
     return AT_PERSON
-
-
-def _remembered(events: tuple[ListenerEvent, ...], keep_s: float) -> tuple[ListenerEvent, ...]:
-    """Return events that are not over by `keep_s`, in order of decision, and the last gaze shift begun by then."""
-    if not events:
-        return events
-    shifts = [event for event in events if event.target_rad is not None and event.start_s <= keep_s]
-    return tuple(
-        event
-        for event in events
-        if event in shifts[-1:] or (event.end_s > keep_s if event.target_rad is None else event.start_s > keep_s)
-    )

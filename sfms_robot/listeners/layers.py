@@ -1,7 +1,7 @@
 """Layers that both listeners share: attention, feed-forward, modulation, written out so that a step is plain to see.
 
-SFMS is made of `Block`s over sequences. ARIG makes one frame at a time, where calling a module costs as much as its
-product: its layers skip the hooks of `nn.Module` (`PlainModule`), and a query looks at a few tokens (`CrossAttention`).
+SFMS is made of `Block`s over sequences. ARIG makes one frame at a time: a query looks at a few tokens
+(`CrossAttention`).
 
 Shapes: B batch, T frames of the query, S frames of the memory, N samples, D width, h heads.
 """
@@ -141,25 +141,6 @@ class Block(nn.Module):
 # --- Layers of single frames (ARIG) -----------------------------------------------------------------------------------
 
 
-class PlainModule(nn.Module):
-    """A module that is called without hooks, which nothing here uses: for one frame they cost as much as a product."""
-
-    def __call__(self, *args: Any) -> Any:
-        return self.forward(*args)
-
-
-class Linear(nn.Linear):
-    """A linear layer without hooks, as `PlainModule`."""
-
-    __call__ = nn.Linear.forward
-
-
-class LayerNorm(nn.LayerNorm):
-    """A LayerNorm without hooks, as `PlainModule`."""
-
-    __call__ = nn.LayerNorm.forward
-
-
 def split_heads(x: Tensor, heads: int) -> Tensor:
     """Return x (N, S, D) as (N, h, S, D/h)."""
     n, s, d = x.shape
@@ -187,13 +168,13 @@ def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
     return join_heads(attend(*(split_heads(each, heads) for each in (q, k, v))))
 
 
-class FeedForward(PlainModule):
+class FeedForward(nn.Module):
     """Widen to `hidden`, GELU, narrow."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.up = Linear(width, hidden)
-        self.down = Linear(hidden, width)
+        self.up = nn.Linear(width, hidden)
+        self.down = nn.Linear(hidden, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (..., D) of x (..., D)."""
@@ -201,7 +182,7 @@ class FeedForward(PlainModule):
         return out
 
 
-class Modulation(PlainModule):
+class Modulation(nn.Module):
     """adaLN (Peebles and Xie 2023; A.1): shifts, scales and gates of a block, computed from a condition.
 
     Ours: a new one leaves its block a plain one (shifts about 0, scales and gates about 1), because gates of 0, with
@@ -212,27 +193,26 @@ class Modulation(PlainModule):
         """Make vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
         super().__init__()
         self.parts = len(kinds)
-        self.linear = Linear(width, self.parts * size)
+        self.linear = nn.Linear(width, self.parts * size)
         nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
         with torch.no_grad():
             self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
 
     def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
-        return self.linear(condition).chunk(self.parts, dim=-1)
+        parts: tuple[Tensor, ...] = self.linear(condition).chunk(self.parts, dim=-1)
+        return parts
 
     def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample; (size,) if N is 1."""
-        parts = self.linear(condition)
-        return (parts[0] if parts.shape[0] == 1 else parts[:, None]).chunk(self.parts, dim=-1)
+        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample."""
+        parts: tuple[Tensor, ...] = self.linear(condition)[:, None].chunk(self.parts, dim=-1)
+        return parts
 
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """Return LayerNorm of x (..., D) without weights, then scaled and shifted; `shift`, `scale` broadcast to x."""
     if torch.compiler.is_exporting():
         return exported_norm(x, scale, shift)
-    if shift.dim() == 1:  # the same for all: LayerNorm applies it as its own weights
-        return torch.layer_norm(x, x.shape[-1:], scale, shift)
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
 
 
@@ -247,7 +227,7 @@ def windows(x: Tensor, size: int) -> Tensor:
     return padded.unfold(1, size, 1).transpose(-1, -2)
 
 
-class CrossAttention(PlainModule):
+class CrossAttention(nn.Module):
     """A query that looks at a few tokens, then a feed-forward; pre-norm, residual.
 
     Keys and values of a token do not depend on its slot: the meaning of a slot is added to the finished key. So a
@@ -257,12 +237,12 @@ class CrossAttention(PlainModule):
     def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = LayerNorm(width)
-        self.query = Linear(width, width)
-        self.key_value = Linear(width, 2 * width)
+        self.norm = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
         self.slots = nn.Parameter(torch.randn(slots, 2 * width) * 0.02)
-        self.out = Linear(width, width)
-        self.ffn_norm = LayerNorm(width)
+        self.out = nn.Linear(width, width)
+        self.ffn_norm = nn.LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
     def keys(self, tokens: Tensor) -> Tensor:

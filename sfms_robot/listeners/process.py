@@ -3,8 +3,8 @@
 In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
 model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.
 
-A listener that is loaded is not yet fast: it builds its graphs while the head eases in, tries whether more than one
-thread is faster, and measures what a plan takes on this machine. From that, and from how late the source has been for
+A listener that is loaded tries, while the head eases in, whether more than one thread is faster, and measures what a
+plan takes on this machine. From that, and from how late the source has been for
 half a second, the parent chooses its hop. Every ten seconds the choice is compared with what has been measured since: a
 hop that does not fit any more is replaced by a shorter one, never by a longer one, so that it settles.
 
@@ -44,7 +44,7 @@ from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, calmed
+from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, listen
 from sfms_robot.ports import Listener
 from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, cores, give_way
 from sfms_robot.signals.quantiles import Quantiles
@@ -61,8 +61,6 @@ PROBE_S: Final = 0.5
 PROBE_PLANS: Final = 12
 
 log = logging.getLogger(__name__)
-
-Say = Callable[[tuple[str, Any, float]], object]
 
 
 class ListenerProcess:
@@ -287,11 +285,10 @@ def main() -> None:
     parent.forward(sort)
     give_way(NICE)
     try:
-        from sfms_robot.listeners.registry import at_hop, build_graphs, engine_name, hops_of, load_listener
+        from sfms_robot.listeners.registry import at_hop, engine_name, hops_of, load_listener
 
-        listener = load_listener(name, graphs=False, calmness=calmness, engine=engine, threads=1)
+        listener = load_listener(name, calmness=calmness, engine=engine, threads=1)
         parent.send(("loaded", engine_name(listener), 0.0))
-        build_graphs(listener)
         choices = hops_of(listener)
         if use_threads(at_hop(listener, min(choices)), threads()):
             parent.send(("loaded", engine_name(listener), 0.0))
@@ -362,21 +359,3 @@ def plan_times_s(
         wait(max(0.0, FRAME_S - taken_s))
     p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
     return float(p50_s), float(p99_s)
-
-
-def listen(listener: Listener, seed: int, inbox: Inbox, say: Say, hops: queue.SimpleQueue[int] | None = None) -> None:
-    """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
-    from sfms_robot.listeners.registry import at_hop
-
-    memory = listener.start(seed)
-    say(("ready", None, 0.0))
-    while (frame := inbox.next()) is not None:
-        if inbox.skipped:
-            say(("skipped", None, inbox.skipped))
-        memory = calmed(listener, memory, inbox)
-        while hops is not None and not hops.empty():
-            listener = at_hop(listener, hops.get())
-        began_s = time.perf_counter()
-        plan, memory = listener.step(frame, memory)
-        taken_ms = (time.perf_counter() - began_s) * 1e3
-        say(("done" if plan is None else "plan", plan, taken_ms))

@@ -55,23 +55,18 @@ class ClockSample:
 
 
 class ClockOffset:
-    """The samples of the last `WINDOW_S` that could still become the best one."""
+    """The samples of the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
+        self._samples: deque[ClockSample] = deque()
 
     def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
         """Add an exchange: t1 to t4 of the module's text."""
-        sample = ClockSample(
-            came_s,
-            ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,
-            max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s)),
-        )
-        if self._samples and abs(sample.offset_s - self._samples[0].offset_s) > SET_S + sample.delay_s:
+        offset_s = ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2
+        delay_s = max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s))
+        if self.best is not None and abs(offset_s - self.best.offset_s) > SET_S + delay_s:
             self._samples.clear()
-        while self._samples and self._samples[-1].delay_s >= sample.delay_s:
-            self._samples.pop()
-        self._samples.append(sample)
+        self._samples.append(ClockSample(came_s, offset_s, delay_s))
         while came_s - self._samples[0].at_s > WINDOW_S:
             self._samples.popleft()
 
@@ -82,11 +77,12 @@ class ClockOffset:
     @property
     def best(self) -> ClockSample | None:
         """Return the sample with the least delay; None before the first."""
-        return self._samples[0] if self._samples else None
+        return min(self._samples, key=lambda sample: sample.delay_s, default=None)
 
     def theirs(self, our_s: float) -> float | None:
         """Return a time of our clock by the server's; None while nothing is known of it."""
-        return None if self.best is None else our_s + self.best.offset_s
+        best = self.best
+        return None if best is None else our_s + best.offset_s
 
 
 class JitterBuffer:

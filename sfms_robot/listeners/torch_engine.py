@@ -1,4 +1,4 @@
-"""Networks on torch: run as modules or traced graphs, or written as ONNX graphs without weights.
+"""Networks on torch: run as modules, or written as ONNX graphs without weights.
 
 `TorchEngine` runs a listener's networks. `export` writes them for `engine.OnnxEngine`: torch.export traces a network
 for any number of streams, torch.onnx writes it, onnxscript simplifies it. Weights keep the names that they have in
@@ -12,28 +12,30 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.networks import large_layers, with_precision
+from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.arig.networks import networks as arig_networks
-from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
-from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Examples, digest
+from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, RunsOnEngine, digest
+from sfms_robot.listeners.registry import model_of_motion
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
-from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.signals.control import COLUMNS
 
 Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
 
-WARM_UPS: Final = 3  # torch.jit specialises a graph in its first two runs
 MODEL: Final = "model."  # before the name of a weight, in every network
 MOST_STREAMS: Final = 4096
 EXAMPLE_STREAMS: Final = 3
@@ -48,44 +50,39 @@ class TorchEngine:
         networks: of the model.
     """
 
+    name = "torch"
+
     def __init__(self, model: nn.Module, networks: Networks) -> None:
         self.model = model.eval()
-        state = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
-        self.tensors = {name: value.detach().numpy() for name, value in state.items() if not value.is_quantized}
+        self.tensors = {name: value.detach().numpy() for name, value in model.state_dict().items()}
         self._networks = networks
-        self._graphs: dict[str, Callable[..., Any]] = {}
-
-    @property
-    def name(self) -> str:
-        """Return "torch"."""
-        return "torch"
-
-    @torch.inference_mode()
-    def build_graphs(self, examples: Examples) -> None:
-        """Trace every network for a single stream: a small model takes a fifth less time. The weights must not change.
-
-        Sizes that a module turns into Python numbers stay those of the example. torch.jit is being retired; what takes
-        its place needs a C++ compiler on the machine that runs.
-        """
-        for name, inputs in examples.items():
-            network, example = self._networks[name].eval(), _tensors(inputs.values())
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                traced = torch.jit.trace(network, example, check_trace=False)  # type: ignore[no-untyped-call]
-                self._graphs[name] = torch.jit.freeze(traced)
-            for _ in range(WARM_UPS):
-                self._graphs[name](*example)
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `engine.Engine.run`."""
-        tensors = _tensors(inputs)
-        module = self._graphs.get(network) if max(map(len, tensors)) == 1 else None
-        return tuple(output.numpy() for output in (module or self._networks[network])(*tensors))
+        return tuple(output.numpy() for output in self._networks[network](*_tensors(inputs)))
 
     def set_threads(self, threads: int) -> None:
         """Use this many threads in the whole process: torch has no other setting."""
         torch.set_num_threads(threads)
+
+
+class Recorder(TorchEngine):
+    """An engine that keeps the inputs of the last call of each network, by name, as examples."""
+
+    def __init__(self, model: nn.Module, networks: Networks) -> None:
+        super().__init__(model, networks)
+        self.examples: dict[str, dict[str, Tensor]] = {}
+
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """Return the outputs of a network, see `engine.Engine.run`."""
+        module, streams = self._networks[network], max(map(len, inputs))
+        names = [*signature(module.forward).parameters]
+        if further := getattr(module, "further", ()):  # in place of *parts
+            names[-1:] = further
+        arrays = _tensors(np.broadcast_to(each, (streams, *each.shape[1:])) for each in inputs)
+        self.examples[network] = dict(zip(names, arrays, strict=False))
+        return super().run(network, *inputs)
 
 
 def new_model(settings: config.ListenerSettings) -> SfmsModel | ArigModel:
@@ -103,12 +100,14 @@ def load_model(folder: Path) -> SfmsModel | ArigModel:
     return model.eval()
 
 
+def networks_of(model: SfmsModel | ArigModel) -> Networks:
+    """Return the networks of a model by name."""
+    return arig_networks(model) if isinstance(model, ArigModel) else sfms_networks(model)
+
+
 def torch_engine(model: SfmsModel | ArigModel) -> TorchEngine:
-    """Return an engine for a model in memory, in the precision of its settings. Raises ModelError."""
-    if isinstance(model, ArigModel):
-        model = with_precision(model, model.settings.precision)
-        return TorchEngine(model, arig_networks(model))
-    return TorchEngine(model, sfms_networks(model))
+    """Return an engine for a model in memory."""
+    return TorchEngine(model, networks_of(model))
 
 
 def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
@@ -143,23 +142,20 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     Raises ConfigError, MissingExtra, and ModelError where `out` cannot be written.
     """
     settings = load_config(folder)
-    model = new_model(settings).eval()
-    listener: SfmsListener | ArigListener
-    networks: Networks
-    if isinstance(model, ArigModel):
-        networks, layers = arig_networks(model, kept=False), large_layers(model) if int8 else []
-        listener = ArigListener(model.settings, TorchEngine(model, networks))
-    else:
-        networks, layers = sfms_networks(model), []
-        unheard = model.settings.model_copy(update={"wav2vec2": None})  # examples need no model of sound
-        listener = SfmsListener(unheard, TorchEngine(model, networks))
-    examples = listener.examples(EXAMPLE_STREAMS)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = new_model(settings).eval()
+    layers = large_layers(model) if int8 and isinstance(model, ArigModel) else []
+    recorder = Recorder(model, networks_of(model))
+    listener: RunsOnEngine = model_of_motion(settings, recorder, folder)
+    control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
+    silence = SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32))
+    memories = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
+    listener.step_each([silence] * EXAMPLE_STREAMS, memories, control * EXAMPLE_STREAMS)
     graphs: dict[str, Any] = {}
-    for name, network in networks.items():
-        example = dict(zip(examples[name], _tensors(examples[name].values()), strict=True))
+    for name, network in networks_of(model).items():
         with torch.no_grad():
-            network(*example.values())  # fills caches, which must not be traced
-            graphs[name] = _graph(network.eval(), example, several=name != ONE_STREAM)
+            graphs[name] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
         if layers:
             graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
     state: dict[str, Tensor] = model.state_dict()

@@ -40,7 +40,7 @@ from sfms_robot.lab.learning.events.event_trainer import (
 from sfms_robot.lab.learning.events.labels import meeting_evidence
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, STEP_FRAMES, STEP_S, DecideMemory, EventModel
-from sfms_robot.listeners.stream_rng import Use, uniforms_of
+from sfms_robot.listeners.stream_rng import Use, uniforms
 
 _SILENT: Final = {
     **PHASE,
@@ -82,7 +82,7 @@ def decisions(
     most = most_in(model, heard[steps], calmness or Calmness())
     found = []
     for seed in seeds:
-        draws = uniforms_of(seed, steps, Use.EVENT, len(EVENT_KINDS))[:, model.draws]
+        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
         frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
         found.append(_decided(model, heard, frames, model.start(seed, calmness).decided))
     return found

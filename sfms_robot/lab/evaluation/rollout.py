@@ -36,7 +36,7 @@ from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
 from sfms_robot.listeners.registry import at_hop, hops_of, load_listener, one_thread
-from sfms_robot.listeners.sfms.draw import PlanInputs, later, passed, revoked
+from sfms_robot.listeners.sfms.draw import Context, later, passed, revoked
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
 from sfms_robot.processes import process_pool
@@ -244,7 +244,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             control, before = listener.told([asked]), later(control, frames_passed)
             tokens, settled = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
-        seen = PlanInputs(
+        seen = Context(
             face=face[None, window],
             face_known=known[None, window],
             voice=voice[None, window],
@@ -252,9 +252,8 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             phase=phase[None, window],
             tokens=tokens,
             control=np.repeat(control, streams, axis=0),
-            settled=np.broadcast_to(settled, streams),
         )
-        tokens, path = listener.plan(seen, path, seeds, [now] * streams)
+        tokens, path = listener.plan(seen, np.broadcast_to(settled, streams), path, seeds, [now] * streams)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
         drawn[:, now + 1 : now + 1 + ahead] = tokens[:, -ahead:]
     sway = np.stack([listener.sway.start(seed) for seed in seeds])

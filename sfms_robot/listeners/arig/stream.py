@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -28,7 +27,7 @@ from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
-from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
@@ -108,16 +107,11 @@ def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
     They turn keys and queries of the long range; the halves of `size` are the two coordinates of each plane. Computed
     in double precision: after days of running the angles of two chunks still differ.
     """
-    turns, signs = _planes(size)
-    angles = chunks[:, None] * turns
-    return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
-
-
-@lru_cache(maxsize=8)
-def _planes(size: int) -> tuple[Doubles, Doubles]:
-    """Return radians per chunk (size,), and signs of the sines, read-only."""
     half = size // 2
-    return np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2), np.where(np.arange(size) < half, -1.0, 1.0)
+    turns = np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2)  # radians per chunk
+    angles = chunks[:, None] * turns
+    signs = np.where(np.arange(size) < half, -1.0, 1.0)
+    return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
 
 
 # --- Stream -----------------------------------------------------------------------------------------------------------
@@ -169,13 +163,6 @@ REMEMBERED: Final = (
     "motion",
     "motion_keys",
     "sample",
-)
-
-
-FRAME_INPUTS: Final = (
-    *("sounds", "heard", "voiced", "face", "seen", "first", "state", "rotary", "view"),
-    *REMEMBERED,
-    "rows",
 )
 
 
@@ -242,22 +229,6 @@ class ArigListener(RunsOnEngine):
             sojourn=Sojourn(FIRST, 0),
             sway=self.sway.start(seed),
         )
-
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        memories, rows = [self.start(seed) for seed in range(streams)], self._rows([None] * streams)
-        heard = self._hear([SpeakerFrame(0.0, np.zeros(0, np.float32))] * streams, memories)
-        inputs = self._frame_inputs(heard, memories, rows)
-        past = [f"{part}_{layer}" for layer in range(self.settings.context_layers) for part in ("keys", "values")]
-        draw = {
-            "z": self.engine.run("frame", *inputs)[0],
-            "noise": np.zeros((streams, *self._noise_shape), np.float32),
-            **{name: _stacked(memories, name) for name in ("standard", "motion_keys")},
-        }
-        if self.settings.events:
-            draw |= {"rows": rows, "speaks": heard.voiced[:, 0]}
-        frame = dict(zip((*FRAME_INPUTS, *past), inputs, strict=True))
-        return {"rest": {"still": memories[0].standard[None]}, "frame": frame, "draw": draw}
 
     def condition(
         self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None

@@ -20,10 +20,10 @@ from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.listeners.layers import Block, sinusoidal
-from sfms_robot.listeners.sfms.draw import LastKeyframes, neutral_mask
+from sfms_robot.listeners.sfms.draw import Context, LastKeyframes, neutral_mask
 from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place
-from sfms_robot.listeners.sfms.predictor import Context, Predictor
+from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.space import MotionSpace
 
@@ -76,19 +76,21 @@ class Inpainter(nn.Module):
         """
         if around is None:
             neighbours = Neighbours.in_mask(mask, self.ramp)
-            rows, seen, found = _every(mask)
+            seen = (mask > 0.5).any(-1)  # every frame is looked up, so that learned placement gets its gradient
+            seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
-            rows, seen, found = around.rows, around.seen, around.places
+            seen = around.seen
         places = sinusoidal(mask.shape[1], self.width).to(codes)  # (T, W)
         # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
-        # Other frames are not looked at and not kept; but the gradient that learned placement needs passes there.
-        z_keys = F.embedding(rows, z_kf.flatten(0, 1))  # (B, K, W): the keyframes of each window, in a row
+        # (B, K, W): the keyframes of each window, in a row; other frames are not looked at and not kept.
+        z_keys = z_kf if around is None else F.embedding(around.rows, z_kf.flatten(0, 1))
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
-        z_kf = F.embedding(found, z_keys.flatten(0, 1)) * mask.amax(-1, keepdim=True)
+        z_kf = z_keys if around is None else F.embedding(around.places, z_keys.flatten(0, 1))
+        z_kf = z_kf * mask.amax(-1, keepdim=True)
         between = neighbours.interpolate(keyed)  # codes on straight lines, (B, T, G, D)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places  # Phi^tf of equation (10): T^tf queries z^kf
@@ -104,21 +106,6 @@ class Inpainter(nn.Module):
         # Ours: lines between the decoded keyframes (B, T, C), each channel between those of its own group.
         lines = neighbours if last is None else neighbours.last(last)
         return out + quantizer.by_channel(lines.interpolate(quantizer.decoder(keyed)))
-
-
-def _every(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `Around.rows`, `seen` and `places` of a mask (B, T, G) with every frame among the keyframes of its window.
-
-    Where no gradient is needed, only frames that are a keyframe in any window.
-    """
-    seen = (mask > 0.5).any(-1)
-    seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
-    windows, frames = seen.shape
-    frame = torch.arange(frames, device=mask.device)
-    keys = frame if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
-    window = torch.arange(windows, device=mask.device)[:, None]
-    place = torch.zeros_like(frame).index_copy(0, keys, torch.arange(len(keys), device=mask.device))
-    return window * frames + keys, seen[:, keys], window * len(keys) + place
 
 
 class Tokenizer(nn.Module):
@@ -171,7 +158,7 @@ class Tokenizer(nn.Module):
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
         """Return the tokens (B, T, G) of motion (B, T, C) with keyframes at a mask (B, T, G)."""
-        indices = self.quantizer.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
+        indices = self.quantizer.codebook.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
         return torch.where(mask > 0.5, indices + 1, 0)
 
     def decode(self, tokens: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
@@ -179,7 +166,9 @@ class Tokenizer(nn.Module):
 
         `last`, `around`: see `Inpainter`.
         """
-        codes = self.quantizer.codes((tokens - 1).clamp(min=0))  # of transitions arbitrary: the mask hides them
+        codes = self.quantizer.codebook.codes(
+            (tokens - 1).clamp(min=0)
+        )  # of transitions: any
         out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 
@@ -230,9 +219,11 @@ class Network(nn.Module):
 
     Attributes:
         free: inputs of (B, K, ...), K any number but the same for all of them.
+        further: names of the inputs of `forward` that have none there.
     """
 
     free: tuple[str, ...] = ()
+    further: tuple[str, ...] = ()
 
     def __init__(self, model: SfmsModel) -> None:
         super().__init__()
@@ -248,7 +239,7 @@ class Rest(Network):
         """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
         quantizer = self.model.tokenizer.quantizer
         indices = torch.arange(max(self.codes))[:, None] % torch.tensor(self.codes)
-        return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codes(indices)[None])
+        return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codebook.codes(indices)[None])
 
 
 class Hear(Network):
@@ -262,29 +253,11 @@ class Hear(Network):
 class Ahead(Network):
     """The predictor up to the point where the drawn keyframes matter."""
 
-    def forward(
-        self,
-        face: Tensor,
-        face_known: Tensor,
-        voice: Tensor,
-        heard: Tensor,
-        phase: Tensor,
-        tokens: Tensor,
-        control: Tensor,
-        last: Tensor,
-        at: Tensor,
-    ) -> tuple[Tensor]:
+    further = (*Context._fields, "last", "at")
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor]:
         """Return slots (B, H, W) of the parts of a `Context` and its last keyframes (B, P + H, G, 2)."""
-        context = Context(
-            face=face,
-            face_known=face_known,
-            voice=voice,
-            heard=heard,
-            phase=phase,
-            tokens=tokens,
-            control=control,
-        )
-        return (self.model.predictor(context, LastKeyframes(last, at)),)
+        return (self.model.predictor(Context(*inputs[:-2]), LastKeyframes(*inputs[-2:])),)
 
 
 class Next(Network):

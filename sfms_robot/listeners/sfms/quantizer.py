@@ -217,11 +217,3 @@ class Quantizer(nn.Module):
     def by_channel(self, slots: Tensor) -> Tensor:
         """Return the output of `decoder`, (..., G, slots of a group), in the order of channels (..., C)."""
         return slots.flatten(-2).index_select(-1, self.place) * self.drawn
-
-    def indices(self, codes: Tensor) -> Tensor:
-        """Return the indices (..., G), from 0, of codes (..., G, D)."""
-        return self.codebook.indices(codes)
-
-    def codes(self, indices: Tensor) -> Tensor:
-        """Return the codes (..., G, D) of indices (..., G)."""
-        return self.codebook.codes(indices)

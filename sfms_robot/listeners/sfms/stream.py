@@ -32,17 +32,16 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.audio_frontend import AudioFrontend, AudioState, check_length
-from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HEAD, HeadSway
 from sfms_robot.listeners.sfms.draw import (
     UNDECIDED,
     CodeReach,
+    Context,
     EventCourse,
-    PlanInputs,
     Sampler,
     Tokens,
     around,
-    last_keyframes,
     later,
     neutral_mask,
     passed,
@@ -62,7 +61,7 @@ class SpeakerState:
         sounds, faces: of every frame since: its samples, and its motion (58,), NaN where no face is known.
         audio: state of unfinished features.
         rows: (R, bins) sound of the newest of the P frames, standardised.
-        voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.PlanInputs`.
+        voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.Context`.
     """
 
     sounds: tuple[Floats, ...] = ()
@@ -179,25 +178,6 @@ class SfmsListener(RunsOnEngine):
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        p, start = self.settings.past_frames, [self.start(seed) for seed in range(streams)]
-        tokens, control = (np.stack([getattr(memory, name) for memory in start]) for name in ("tokens", "control"))
-        parts = ("face", "face_known", "voice", "heard", "phase")
-        speaker = {name: np.stack([getattr(memory.speaker, name) for memory in start]) for name in parts}
-        recent = last_keyframes(tokens)
-        last, at = recent.tokens, recent.at
-        now = {"last": last[:, p - 1], "at": at[:, p - 1], "frame": np.full(streams, p - 1)}
-        return {
-            "rest": {"still": self._still(p)[None], "mask": neutral_mask(p, tokens.shape[2])[None]},
-            "hear": {"rows": np.stack([np.tile(memory.speaker.rows, (2, 1)) for memory in start])},
-            "ahead": speaker | {"tokens": tokens, "control": control, "last": last, "at": at},
-            "next": {"slots": speaker["voice"][:, 0], **now},
-            "decode": dict(
-                zip(("tokens", "before", "after", "rows", "seen", "places"), (tokens, *around(tokens)), strict=True)
-            ),
-        }
-
     def is_due(self, memory: SfmsMemory) -> bool:
         """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
@@ -247,8 +227,8 @@ class SfmsListener(RunsOnEngine):
         speakers, seen = self._taken_in([memory.speaker for memory in memories])
         newest = [memory.frames - 1 for memory in memories]
         # 4. Undecided tokens are drawn and decoded.
-        inputs = PlanInputs(**seen, tokens=tokens, control=control, settled=settled)
-        tokens, path = self.plan(inputs, way, [memory.seed for memory in memories], newest)
+        inputs = Context(**seen, tokens=tokens, control=control)
+        tokens, path = self.plan(inputs, settled, way, [memory.seed for memory in memories], newest)
         # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
         sway = stacked([memory.sway for memory in memories])
         motion, jaw_rad = self.space.decode(
@@ -301,17 +281,17 @@ class SfmsListener(RunsOnEngine):
         return np.asarray(own + self._smoothing * ((before + after) / 2 - own))
 
     def plan(
-        self, seen: PlanInputs, path: Floats, seeds: Sequence[int], newest: Sequence[int]
+        self, seen: Context[Any], settled: Tokens, path: Floats, seeds: Sequence[int], newest: Sequence[int]
     ) -> tuple[Tokens, Floats]:
         """Return the tokens (B, P + H, G) and path (B, 2 + H, C) of a new plan of B streams.
 
         Args:
-            seen: inputs of the plan.
+            seen, settled: as of `Sampler.draw`.
             path: (B, 2 + H, C) the old plan, as played so far.
             seeds: of each stream.
             newest: number of the newest frame of each stream, from 0 at its beginning.
         """
-        tokens = self.sampler.draw(seen, seeds, [frame + self.horizon for frame in newest])
+        tokens = self.sampler.draw(seen, settled, seeds, [frame + self.horizon for frame in newest])
         (decoded,) = self.engine.run("decode", tokens, *around(tokens))
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
@@ -328,7 +308,7 @@ class SfmsListener(RunsOnEngine):
         return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
 
     def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, Any]]:
-        """Return states whose frames since the last plan are among their P, and the speaker's part of `PlanInputs`.
+        """Return states whose frames since the last plan are among their P, and the speaker's part of `Context`.
 
         Where all streams have the same speaker, that part is of one stream.
         """

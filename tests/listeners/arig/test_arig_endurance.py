@@ -87,7 +87,7 @@ def minutes_of_events(minutes: float) -> list[ListenerEvent]:
 def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs():
     """And beside its sway, which test_sway tells of, only nods have moved it."""
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")
-    listener = load_folder(SHIPPED).build_graphs()
+    listener = load_folder(SHIPPED)
     told = minutes_of_events(10)
     control = control_track(told, 0, FRAMES + 1)
     start = listener.start(0)
@@ -117,7 +117,7 @@ def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs
 @pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
 def test_whatever_its_face_was_left_in_it_comes_back_to_rest():
     """Each part of the face, 0.4 away from where it rests and with nothing told: five seconds later it is back."""
-    listener = load_folder(SHIPPED).build_graphs()
+    listener = load_folder(SHIPPED)
     channels = listener.settings.channels
     parts = [channels.index(name) for name in listener.settings.drawn_channels if name not in POSE_CHANNELS]
     begun = SpeakerFrame(FRAME_S, SILENCE)

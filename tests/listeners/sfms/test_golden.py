@@ -7,8 +7,7 @@ import pytest
 import torch
 from tiny_sfms import plans_of, speech, tiny_listener
 
-from sfms_robot.listeners.sfms.draw import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 
 GOLDEN = Path(__file__).parents[2] / "assets" / "sfms_tiny.npz"
 

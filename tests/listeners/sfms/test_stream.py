@@ -8,7 +8,7 @@ from tiny_sfms import plans_of, speech, tiny_listener
 
 from sfms_robot.config.hop import default_hop
 from sfms_robot.frames import FRAME_S, SpeakerFrame
-from sfms_robot.listeners.sfms.draw import UNDECIDED, PlanInputs, sample
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context, sample
 from sfms_robot.listeners.sfms.model import neutral_tokens
 from sfms_robot.listeners.sfms.stream import join
 from sfms_robot.signals import phase
@@ -47,11 +47,8 @@ def offline(listener, speaker, seed):
         own = tokens[None, past.start : past.stop + h].clone()
         own[:, p + decided - (now + 1) :] = UNDECIDED
         parts = [x[None, past].numpy() for x in (face, known, voice, known, place)]
-        names = ("face", "face_known", "voice", "heard", "phase")
-        nothing = np.zeros((1, p + h, 0), np.float32)
-        heard = dict(zip(names, parts, strict=True))
-        seen = PlanInputs(**heard, tokens=own.numpy(), control=nothing, settled=np.array([p - 1]))
-        drawn = torch.from_numpy(listener.sampler.draw(seen, [seed], [now + h]))
+        seen = Context(*parts, own.numpy(), np.zeros((1, p + h, 0), np.float32))
+        drawn = torch.from_numpy(listener.sampler.draw(seen, np.array([p - 1]), [seed], [now + h]))
         tokens[past.stop : past.stop + h] = drawn[0, p:]
         decided = now + 1 + h
         window = model.tokenizer.decode(drawn)[0]

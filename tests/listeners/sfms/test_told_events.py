@@ -11,8 +11,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
-from sfms_robot.listeners.sfms.draw import KEPT_FRAMES, UNDECIDED, passed, revoked
-from sfms_robot.listeners.sfms.predictor import Context
+from sfms_robot.listeners.sfms.draw import KEPT_FRAMES, UNDECIDED, Context, passed, revoked
 from sfms_robot.signals.control import COLUMNS, control_track
 
 NOD = ListenerEvent("nod", 0.8, 0.8, 0.1, swings=2)
