@@ -114,7 +114,7 @@ class EventfulListener:
             found.append(changed(memory, when=when, news=memory.news + decision.events, gaze=gaze))
             # Control rows of frames t - P + 1 to t + A, where frame t brings a plan.
             due, first = self.how.is_due(memory.how), frame_of(speaker) + 1 - past
-            controls.append(control_track(when.decided.done, first, past + ahead) if due else None)
+            controls.append(control_track(when.done, first, past + ahead) if due else None)
         moved = self.how.step_each([*map(_believed, speakers)], [memory.how for memory in found], controls)
         return [
             self._looking(plan, decision, changed(memory, how=how))
@@ -127,7 +127,7 @@ class EventfulListener:
         """Return the plan with eyes, idle motion and the new events, and the memory after it."""
         if plan is None:
             return None, memory
-        shifts = [event for event in memory.when.decided.done if event.target_rad is not None]
+        shifts = [event for event in memory.when.done if event.target_rad is not None]
         targets = [target_at(shifts, time_s) for time_s in plan.times_s.tolist()]
         head_rad, eyes, states = gaze_kinematics.follow(targets, plan.frames, memory.gaze[0])
         frames = plan.frames.copy()

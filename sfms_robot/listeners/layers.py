@@ -38,15 +38,34 @@ def _operator(name: str, inputs: tuple[Any, ...], attributes: dict[str, Any], li
     return out
 
 
-def exported_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
-    """Return full attention (B, T, D) of q (B, T, D) over k, v (B, S, D) as one operator; `seen` (B, S) masks keys."""
-    mask = None if seen is None else seen.to(torch.int32)
-    return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
-
-
 def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     """Return LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator."""
     return _operator("LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, x, 17)
+
+
+def split_heads(x: Tensor, heads: int) -> Tensor:
+    """Return x (N, S, D) as (N, h, S, D/h)."""
+    return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+
+
+def join_heads(x: Tensor) -> Tensor:
+    """Return x (N, h, S, D/h) as (N, S, D)."""
+    return x.transpose(1, 2).flatten(2)
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
+    """Return attention (N, T, D) of q (N, T, D) over k, v (N, S, D); `seen` (N, S) is True where it may look.
+
+    In 32 bits where a CPU trains in 16: its gradient is slow in those.
+    """
+    if torch.compiler.is_exporting():
+        mask = None if seen is None else seen.to(torch.int32)
+        return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
+    parts, mask = [split_heads(each, heads) for each in (q, k, v)], None if seen is None else seen[:, None, None]
+    if q.dtype == torch.bfloat16 and not q.is_cuda:
+        with torch.autocast(q.device.type, enabled=False):
+            return join_heads(F.scaled_dot_product_attention(*(each.float() for each in parts), attn_mask=mask))
+    return join_heads(F.scaled_dot_product_attention(*parts, attn_mask=mask))
 
 
 # --- Blocks over sequences (SFMS) -------------------------------------------------------------------------------------
@@ -66,12 +85,8 @@ class Attention(nn.Module):
         """Return (B, T, D). `seen` (B, S) is True where the memory may be looked at, at least once per row."""
         if torch.compiler.is_exporting():
             return self._exported(x, memory, seen)
-        (b, t, d), s = x.shape, memory.shape[1]
-        q = self.query(x).view(b, t, self.heads, -1).transpose(1, 2)  # (B, h, T, D/h)
-        k, v = self.key_value(memory).view(b, s, 2, self.heads, -1).permute(2, 0, 3, 1, 4)  # (B, h, S, D/h)
-        mask = None if seen is None else seen[:, None, None, :]
-        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        out: Tensor = self.out(y.transpose(1, 2).reshape(b, t, d))
+        k, v = self.key_value(memory).chunk(2, dim=-1)
+        out: Tensor = self.out(attention(self.query(x), k, v, self.heads, seen))
         return out
 
     def _exported(self, x: Tensor, memory: Tensor, seen: Tensor | None) -> Tensor:
@@ -84,7 +99,7 @@ class Attention(nn.Module):
             return F.linear(y, self.out.weight, self.out.bias)
         # softmax(q (k + c)^T) does not depend on c, and a bias of all values is a bias of the result.
         k, v = F.linear(memory, other.weight).chunk(2, dim=-1)
-        y = exported_attention(self.query(x), k, v, self.heads, seen)
+        y = attention(self.query(x), k, v, self.heads, seen)
         bias = self.out.bias + self.out.weight @ other.bias.chunk(2)[1]
         return F.linear(y, self.out.weight, bias)
 
@@ -139,33 +154,6 @@ class Block(nn.Module):
 
 
 # --- Layers of single frames (ARIG) -----------------------------------------------------------------------------------
-
-
-def split_heads(x: Tensor, heads: int) -> Tensor:
-    """Return x (N, S, D) as (N, h, S, D/h)."""
-    n, s, d = x.shape
-    return x.view(n, s, heads, d // heads).transpose(1, 2)
-
-
-def join_heads(x: Tensor) -> Tensor:
-    """Return x (N, h, S, D/h) as (N, S, D)."""
-    n, h, s, d = x.shape
-    return x.transpose(1, 2).reshape(n, s, h * d)
-
-
-def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Return full attention of (N, h, S, D/h), in 32 bits where a CPU trains in 16: its gradient is slow in those."""
-    if q.dtype == torch.bfloat16 and not q.is_cuda:
-        with torch.autocast(q.device.type, enabled=False):
-            return F.scaled_dot_product_attention(q.float(), k.float(), v.float())
-    return F.scaled_dot_product_attention(q, k, v)
-
-
-def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
-    """Return full attention (N, T, D) of q (N, T, D) over k, v (N, S, D)."""
-    if torch.compiler.is_exporting():
-        return exported_attention(q, k, v, heads)
-    return join_heads(attend(*(split_heads(each, heads) for each in (q, k, v))))
 
 
 class FeedForward(nn.Module):

@@ -30,10 +30,8 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -56,7 +54,7 @@ _LOOK_S: Final = 0.1  # between two checks of a child that loads, while nothing 
 _STATES: Final = {"backing off": "starting", "loading": "building", "running": "listening"}
 
 NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
-AWAKE_S: Final = 0.25
+AWAKE_S: Final = 0.02
 PROBE_S: Final = 0.5
 PROBE_PLANS: Final = 12
 
@@ -271,12 +269,12 @@ class ListenerProcess:
 
 def main() -> None:
     """Load the listener of the first message, then listen until the pipe ends."""
-    parent, inbox, hops = ParentPipe(), Inbox(), queue.SimpleQueue[int]()
+    parent, inbox = ParentPipe(), Inbox()
     name, seed, calmness, engine = parent.receive()
 
     def sort(message: int | Calmness | SpeakerFrame) -> None:
         if isinstance(message, int):
-            hops.put(message)
+            inbox.hop = message
         elif isinstance(message, Calmness):
             inbox.calmness = message
         else:
@@ -305,19 +303,14 @@ def main() -> None:
     except RobotError as error:
         parent.send(("error", str(error), 0.0))
         return
-    listen(at_hop(listener, _hop(hops)), seed, inbox, parent.send, hops)
+    while inbox.hop is None:  # awake again and again: for the parent, a child that uses no processor time hangs
+        time.sleep(AWAKE_S)
+    listen(listener, seed, inbox, parent.send)
 
 
 def threads() -> int:
     """Return the number of threads that the child may use: one core is the servo loop's."""
     return max(1, cores() - 1)
-
-
-def _hop(hops: queue.SimpleQueue[int]) -> int:
-    """Wait for the hop, awake a few times a second: for the parent, a child that uses no processor time hangs."""
-    while True:
-        with suppress(queue.Empty):
-            return hops.get(timeout=AWAKE_S)
 
 
 def use_threads(listener: Listener, most: int) -> bool:

@@ -70,10 +70,6 @@ class ClockOffset:
         while came_s - self._samples[0].at_s > WINDOW_S:
             self._samples.popleft()
 
-    def forget(self) -> None:
-        """Drop all samples: the server is another one."""
-        self._samples.clear()
-
     @property
     def best(self) -> ClockSample | None:
         """Return the sample with the least delay; None before the first."""
@@ -112,11 +108,6 @@ class JitterBuffer:
         """Return what is added to the times of plans at this moment [s]."""
         return self._shift_s
 
-    @property
-    def delay_s(self) -> float | None:
-        """Return the delay that the shift allows for; None before the first plan."""
-        return float(np.percentile(self._delays_s, PERCENT)) if self._delays_s else None
-
     def put(self, number: int, plan: Plan, came_s: float) -> None:
         """Add a plan, made for frame `number`, which came at `came_s`."""
         if self._given is not None and number <= self._given:
@@ -152,7 +143,8 @@ class JitterBuffer:
         if made_at_s < self._from_s or delay_s > LONGEST_S:
             return
         self._delays_s.append(delay_s)
-        self._wanted_s = max(0.0, self._hop * FRAME_S + (self.delay_s or 0.0) + MARGIN_S - self._reach_s)
+        late_s = float(np.percentile(self._delays_s, PERCENT))
+        self._wanted_s = max(0.0, self._hop * FRAME_S + late_s + MARGIN_S - self._reach_s)
 
     def _is_due(self, number: int, now_s: float) -> bool:
         """Return whether it is the next in turn, or waiting longer for the one before is of no use."""

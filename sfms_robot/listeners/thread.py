@@ -40,7 +40,8 @@ class Inbox:
 
     Attributes:
         skipped: frames left out before the last one returned.
-        calmness: requested since `calmed` looked; None: none.
+        calmness: requested since the last frame; None: none.
+        hop: requested; None: the listener's own.
     """
 
     def __init__(self, most: int = MOST_WAITING) -> None:
@@ -50,6 +51,7 @@ class Inbox:
         self._waiting: deque[SpeakerFrame | None] = deque()
         self.skipped = 0
         self.calmness: Calmness | None = None
+        self.hop: int | None = None
 
     def put(self, frame: SpeakerFrame | None) -> None:
         """Add a frame, or None for the end. Never blocks."""
@@ -77,13 +79,7 @@ def calmed(listener: Listener, memory: Any, calmness: Calmness | None) -> Any:
     return memory if calmness is None or change is None else change(memory, calmness)
 
 
-def listen(
-    listener: Listener,
-    seed: int,
-    inbox: Inbox,
-    say: Say,
-    hops: queue.SimpleQueue[int] | None = None,
-) -> None:
+def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
     """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
     from sfms_robot.listeners.registry import at_hop
 
@@ -94,8 +90,8 @@ def listen(
             say(("skipped", None, inbox.skipped))
         calmness, inbox.calmness = inbox.calmness, None
         memory = calmed(listener, memory, calmness)
-        while hops is not None and not hops.empty():
-            listener = at_hop(listener, hops.get())
+        if inbox.hop is not None:
+            listener = at_hop(listener, inbox.hop)
         began_s = time.perf_counter()
         plan, memory = listener.step(frame, memory)
         taken_ms = (time.perf_counter() - began_s) * 1e3

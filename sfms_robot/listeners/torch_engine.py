@@ -8,6 +8,7 @@ configuration run on them. `export` needs the extra `export`.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import logging
@@ -120,17 +121,11 @@ def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
 # What is done to the graph of a network:
 #
 #     1. torch.export: a program in which the number of streams N is a symbol. Modules write attention and LayerNorm as
-#        the one operator that onnxruntime has for each (`layers.exported_attention`).
+#        the one operator that onnxruntime has for each (`layers.attention`).
 #     2. torch.onnx: initialisers hold the weights, "model.NAME", and constants.
 #     3. Weights become inputs, onnxscript folds constants and removes what is not used, weights become initialisers
 #        again. As initialisers they would be folded into the graph; values of inputs are not known.
-#     4. For 8 bits, each product of a large layer is replaced (`_with_integers`):
-#
-#            W -> Transpose -> MatMul(x, .) -> Add(., b)   }
-#            Gemm(x, W, b)                                 }  ->  DynamicQuantizeMatMul(x, W.int8, W.scale, -, b)
-#
-#        onnxruntime rounds x by its own range, multiplies integers and scales the result.
-#     5. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
+#     4. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
 #        their content, which `engine` hands to the session (`_written`).
 
 
@@ -145,19 +140,20 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = new_model(settings).eval()
-    layers = large_layers(model) if int8 and isinstance(model, ArigModel) else []
     recorder = Recorder(model, networks_of(model))
     listener: RunsOnEngine = model_of_motion(settings, recorder, folder)
     control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
-    silence = SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32))
+    speakers = [SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32)) for _ in range(EXAMPLE_STREAMS)]
     memories = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
-    listener.step_each([silence] * EXAMPLE_STREAMS, memories, control * EXAMPLE_STREAMS)
+    listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
+    models: dict[str, SfmsModel | ArigModel] = {"": model}
+    if int8 and isinstance(model, ArigModel) and large_layers(model):
+        models[".int8"] = in_integers(model)
     graphs: dict[str, Any] = {}
-    for name, network in networks_of(model).items():
-        with torch.no_grad():
-            graphs[name] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
-        if layers:
-            graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
+    for suffix, each in models.items():
+        for name, network in networks_of(each).items():
+            with torch.no_grad():
+                graphs[name + suffix] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
     state: dict[str, Tensor] = model.state_dict()
     known: dict[str, Any] = {}
     files: list[Path] = []
@@ -178,6 +174,34 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     except OSError as error:
         raise ModelError(f"{out / FOLDER}: cannot be written: {error.strerror}") from error
     return files
+
+
+class IntegerLinear(nn.Module):
+    """A linear layer of a graph that multiplies in 8 bits (step 1); its weight is rounded when the graph is loaded."""
+
+    def __init__(self, layer: nn.Linear) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Module(), layer.bias
+        self.weight.int8 = nn.Buffer(torch.zeros(layer.weight.T.shape, dtype=torch.int8))
+        self.weight.scale = nn.Buffer(torch.zeros(layer.out_features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., out) of x (..., in)."""
+        inputs = (x, self.weight.int8, self.weight.scale, None, self.bias)  # None: zero point of 0
+        shape = (*x.shape[:-1], self.weight.scale.shape[0])
+        out: Tensor = torch.onnx.ops.symbolic(
+            "com.microsoft::DynamicQuantizeMatMul", inputs, dtype=x.dtype, shape=shape
+        )
+        return out
+
+
+def in_integers(model: ArigModel) -> ArigModel:
+    """Return a copy of a model whose `large_layers` multiply in 8 bits, for a graph."""
+    model = copy.deepcopy(model)
+    for name in large_layers(model):
+        parent, own = model.get_submodule(name.rpartition(".")[0].rpartition(".")[0]), name.split(".")[-2]
+        setattr(parent, own, IntegerLinear(getattr(parent, own)))
+    return model
 
 
 def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> Any:
@@ -225,7 +249,7 @@ def _like_arguments(network: nn.Module, shapes: list[Any]) -> tuple[Any, ...]:
 
 
 def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, Any]]:
-    """Return the file of a graph (step 5) and its entry in the manifest."""
+    """Return the file of a graph (step 4) and its entry in the manifest."""
     import onnx
     import onnx_ir
 
@@ -261,70 +285,3 @@ def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, 
         "integers": sorted(layers),
     }
     return data, known
-
-
-def _with_integers(model: Any, layers: Iterable[str]) -> Any:
-    """Return a copy whose `layers` multiply in 8 bits (step 4)."""
-    import onnx_ir
-    from onnx_ir.passes.common import RemoveUnusedNodesPass
-
-    model = onnx_ir.from_proto(onnx_ir.to_proto(model))
-    graph = model.graph
-    for layer in layers:
-        weight = graph.initializers.get(MODEL + layer)
-        if weight is None:
-            continue
-        size = [int(each) for each in weight.shape]
-        rounded = _placeholder(f"{MODEL}{layer}.int8", size[::-1], onnx_ir.DataType.INT8)
-        scale = _placeholder(f"{MODEL}{layer}.scale", size[:1], onnx_ir.DataType.FLOAT)
-        graph.initializers.update({rounded.name: rounded, scale.name: scale})
-        for node, index in list(weight.uses()):
-            if node.op_type == "Gemm" and index == 1:
-                _replace(graph, node, node.inputs[0], rounded, scale, node.inputs[2] if len(node.inputs) > 2 else None)
-            elif node.op_type == "Transpose":
-                for product, _ in list(node.outputs[0].uses()):
-                    last, bias = _biased(graph, product)
-                    _replace(graph, last, product.inputs[0], rounded, scale, bias)
-            else:
-                raise ModelError(f"{layer}: used by {node.op_type}, which has no product in 8 bits")
-    RemoveUnusedNodesPass()(model)
-    for name in [name for name, value in graph.initializers.items() if not value.uses()]:
-        del graph.initializers[name]
-    model.opset_imports["com.microsoft"] = 1
-    return model
-
-
-def _placeholder(name: str, shape: list[int], kind: Any) -> Any:
-    """Return an initialiser that gets its content when the graph is loaded."""
-    import onnx_ir
-
-    value = onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
-    value.const_value = onnx_ir.ExternalTensor(WEIGHTS, None, None, kind, shape=onnx_ir.Shape(shape), name=name)
-    return value
-
-
-def _biased(graph: Any, product: Any) -> tuple[Any, Any]:
-    """Return the node that adds a bias to a product, and the bias; the product and None where there is none."""
-    uses = list(product.outputs[0].uses())
-    if len(uses) == 1 and uses[0][0].op_type == "Add":
-        node, index = uses[0]
-        bias = node.inputs[1 - index]
-        if bias.name in graph.initializers and len(bias.shape) == 1:
-            return node, bias
-    return product, None
-
-
-def _replace(graph: Any, node: Any, x: Any, rounded: Any, scale: Any, bias: Any) -> None:
-    """Put a product in 8 bits in the place of `node`, under the name of its output."""
-    import onnx_ir
-
-    inputs = [x, rounded, scale] if bias is None else [x, rounded, scale, None, bias]  # None: zero point of 0
-    product = onnx_ir.Node("com.microsoft", "DynamicQuantizeMatMul", inputs)
-    product.outputs[0].name = node.outputs[0].name
-    graph.insert_before(node, product)
-    for user, index in list(node.outputs[0].uses()):
-        user.replace_input_with(index, product.outputs[0])
-    for index, output in enumerate(graph.outputs):
-        if output is node.outputs[0]:
-            graph.outputs[index] = product.outputs[0]
-    graph.remove(node, safe=True)

@@ -16,7 +16,7 @@ from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
 from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, save_config
 from sfms_robot.listeners.engine import HALF, OnnxEngine, digest, integers, read_graphs
-from sfms_robot.listeners.registry import at_hop, engine_name, load_listener
+from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.listeners.torch_engine import new_model
 
 LISTENERS = data_dir("configs") / "listeners"
@@ -56,25 +56,6 @@ def test_plans_are_those_of_torch(both):
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one.frames, other.frames, atol=1e-4)
         assert one.events == other.events
-
-
-def test_streams_of_any_age_together_are_each_one_alone(both):
-    for listener in both:
-        listener = at_hop(listener, 4 if listener.horizon > 1 else 1)
-        begins, speakers = (0, 3, 10), [people(30, seed) for seed in (4, 5, 6)]
-        alone = [streamed(listener, speaker, seed)[0] for seed, speaker in enumerate(speakers)]
-        memories, together = [listener.start(seed) for seed in range(3)], [[] for _ in begins]
-        for now in range(30):
-            live = [row for row, begin in enumerate(begins) if begin <= now]
-            told = [speakers[row][now - begins[row]] for row in live]
-            for row, (plan, memory) in zip(
-                live, listener.step_each(told, [memories[row] for row in live]), strict=True
-            ):
-                memories[row] = memory
-                together[row] += [] if plan is None else [plan]
-        for one, many in zip(alone, together, strict=True):
-            for plan, other in zip(one, many, strict=False):
-                np.testing.assert_allclose(plan.frames, other.frames, atol=2e-5)
 
 
 def test_auto_is_onnx_where_there_are_graphs(both):

@@ -39,7 +39,7 @@ from sfms_robot.lab.learning.corpus import in_space
 from sfms_robot.lab.learning.sfms.features import frames_of, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_scores
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import reconstruction_error
-from sfms_robot.listeners.checkpoint import config_of
+from sfms_robot.listeners.checkpoint import CONFIG
 from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -53,7 +53,7 @@ _TRAIN_DYADS: Final = 200  # from which the heuristics take their means
 def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
     """Return the held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
     folder = find("listeners", name, "config.yaml")
-    settings, listener = config_of(folder, config.Sfms), load_folder(folder, "torch")
+    settings, listener = config.load(config.Sfms, folder / CONFIG), load_folder(folder, "torch")
     model = listener.model
     dyads = open_for(listener.space.name, data, "validation", order)
     corpus = gather(dyads, model.tokenizer.window, listener.space, None, settings)

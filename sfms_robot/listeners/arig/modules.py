@@ -64,6 +64,7 @@ class TrackSide(nn.Module):
 
     def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
         """Return (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
+        # adaLN (A.1): gates of the attention and of the feed-forward, both modulated by the newest sound of the track.
         x = torch.addcmul(x, parts[2], self.out(seen))
         return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
 
@@ -246,6 +247,7 @@ class LongRange(nn.Module):
         Returns:
             cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, in case it is the last of its chunk.
         """
+        # 3.2: the chunk in progress is one token; keys and values of whole chunks never change.
         x, made = summary[:, None], []
         turned, view = rotary.transpose(0, 1)[:, :, None, None], seen[:, None, None]
         for layer, keys, values in zip(self._layers(), past[::2], past[1::2], strict=True):
@@ -293,6 +295,7 @@ class StateUnderstanding(nn.Module):
 
     def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
         """Return the state condition (N, 3, 2D) of cis (N, D) and voiced (N, 2): agent now, user one frame before."""
+        # 3.3: C^s_T, the voices of both and the cis-token.
         told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
         return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
 

@@ -31,6 +31,7 @@ COSINE_END = 0.98  # share of the quarter circle that the schedule covers
 
 def cosine_alpha_bar(levels: int) -> Tensor:
     """Return alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
+    # Nichol and Dhariwal 2021: ab = cos^2 of an angle that grows evenly with the level.
     angle = torch.arange(1, levels + 1, dtype=torch.float64) / levels
     return torch.cos(angle * COSINE_END * math.pi / 2) ** 2
 
@@ -103,6 +104,7 @@ class Denoiser(nn.Module):
         alpha_bar = self.alpha_bar[t][:, None]
         # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
+        # eps_theta(M_t | t, z)
         found = self(noisy, self.modulate(z, self.level(t)))
         return weighted_mean((noise - found).square(), weights)
 
@@ -194,6 +196,7 @@ class CodeHead(nn.Module):
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
     ) -> Tensor:
         """Return cross-entropy of the code plus squared error of the code, (N,); arguments as `Denoiser.loss`."""
+        # B.1: the softmax learns which code; encoder and decoder learn from what the code makes of the motion.
         code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
         index = codes_to_indices(code.detach(), self.levels)[:, 0]
@@ -202,6 +205,7 @@ class CodeHead(nn.Module):
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
         """Return the motion (N, C) of a code drawn by the softmax; z (N, D), noise (N, 1, 1) standard normal."""
+        # Inverse transform: the code at which the cumulated softmax passes a uniform number.
         share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
         mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
         index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)

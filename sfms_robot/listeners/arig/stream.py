@@ -86,6 +86,7 @@ def draw_sojourn(
         before: that of the frame before.
         uniforms: (2,) in 0..1: which state, and for how long.
     """
+    # The voices of both leave some of the seven states (figure 3).
     may = possible[int(voiced[0]), int(voiced[1])] > 0  # (7,), a new array
     if before.left > 0 and may[before.state]:
         return Sojourn(before.state, before.left - 1)
@@ -109,7 +110,7 @@ def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
     """
     half = size // 2
     turns = np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2)  # radians per chunk
-    angles = chunks[:, None] * turns
+    angles = chunks[:, None] * turns  # place of a chunk: attention depends on how far apart two are, not on when
     signs = np.where(np.arange(size) < half, -1.0, 1.0)
     return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
 
@@ -297,6 +298,7 @@ class ArigListener(RunsOnEngine):
             draw_sojourn(durations, possible, scores, voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, voiced, last, own in zip(logits, heard.voiced, before, now, strict=True)
         ]
+        # A nod or a smile under way makes listening a state of its own.
         drawn = np.array([sojourn.state for sojourn in sojourns])
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
@@ -315,6 +317,7 @@ class ArigListener(RunsOnEngine):
 
     def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> BothPeople:
         """Return both people in the newest frame of each stream."""
+        # Equation (2): A^u_(T-1) of the user, and A^a_T of the agent, which is one frame ahead.
         samples = [track for one in speakers for track in (one.audio, fit_frame(one.agent_audio))]
         before = [voice for memory in memories for voice in (memory.user_voice, memory.agent_voice)]
         sounds, present, after = hear_each(samples, before)
@@ -332,6 +335,7 @@ class ArigListener(RunsOnEngine):
     def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
         """Return the inputs of the network `frame`."""
         settings = self.settings
+        # 3.2: chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view, w - 1 are whole.
         frames = np.array([memory.frames for memory in memories])
         chunks, room = frames // settings.chunk_frames, settings.context_chunks - 1
         return [

@@ -216,28 +216,22 @@ class Decision:
     hazards_hz: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class DecideMemory:
-    """The memory of one stream of its own events.
+@dataclass(frozen=True, kw_only=True)
+class EventMemory:
+    """The memory of one stream.
 
     Attributes:
+        sensed: of the person.
         seed, calmness: of the stream.
-        done: events decided, in order, as far as they still matter.
+        done: own events decided, in order, as far as they still matter.
         hazards_hz: the last ones that were drawn.
     """
 
+    sensed: SenseMemory
     seed: int
     calmness: Calmness
     done: tuple[ListenerEvent, ...] = ()
     hazards_hz: Mapping[str, float] | None = None
-
-
-@dataclass(frozen=True)
-class EventMemory:
-    """The memory of one stream: of the person, and of its own events."""
-
-    sensed: SenseMemory
-    decided: DecideMemory
 
 
 class EventModel:
@@ -258,30 +252,28 @@ class EventModel:
     def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
         """Return the memory of a new stream."""
         asked = calmness or Calmness()
-        return EventMemory(SenseMemory(addressed=asked.addressed), DecideMemory(seed, asked))
+        return EventMemory(sensed=SenseMemory(addressed=asked.addressed), seed=seed, calmness=asked)
 
     def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
         """Return the memory with other rates from now on."""
-        return EventMemory(
-            changed(memory.sensed, addressed=calmness.addressed), changed(memory.decided, calmness=calmness)
-        )
+        return changed(memory, sensed=changed(memory.sensed, addressed=calmness.addressed), calmness=calmness)
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
     ) -> list[tuple[Decision, EventMemory]]:
         """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
-        decided = self.decide_each([one for one, _ in sensed], [memory.decided for memory in memories])
+        decided = self.decide_each([one for one, _ in sensed], memories)
         return [
-            (decision, EventMemory(heard, own)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
+            (decision, changed(own, sensed=heard)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
         ]
 
     def decide_each(
         self,
         sensed: Sequence[Sensed],
-        memories: Sequence[DecideMemory],
+        memories: Sequence[EventMemory],
         histories: Sequence[Sequence[ListenerEvent]] | None = None,
-    ) -> list[tuple[Decision, DecideMemory]]:
+    ) -> list[tuple[Decision, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
         `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
@@ -301,8 +293,8 @@ class EventModel:
         return found
 
     def _drawn(
-        self, sensed: Sensed, memory: DecideMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
-    ) -> tuple[Decision, DecideMemory]:
+        self, sensed: Sensed, memory: EventMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
+    ) -> tuple[Decision, EventMemory]:
         """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
@@ -341,7 +333,7 @@ class EventModel:
 
     def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
         """Return the look back at the person, once looking away is over."""
-        shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+        shift = last_shift(history)
         if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:
             return ()
         until_s = 60.0 / self.tables.hazards["gaze_shift"].per_minute
@@ -370,6 +362,11 @@ def quantile(values: Sequence[float], share: float) -> float:
     return float(np.interp(share * (len(values) - 1), np.arange(len(values)), values))
 
 
+def last_shift(events: Sequence[ListenerEvent]) -> ListenerEvent | None:
+    """Return the newest gaze shift, if there is any."""
+    return next((event for event in reversed(events) if event.kind == "gaze_shift"), None)
+
+
 def _begin_s(frame: int) -> float:
     return (frame + 1 + LEAD_FRAMES) * FRAME_S
 
@@ -379,7 +376,7 @@ def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) 
     silence_s, own_s, phrase_s, last_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
-    shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+    shift = last_shift(history)
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
         under_way.add("gaze_shift")
     return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not EXCLUDES[kind] & under_way)

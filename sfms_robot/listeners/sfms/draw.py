@@ -100,12 +100,9 @@ def last_keyframes(tokens: Tokens) -> LastKeyframes[Tokens]:
 
 def with_drawn(recent: LastKeyframes[Tokens], drawn: Tokens, frame: int) -> LastKeyframes[Tokens]:
     """Return the last keyframes (..., G, 2) after the tokens (..., G) `drawn` for `frame`."""
-    key, tokens, at = drawn > 0, recent.tokens.copy(), recent.at.copy()
-    for part in (tokens, at):
-        np.copyto(part[..., 1], part[..., 0], where=key)
-    np.copyto(tokens[..., 0], drawn, where=key)
-    np.copyto(at[..., 0], frame, where=key)
-    return LastKeyframes(tokens, at)
+    key, now = drawn[..., None] > 0, np.full_like(drawn, frame)
+    tokens, at = (np.stack([new, old[..., 0]], -1) for new, old in zip((drawn, now), recent, strict=True))
+    return LastKeyframes(np.where(key, tokens, recent.tokens), np.where(key, at, recent.at))
 
 
 def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
@@ -144,16 +141,8 @@ def passed(tokens: Tokens, path: Floats, frames: int = 1, holds: bool = False) -
     moved = np.concatenate([tokens[:, frames:], np.full_like(tokens[:, :frames], UNDECIDED)], axis=1)
     np.maximum(moved[:, :-horizon], 0, out=moved[:, :-horizon])
     if holds:
-        moved[:, 0] = _newest(tokens[:, : frames + 1])
+        moved[:, 0] = last_keyframes(tokens[:, : frames + 1]).tokens[:, -1, :, 0]
     return moved, np.concatenate([path[:, frames:], np.repeat(path[:, -1:], frames, axis=1)], axis=1)
-
-
-def _newest(tokens: Tokens) -> Tokens:
-    """Return the last keyframe of each group (B, G) of tokens (B, T, G), 0 where there is none."""
-    out: Tokens = np.maximum(tokens[:, 0], 0)
-    for frame in range(1, tokens.shape[1]):
-        out = np.where(tokens[:, frame] > 0, tokens[:, frame], out)
-    return out
 
 
 def later(control: Floats, frames: int = 1) -> Floats:
@@ -190,7 +179,7 @@ def anchored(tokens: Tokens, drawn: NDArray[np.bool_], settled: Tokens, ramp: in
     ahead = (tokens > 0) & (behind & (frame < settled[:, None] + ramp))[..., None]
     first = ahead.argmax(1)  # the next keyframe of each group, if there is any
     is_new = np.take_along_axis(new, first[:, None], axis=1)[:, 0]
-    held = _newest(np.where(behind[..., None], 0, tokens))
+    held = last_keyframes(np.where(behind[..., None], 0, tokens)).tokens[:, -1, :, 0]
     out[stream, settled] = np.where(ahead.any(1) & is_new, held, tokens[stream, settled])
     return out
 

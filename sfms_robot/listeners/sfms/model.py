@@ -49,10 +49,13 @@ class Inpainter(nn.Module):
         self.width = width
         self.residual = settings.inpainter == "residual"
         self.ramp = settings.ramp_frames
+        # z^kf of equation (9): codes of all groups at a frame, and which groups have a keyframe there.
         self.keyframe_in = nn.Linear(groups * (quantizer.dims + 1), width)
         self.keyframe_encoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        # z^tf of equation (10): codes on the line between the neighbours, and T^tf as binary positions (IV-B5).
         self.transition_in = nn.Linear(groups * (quantizer.dims + 2 * POSITION_BITS + 3), width)
         self.transition_encoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
+        # Phi^full of equation (10), the decoder.
         self.join = nn.Linear(2 * width, width)
         self.decoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
@@ -120,6 +123,7 @@ class Tokenizer(nn.Module):
         self.window = settings.window_frames
         self.keyframes = [group.keyframes or 0 for group in groups]  # 0 where a keyframe has a cost instead
         self.costs = [group.keyframe_cost or 0.0 for group in groups]
+        # Ours: groups of channels, each with its own mask and codebook; `preset: one` is the paper's single mask.
         member = [[float(name in group.channels) for name in settings.channels] for group in groups]
         self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
         levels = [group.levels for group in groups]
@@ -142,6 +146,7 @@ class Tokenizer(nn.Module):
         motion.
         """
         frames = motion.shape[1]
+        # k of IV-B2 is of a window; a longer stretch gets as many a second.
         scaled = [max(1, round(count * frames / self.window)) for count in self.keyframes]
         return place(
             motion,
@@ -166,9 +171,8 @@ class Tokenizer(nn.Module):
 
         `last`, `around`: see `Inpainter`.
         """
-        codes = self.quantizer.codebook.codes(
-            (tokens - 1).clamp(min=0)
-        )  # of transitions: any
+        # Class 0 is the transition frame, class 1 + i the code c_i of the codebook D (IV-C2).
+        codes = self.quantizer.codebook.codes((tokens - 1).clamp(min=0))  # of transitions: any
         out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 

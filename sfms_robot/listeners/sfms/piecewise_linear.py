@@ -116,6 +116,7 @@ class Neighbours:
     @cached_property
     def weight(self) -> Tensor:
         """Return the weight (B, T, G) of the keyframe after: 0 at the one before, 1 at the one after."""
+        # Share of the way from the keyframe before (0) to the one after (1); held until the ramp begins.
         begin = self.before if self.ramp is None else torch.maximum(self.before, self.after - self.ramp)
         span = (self.after - begin).clamp(min=1)
         return ((self.frame - begin) / span).clamp(0.0, 1.0)
@@ -128,6 +129,7 @@ class Neighbours:
 
     def positions(self) -> Tensor:
         """Return binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
+        # IV-B5: T^tf as a binary vector, so that one frame more changes the input clearly; ours: to both neighbours.
         powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
         bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
         ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
@@ -187,6 +189,7 @@ def best_frames(cost: Segments, count: int) -> Tensor:
 
     best[j] = min_i best[i] + inside[i, j], `count` - 1 times; the way back from the cheapest end gives the frames.
     """
+    # best[j]: least error up to j of the keyframes placed so far, the last of them at j.
     best, parents = cost.before, []
     for _ in range(count - 1):
         best, parent = (best[:, :, None] + cost.inside).min(dim=1)
@@ -209,6 +212,7 @@ def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
     for _ in range(most - 1):
         ahead.append((ahead[-1][:, :, None] + allowed.inside).amin(dim=1))
         behind.append((allowed.inside + behind[-1][:, None, :]).amin(dim=2))
+    # Of k keyframes, m stand up to t and k + 1 - m from t on; the best split counts.
     forward, backward = torch.stack(ahead, 1), torch.stack(behind, 1)  # (N, most, T)
     totals = [(forward[:, :k] + backward[:, :k].flip(1)).amin(dim=1) for k in range(1, most + 1)]
     return torch.stack(totals, 1)
@@ -216,6 +220,7 @@ def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
 
 def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
     """Return the error (N,) of a mask (N, T): the sum over its stretches, infinite for a mask without keyframes."""
+    # Each keyframe pays for the stretch that ends with it, the last one for the frames behind it too.
     key, last = mask > 0.5, nearest_keys(mask)[0]
     previous = F.pad(last[:, :-1], (1, 0), value=-1)
     between = cost.inside.gather(1, previous.clamp(min=0)[:, None])[:, 0]
@@ -306,6 +311,7 @@ def _cheapest(cost: float, before: Tensor, inside: Tensor, after: Tensor) -> lis
     """Return the keyframes of every track, last to first, from the `cost` of one and `stretches`."""
     best, band, ends = before.numpy() + cost, inside.numpy(), after.numpy()
     tracks, t = best.shape
+    # parent: the keyframe before in the cheapest mask that has one at j; -1: j is the first.
     parent, every = np.full((tracks, t), -1), np.arange(tracks)
     for j in range(1, t):
         first = max(0, j - band.shape[2] + 1)

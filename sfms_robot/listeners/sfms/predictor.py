@@ -131,6 +131,7 @@ class Predictor(nn.Module):
         self.token_in = nn.Linear(described + groups, width)
         self.undecided = nn.Parameter(torch.randn(width) * 0.02)
         self.own = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        # Queries of the H future frames: the paper's parallel prediction of 8 frames (V-C).
         self.slots = nn.Parameter(torch.randn(self.future, width) * 0.02)
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)  # face, voice, own tokens
         self.phase_in = nn.Linear(FEATURES, width) if settings.phase else None
@@ -152,11 +153,13 @@ class Predictor(nn.Module):
         `recent`: `last_keyframes` of the context's tokens, for a caller that has them.
         """
         c = context
+        # IV-C2: encoders of the speaker and of the listener, and one decoder that future frames query.
         speaker = self.speaker(c)
         own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
         # The place in the phrase at the newest frame also goes to every future frame directly.
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
         speaker = speaker.expand(own.shape[0], -1, -1)
+        # Ours: learned roles tell the decoder which modality a memory slot is of.
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
         memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B, 2P + P + H, W)
         x = self.slots + own[:, -self.future :]  # (B, H, W): queries of the future frames
@@ -168,6 +171,7 @@ class Predictor(nn.Module):
 
     def _own(self, tokens: Tensor, recent: LastKeyframes[Tensor], control: Tensor) -> Tensor:
         """Return (B, P + H, W) of tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K)."""
+        # A token is described by the last two keyframes of each group, not embedded alone: most frames are transitions.
         features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
         # Frames that are not drawn yet are one learned vector; their control rows tell them apart.
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
@@ -202,7 +206,8 @@ class Predictor(nn.Module):
         `target`: the true tokens (B, H, G). V are the most classes of a group, -inf for those that a group lacks.
         """
         tokens = torch.cat([context.tokens[:, : -self.future], target], dim=1)
-        # The last keyframes up to the frame before each future frame: frames P - 1 to P + H - 2.
+        # Ours, `sequential`: the last keyframes up to the frame before each future one, frames P - 1 to P + H - 2. It
+        # makes (11) autoregressive within the window too; the transformers still run once.
         before = slice(-self.future - 1, -1)
         recent = LastKeyframes(*(part[:, before] for part in last_keyframes(tokens)))
         slots = self(context)

@@ -112,6 +112,7 @@ class SfmsListener(RunsOnEngine):
         self.frontend = AudioFrontend.of(settings, folder)
         self._scales = engine.tensors
         self.sway = HeadSway(settings, engine.tensors)
+        # Smoothing is of the head alone: its codes are coarse, and corners of its path make servos audible.
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
@@ -121,11 +122,13 @@ class SfmsListener(RunsOnEngine):
             self.control_frames = (settings.past_frames, self.horizon)
         # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
+        # A stream begins with a still, neutral face: the paper trains with a neutral sequence before each clip (IV-C).
         mask = neutral_mask(settings.past_frames, len(settings.groups))
         neutral, (codes,) = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
         self._neutral = neutral[0]
         groups = settings.groups.values()
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
+        # Ours: each group of channels has its own codebook; the paper has one code per frame.
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
         p = settings.past_frames
         self._unheard = SpeakerState(
@@ -291,6 +294,7 @@ class SfmsListener(RunsOnEngine):
             seeds: of each stream.
             newest: number of the newest frame of each stream, from 0 at its beginning.
         """
+        # Equation (11): the tokens of the undecided frames; then equations (9) and (10): tokens become motion.
         tokens = self.sampler.draw(seen, settled, seeds, [frame + self.horizon for frame in newest])
         (decoded,) = self.engine.run("decode", tokens, *around(tokens))
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
@@ -320,6 +324,7 @@ class SfmsListener(RunsOnEngine):
         rows, phase, audio = self.frontend.step_each(
             [state.sounds for state in states], [state.audio for state in states]
         )
+        # Features of all new frames of all streams, one stream behind the other.
         heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
         # A frame without sound is 0, the mean of the data, not silence.
         rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
@@ -334,8 +339,15 @@ class SfmsListener(RunsOnEngine):
             "heard": heard,
             "phase": phase,
         }
+        # Each queue of P frames loses its oldest and gains the new ones.
         found: dict[str, Any] = {
-            name: _pushed([getattr(state, name) for state in states], part, counts) for name, part in new.items()
+            name: np.stack(
+                [
+                    np.concatenate([queue := getattr(state, name), own])[-len(queue) :]
+                    for state, own in zip(states, np.split(part, ends[:-1]), strict=True)
+                ]
+            )
+            for name, part in new.items()
         }
         after = [
             SpeakerState(audio=sound, rows=rows[end - 1], **{name: part[row] for name, part in found.items()})
@@ -347,6 +359,7 @@ class SfmsListener(RunsOnEngine):
         """Return standardised motion (N, C) and which faces are known, of motion (58,) of N frames, NaN where not."""
         rows = stacked(motion)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(rows).all(axis=1))
+        # A face that is not known is 0, the mean of the data; `face_known` marks it for the encoder.
         faces = np.zeros((len(rows), self.space.dim), np.float32)
         if known.any():
             faces[known] = self.standardise(self.space.encode(rows[known]))
@@ -357,21 +370,9 @@ def _listened(speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
     """Return the state with a new frame. Raises ValueError for another number of samples than a frame has, or none."""
     check_length(speaker.audio)
     face = _NO_FACE if speaker.face is None else speaker.face.motion
+    # Nothing is computed until the next plan (see the module).
     sound = np.array(speaker.audio, np.float32)  # a copy: the caller may use the array again
     return changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
-
-
-def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[int]) -> NDArray[Any]:
-    """Return N queues (P, ...) as (N, P, ...), each without its oldest and with its `counts` rows of `new`."""
-    longest = len(queues[0])
-    out = np.empty((len(queues), *queues[0].shape), queues[0].dtype)
-    end = 0
-    for row, (queue, count) in enumerate(zip(queues, counts, strict=True)):
-        end += count
-        kept = max(longest - count, 0)  # more frames than P: only the newest P of them
-        out[row, :kept] = queue[longest - kept :]
-        out[row, kept:] = new[end - (longest - kept) : end]
-    return out
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
@@ -386,6 +387,7 @@ def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
         (..., 2 + H, C): `tail`, then `decoded` plus a cubic that begins with the difference in place and speed and
         ends flat: with u = frame / seam, offset (1 - u)^2 (1 + 2u) + speed seam u (1 - u)^2.
     """
+    # Ours: the paper's windows end where the next begin; here each plan corrects the one before.
     gap = tail - decoded[..., :2, :]
     before, offset = gap[..., :1, :], gap[..., 1:, :]
     speed = offset - before

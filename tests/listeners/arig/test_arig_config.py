@@ -51,16 +51,6 @@ def test_the_small_one_fits_in_12_megabytes(tmp_path):
     assert (tmp_path / "model.safetensors").stat().st_size < 12e6
 
 
-def test_a_folder_is_loaded_again_as_it_was_saved(tmp_path):
-    settings = config.parse(config.Arig, RAW, "x")
-    checkpoint.save_config(tmp_path, settings)
-    model = ArigModel(settings)
-    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
-    loaded = load_folder(tmp_path)
-    assert loaded.settings == settings
-    assert all((loaded.model.state_dict()[name] == value).all() for name, value in model.state_dict().items())
-
-
 @pytest.mark.parametrize(("bits", "most"), [(16, 0.01), (8, 0.05)])
 def test_weights_in_fewer_bits_make_a_frame_that_differs_by_little_of_its_spread(bits, most, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "LARGE", 64)  # this one's matrices are small

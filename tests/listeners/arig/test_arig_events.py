@@ -123,20 +123,6 @@ def test_eyes_rest_whatever_the_weights_say(draws: str):
     assert not out[:, EYES].any() and out[:, FACE].std() > 0
 
 
-def test_several_streams_of_one_speaker_are_what_each_is_alone(told):
-    speaker, seeds = talk(26), (1, 2, 3)
-    controls = [nods(27), nods(27, 0.1), nods(27, 0.4)]
-    memories = [told.start(seed) for seed in seeds]
-    for index, frame in enumerate(speaker):
-        rows = [control[index : index + 2] for control in controls]
-        alone = [told.step(frame, memory, row) for memory, row in zip(memories, rows, strict=True)]
-        plans, memories = zip(*told.step_each([frame] * 3, memories, rows), strict=True)
-        for plan, memory, (own_plan, own) in zip(plans, memories, alone, strict=True):
-            np.testing.assert_allclose(plan.frames, own_plan.frames, atol=1e-4)
-            assert (memory.state, memory.sojourn) == (own.state, own.sojourn)
-            np.testing.assert_allclose(memory.motion_keys, own.motion_keys, rtol=1e-3, atol=1e-3)
-
-
 # --- states -----------------------------------------------------------------------------------------------------
 
 

@@ -43,20 +43,6 @@ def test_a_stream_that_is_told_equals_offline(hop: int):
         np.testing.assert_allclose(listener.space.decode(whole[row].numpy())[0], streamed[row], atol=2e-4)
 
 
-def test_streams_told_of_different_events_do_what_each_does_alone(told):
-    speaker, seeds, events = speech(40), (1, 2, 3), ((NOD,), (), (SMILE, replace(NOD, start_s=0.3)))
-    alone = [plans_of(told, speaker, seed, own) for seed, own in zip(seeds, events, strict=True)]
-    past, ahead = told.control_frames
-    memories = [told.start(seed) for seed in seeds]
-    for index, frame in enumerate(speaker):
-        known = [[e for e in own if e.start_s <= (index + 3) * 0.04 + 1e-9] for own in events]
-        controls = [control_track(own, index + 1 - past, past + ahead) for own in known]
-        plans, memories = zip(*told.step_each([frame] * 3, memories, controls), strict=True)
-        for plan, own in zip(plans, alone, strict=True):
-            if plan is not None:
-                np.testing.assert_allclose(plan.frames, own[index].frames, atol=1e-5)
-
-
 @pytest.mark.parametrize("start_s", [0.5, 1.0, 1.3])
 def test_an_event_changes_nothing_before_it_is_told(told, start_s: float):
     speaker = speech(50)
@@ -148,16 +134,6 @@ def test_every_told_number_has_a_gradient_and_so_has_every_weight():
     assert control.grad is not None and (control.grad != 0).all()
     told_weights = [weight for name, weight in predictor.named_parameters() if name.startswith("control_in")]
     assert len(told_weights) == 4 and all((weight.grad != 0).any() for weight in told_weights)
-
-
-@torch.no_grad()
-def test_what_is_told_of_a_later_frame_changes_the_tokens_before_it_only_through_the_plan(told):
-    """A plan may prepare for what it is told; what has been played is not its to change."""
-    quiet = torch.zeros(1, 48, len(COLUMNS))
-    loud = quiet.clone()
-    loud[:, 44:] = 1.0
-    a, b = (told.model.predictor(context(told, control)) for control in (quiet, loud))
-    assert not torch.equal(a[:, 4:], b[:, 4:])
 
 
 @pytest.mark.parametrize(
