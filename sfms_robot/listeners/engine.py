@@ -124,11 +124,10 @@ class RunsOnEngine:
     @property
     def model(self) -> Any:
         """Return the torch model of the engine. Raises ModelError for an engine that has none."""
-        try:
-            return self.engine.model  # type: ignore[attr-defined]
-        except AttributeError:
-            name = self.engine.name
-            raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
+        model = getattr(self.engine, "model", None)
+        if model is None:
+            raise ModelError(f"this listener runs on {self.engine.name}: its model can be read with engine torch only")
+        return model
 
 
 def stacked(parts: Sequence[Array]) -> Array:

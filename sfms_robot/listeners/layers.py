@@ -9,6 +9,7 @@ Shapes: B batch, T frames of the query, S frames of the memory, N samples, D wid
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
@@ -45,7 +46,8 @@ def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
 
 def split_heads(x: Tensor, heads: int) -> Tensor:
     """Return x (N, S, D) as (N, h, S, D/h)."""
-    return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+    n, s, d = x.shape
+    return x.view(n, s, heads, d // heads).transpose(1, 2)
 
 
 def join_heads(x: Tensor) -> Tensor:
@@ -61,11 +63,10 @@ def attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None =
     if torch.compiler.is_exporting():
         mask = None if seen is None else seen.to(torch.int32)
         return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
-    parts, mask = [split_heads(each, heads) for each in (q, k, v)], None if seen is None else seen[:, None, None]
-    if q.dtype == torch.bfloat16 and not q.is_cuda:
-        with torch.autocast(q.device.type, enabled=False):
-            return join_heads(F.scaled_dot_product_attention(*(each.float() for each in parts), attn_mask=mask))
-    return join_heads(F.scaled_dot_product_attention(*parts, attn_mask=mask))
+    mask, half = None if seen is None else seen[:, None, None], q.dtype == torch.bfloat16 and not q.is_cuda
+    q, k, v = (split_heads(each.float() if half else each, heads) for each in (q, k, v))
+    with torch.autocast(q.device.type, enabled=False) if half else nullcontext():
+        return join_heads(F.scaled_dot_product_attention(q, k, v, attn_mask=mask))
 
 
 # --- Blocks over sequences (SFMS) -------------------------------------------------------------------------------------

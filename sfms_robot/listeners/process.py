@@ -4,9 +4,9 @@ In one process networks and the servo loop share a lock, and ticks slip by tens 
 model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.
 
 A listener that is loaded tries, while the head eases in, whether more than one thread is faster, and measures what a
-plan takes on this machine. From that, and from how late the source has been for
-half a second, the parent chooses its hop. Every ten seconds the choice is compared with what has been measured since: a
-hop that does not fit any more is replaced by a shorter one, never by a longer one, so that it settles.
+plan takes on this machine. From that, and from how late the source has been for half a second, the parent chooses its
+hop. Every ten seconds the choice is compared with what has been measured since: a hop that does not fit any more is
+replaced by a shorter one, never by a longer one, so that it settles.
 
 `processes.LIMITS["listener"]` says when a child counts as hung and when it is started again. Signs of life:
 

@@ -160,11 +160,14 @@ class ListenerThread:
         plans = []
         while not self._said.empty():
             kind, value, number = self._said.get_nowait()
+            self._since_s = now_s
             if kind == "error":
                 self._state = value
-            self._skipped += kind == "skipped" and int(number)
-            self._unanswered -= {"skipped": int(number), "done": 1, "plan": 1}.get(kind, 0)
-            self._since_s = now_s
+            elif kind == "skipped":
+                self._skipped += int(number)
+                self._unanswered -= int(number)
+            elif kind != "ready":
+                self._unanswered -= 1
             if kind == "plan":
                 self._step_ms.add(number)
                 self._lateness.came(value, now_s)

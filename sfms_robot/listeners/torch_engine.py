@@ -176,22 +176,27 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     return files
 
 
+class IntegerWeight(nn.Module):
+    """Names and shapes of a weight in 8 bits, which is rounded when a graph is loaded (`engine.integers`)."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        self.int8 = nn.Buffer(torch.zeros(weight.T.shape, dtype=torch.int8))
+        self.scale = nn.Buffer(torch.zeros(len(weight)))
+
+
 class IntegerLinear(nn.Module):
-    """A linear layer of a graph that multiplies in 8 bits (step 1); its weight is rounded when the graph is loaded."""
+    """A linear layer of a graph that multiplies in 8 bits (step 1)."""
 
     def __init__(self, layer: nn.Linear) -> None:
         super().__init__()
-        self.weight, self.bias = nn.Module(), layer.bias
-        self.weight.int8 = nn.Buffer(torch.zeros(layer.weight.T.shape, dtype=torch.int8))
-        self.weight.scale = nn.Buffer(torch.zeros(layer.out_features))
+        self.weight, self.bias = IntegerWeight(layer.weight), layer.bias
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (..., out) of x (..., in)."""
+        product, shape = "com.microsoft::DynamicQuantizeMatMul", (*x.shape[:-1], len(self.weight.scale))
         inputs = (x, self.weight.int8, self.weight.scale, None, self.bias)  # None: zero point of 0
-        shape = (*x.shape[:-1], self.weight.scale.shape[0])
-        out: Tensor = torch.onnx.ops.symbolic(
-            "com.microsoft::DynamicQuantizeMatMul", inputs, dtype=x.dtype, shape=shape
-        )
+        out: Tensor = torch.onnx.ops.symbolic(product, inputs, dtype=x.dtype, shape=shape)
         return out
 
 

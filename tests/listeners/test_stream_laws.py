@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from same import same
-from tiny_arig import arig_listener, talk
+from tiny_arig import arig_listener, soft, talk
 from tiny_sfms import told_listener
 
 from sfms_robot.config import Calmness
@@ -26,8 +26,8 @@ KINDS = {
     "sfms": lambda tiny: tiny,
     "sfms with events": lambda tiny: told_listener(hop=2),
     "sfms on onnx": lambda tiny: load_folder(SHIPPED / "sfms-small", "onnx").at_hop(4),
-    "arig": lambda tiny: arig_listener(),
-    "arig with events": lambda tiny: arig_listener(events=True, draws="innovation", sway=True),
+    "arig": lambda tiny: soft(arig_listener()),
+    "arig with events": lambda tiny: soft(arig_listener(events=True, draws="innovation", sway=True)),
     "arig on onnx": lambda tiny: load_folder(SHIPPED / "arig-small", "onnx"),
     "events decided": lambda tiny: EventfulListener(told_listener(hop=2), EventModel.load(), LIVELY),
 }

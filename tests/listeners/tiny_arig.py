@@ -36,6 +36,19 @@ def arig_listener(**changes) -> ArigListener:
     return ArigListener(model.settings, torch_engine(model))
 
 
+def soft(listener: ArigListener) -> ArigListener:
+    """Whose motion is small and inside 0..1, where nothing is clipped, and whose states last some frames."""
+    model = listener.model
+    with torch.no_grad():
+        model.motion_std.fill_(0.02)
+        model.motion_mean.copy_(0.5 * model.is_drawn)
+        if model.settings.draws == "innovation":
+            model.rho.fill_(0.9)
+        if model.states is not None and model.settings.events:
+            model.states.durations.copy_(torch.linspace(1, 6, 33).expand(7, -1))
+    return listener
+
+
 def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agent: bool = True) -> list[SpeakerFrame]:
     """Both tracks speak in turns of some frames."""
     rng = np.random.default_rng(seed)

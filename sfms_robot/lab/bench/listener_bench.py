@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -335,17 +336,21 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
     """
     import torch
 
+    from sfms_robot.listeners.arig.networks import networks
     from sfms_robot.listeners.arig.sampler import Denoiser
+    from sfms_robot.listeners.torch_engine import Recorder
 
     head = listener.model.head
     if not isinstance(head, Denoiser):
         return {}
+    listener = copy(listener)
+    listener.engine = recorder = Recorder(listener.model, networks(listener.model))
     memory, conditions = listener.start(0), []
     for index, frame in enumerate(speaker):
-        if index % _EVERY == _EVERY - 1:
-            conditions.append(listener.condition(frame, memory)[0])
         _, memory = listener.step(frame, memory)
-    repeated = torch.from_numpy(np.concatenate(conditions)).repeat_interleave(_DRAWS, dim=0)
+        if index % _EVERY == _EVERY - 1:
+            conditions.append(recorder.examples["draw"]["z"])
+    repeated = torch.cat(conditions).repeat_interleave(_DRAWS, dim=0)
 
     @torch.inference_mode()
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

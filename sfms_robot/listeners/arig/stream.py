@@ -231,14 +231,6 @@ class ArigListener(RunsOnEngine):
             sway=self.sway.start(seed),
         )
 
-    def condition(
-        self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None
-    ) -> tuple[Floats, ArigMemory]:
-        """Return the inputs of the sampler for the next frame, (1, its width), and the memory without what it draws."""
-        rows = self._rows([control])
-        z, _, (now,) = self._conditions(self._hear([speaker], [memory]), [memory], rows)
-        return z, now
-
     def step_each(
         self,
         speakers: Sequence[SpeakerFrame],

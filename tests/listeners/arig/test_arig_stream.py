@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from tiny_arig import arig_listener, arig_model, dyad_of, generate, noise_of, streamed, talk
+from tiny_arig import arig_listener, arig_model, dyad_of, generate, noise_of, soft, streamed, talk
 
 from sfms_robot import config
 from sfms_robot.data import data_dir
@@ -28,14 +28,6 @@ ABLATIONS = [
 @pytest.fixture(scope="module")
 def tiny() -> ArigListener:
     return arig_listener()
-
-
-def soft(listener: ArigListener) -> ArigListener:
-    """Whose motion is small: what it shows is what it made, nothing is clipped to a blendshape's 0..1."""
-    with torch.no_grad():
-        listener.model.motion_std.fill_(0.02)
-        listener.model.motion_mean.fill_(0.5)
-    return listener
 
 
 def assert_stream_is_offline(listener: ArigListener, frames: int, atol: float) -> None:
