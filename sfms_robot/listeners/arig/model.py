@@ -12,6 +12,16 @@ the same by a law of the tests. Buffers that training sets from its data: `motio
 `sound_std`, and of the diffusion head `low`, `high`, the range of what it draws. Everything that goes in and out here
 is in plain units: motion of the listener's motion space, sound features of `audio_frontend.track`.
 
+Sections of the paper and the files of this folder that follow them:
+
+    3.1, (1), (2)   what a frame is made from            model.py; streaming: stream.py
+    3.2             interactive behaviour understanding  modules.py, ShortRange and LongRange
+    3.3             conversational states                modules.py, StateUnderstanding
+    3.4             progressive motion prediction        modules.py, Progressive
+    3.4, (3), (4)   diffusion head                       sampler.py
+    ours            curves of events                     event_curves.py
+    ours            networks of a stream, 8-bit layers   networks.py
+
 B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
 

@@ -3,7 +3,16 @@
     Inpainter    sparse to dense (IV-B5): keyframes -> every frame
     Tokenizer    motion <-> tokens (IV-B): placement, codes, inpainter
     SfmsModel    tokenizer and predictor, with the scales of motion and sound: the weights of one listener
-    networks     functions of tensors alone that `stream.SfmsListener` calls; they run as modules, traced, or as ONNX
+    networks     functions of tensors alone that `stream.SfmsListener` calls; they run as modules or as ONNX
+
+Sections of the paper and the files of this folder that follow them:
+
+    IV-A   features of sound                         audio_frontend.py (shared with ARIG)
+    IV-B2  keyframe discovery                        placement.py, piecewise_linear.py
+    IV-B4  codes of keyframes                        quantizer.py
+    IV-B5  from keyframes to every frame             model.py
+    IV-C   predictor of listening motion             predictor.py
+    ours   drawing tokens, and running as a stream   draw.py, stream.py
 
 B batch or streams, T frames, P past and H future frames, C channels, G groups, D digits of a code, W width.
 """
