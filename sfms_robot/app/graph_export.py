@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import cast, get_args
 
 from sfms_robot.app.output_paths import made_folder
-from sfms_robot.config.listener import listener_package
 from sfms_robot.data import find
-from sfms_robot.errors import ConfigError
-from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, load_config, read_weights, write_tensors
+from sfms_robot.errors import ConfigError, optional
+from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, read_weights, write_tensors
 
 
 def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None = None) -> list[Path]:
@@ -23,7 +22,9 @@ def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | 
     folder = find("listeners", name, "config.yaml")
     target = folder if out is None else made_folder(out, "--out")
     weights = None if weight_bits is None else read_weights(folder / WEIGHTS)
-    files: list[Path] = listener_package(load_config(folder).kind).export_graphs(folder, target, int8)
+    with optional("sfms-robot export"):
+        from sfms_robot.listeners.torch_engine import export
+    files = export(folder, target, int8)
     if weights is not None:
         write_tensors(target / WEIGHTS, weights, cast("Bits", weight_bits))
         files = [*files, target / WEIGHTS]

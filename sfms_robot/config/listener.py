@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -397,7 +396,7 @@ class Arig(ListenerSettings):
         draws: target of the sampler: the `motion` of a frame, as in the paper; the `step` from the frame before, whose
             errors are small where a face is still, but add up; or the `innovation` of a first-order autoregression
             fitted on the data, a step that is forgotten as fast as people's motion returns to its mean.
-        precision: of the running model's large layers; auto: int8 where the processor has it, else fp32.
+        precision: of large layers on onnxruntime; auto: int8 where the folder has such graphs. torch computes in fp32.
     """
 
     kind: Literal["arig"]
@@ -440,17 +439,9 @@ class Arig(ListenerSettings):
         return EVENT_STATES if self.events else STATES
 
 
-# The models of config.yaml of each kind of listener that a folder may hold. Listeners of other packages are no folders
-# of ours: see `plugins`.
+# The models of config.yaml of each kind of listener that a folder may hold; for listeners of other packages see
+# `plugins`.
 LISTENER_KINDS: Final[Mapping[str, type[ListenerSettings]]] = {"sfms": Sfms, "arig": Arig}
-
-
-def listener_package(kind: str) -> Any:
-    """Return the package of a kind, with `load(folder, engine, threads)` and `export_graphs(folder, out, int8)`.
-
-    It is imported only where such a listener is loaded: it may need torch.
-    """
-    return import_module(f"sfms_robot.listeners.{kind}")
 
 
 def load_listener(file: Path) -> ListenerSettings:

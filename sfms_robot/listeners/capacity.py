@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -32,13 +32,16 @@ _BISECTIONS: Final = 20
 
 
 def step_each(
-    listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any]
+    listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], *controls: Sequence[Any]
 ) -> list[tuple[Plan | None, Any]]:
-    """Step each stream once; in one batch where the listener can (`engine.RunsOnEngine`)."""
+    """Step each stream once; in one batch where the listener can (`engine.RunsOnEngine`).
+
+    `controls`: one sequence of them, for a listener that takes control.
+    """
     together = getattr(listener, "step_each", None)
     if together is None:
-        return [listener.step(speaker, memory) for speaker, memory in zip(speakers, memories, strict=True)]
-    found: list[tuple[Plan | None, Any]] = together(speakers, memories)
+        return [listener.step(*each) for each in zip(speakers, memories, *controls, strict=True)]
+    found: list[tuple[Plan | None, Any]] = together(speakers, memories, *controls)
     return found
 
 
@@ -88,10 +91,6 @@ class Capacity:
             heads += 1
         return heads
 
-    def scaled(self, scale: float) -> Capacity:
-        """Return the costs with another scale."""
-        return replace(self, scale=scale)
-
 
 def measure_capacity(
     listener: Listener,
@@ -126,9 +125,6 @@ def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float
 
 def _between(sizes: Sequence[int], costs_s: Sequence[float], count: float) -> float:
     """Return the cost of `count`: 0 for none, a line between two sizes, and the last line beyond."""
-    if count <= sizes[0]:
-        return costs_s[0] * max(count, 0.0) / sizes[0]  # some batches have one, most have none
-    if count <= sizes[-1]:
-        return float(np.interp(count, sizes, costs_s))
-    slope = (costs_s[-1] - costs_s[-2]) / (sizes[-1] - sizes[-2]) if len(sizes) > 1 else costs_s[0] / sizes[0]
-    return costs_s[-1] + max(0.0, slope) * (count - sizes[-1])
+    at, cost_s = (0, *sizes), (0.0, *costs_s)  # some batches have one, most have none
+    slope = max(0.0, (cost_s[-1] - cost_s[-2]) / (at[-1] - at[-2]))
+    return float(np.interp(count, at, cost_s)) + slope * max(0.0, count - at[-1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import yaml
@@ -14,7 +14,7 @@ from safetensors import SafetensorError, deserialize, safe_open
 from safetensors.numpy import save_file
 
 from sfms_robot import config
-from sfms_robot.errors import ConfigError, ModelError
+from sfms_robot.errors import ModelError
 
 if TYPE_CHECKING:
     from torch import nn
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 Shapes = Mapping[str, tuple[tuple[int, ...], bool]]  # of tensors by name; True where they hold real numbers
 Bits = Literal[8, 16, 32]
-Settings = TypeVar("Settings", bound=config.ListenerSettings)
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
 BFLOAT16, INT8 = "BF16", "I8"
@@ -35,15 +34,6 @@ LARGEST = 1e6  # of any value: an unmeasured speed is stored as this, weights ar
 def load_config(folder: Path) -> config.ListenerSettings:
     """Read `folder`/config.yaml. Raises ConfigError."""
     return config.load_listener(folder / CONFIG)
-
-
-def config_of(folder: Path, kind: type[Settings]) -> Settings:
-    """Read `folder`/config.yaml of one kind of listener. Raises ConfigError."""
-    settings = load_config(folder)
-    if not isinstance(settings, kind):
-        wanted = kind.__name__.lower()
-        raise ConfigError(f"{folder / CONFIG}: kind: expected {wanted}, got {settings.kind}")
-    return settings
 
 
 def save_config(folder: Path, settings: config.ListenerSettings) -> None:

@@ -11,6 +11,7 @@ or to weights of other shapes is reported in one line before anything runs.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import hashlib
 import json
@@ -18,7 +19,7 @@ import logging
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -28,12 +29,11 @@ from typing import Any, Final, Literal, Protocol, Self
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.errors import ModelError, optional
+from sfms_robot.errors import ModelError
 from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
-Examples = Mapping[str, Mapping[str, Array]]  # inputs of every network, by the names of network and input
 
 KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
 ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
@@ -64,25 +64,37 @@ class Engine(Protocol):
         """
         ...
 
-    def build_graphs(self, examples: Examples) -> None:
-        """Make calls for a single stream, as in `examples`, as fast as possible; the weights must not change any more.
-
-        Takes a second with torch, nothing with onnx.
-        """
-
     def set_threads(self, threads: int) -> None:
         """Use this many threads from now on."""
 
 
 class RunsOnEngine:
-    """A listener whose networks an engine runs. It has no state but the weights, held by the engine."""
+    """A listener whose networks an engine runs. It has no state but the weights, held by the engine.
+
+    Attributes:
+        hop: frames from one plan to the next; hops: those that `at_hop` takes.
+        horizon: frames of a plan.
+        control_frames: rows of control that a step takes, up to the newest frame and after it; (0, 0) without events.
+    """
 
     engine: Engine
+    hop: int = 1
+    hops: Sequence[int] = (1,)
+    horizon: int = 1
+    control_frames: tuple[int, int] = (0, 0)
 
-    def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], controls: Sequence[Floats | None] | None
-    ) -> Sequence[tuple[Plan | None, Any]]:
-        """Move N streams one frame on; with a single speaker, all of them had the same from the start."""
+    def at_hop(self, hop: int) -> Self:
+        """Return a listener of the same weights that plans every `hop` frames, one of `hops`."""
+        other = copy.copy(self)
+        other.hop = hop
+        return other
+
+    def is_due(self, memory: Any) -> bool:
+        """Return whether the next frame brings a plan."""
+        return True
+
+    def start(self, seed: int) -> Any:
+        """Return the memory of a new stream."""
         raise NotImplementedError
 
     def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]:
@@ -93,7 +105,7 @@ class RunsOnEngine:
 
         Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
         """
-        return self._stepped([speaker], [memory], None if control is None else [control])[0]
+        return self.step_each([speaker], [memory], [control])[0]
 
     def step_each(
         self,
@@ -107,19 +119,7 @@ class RunsOnEngine:
         its plan is its own, and None where it is not due. Never changes memories in place. Raises as `step`, for the
         first frame that is refused; then no stream has moved.
         """
-        if len(speakers) != len(memories):
-            raise ValueError(f"{len(speakers)} frames for {len(memories)} streams")
-        return [*self._stepped(speakers, memories, controls)]
-
-    def step_many(
-        self, speaker: SpeakerFrame, memories: Sequence[Any], controls: Sequence[Floats | None] | None = None
-    ) -> tuple[list[Plan], list[Any]]:
-        """Step streams that began together with the same speaker; return their plans, none where none is due.
-
-        As `step_each`, but features of the speaker are computed once.
-        """
-        found = self._stepped([speaker], memories, controls)
-        return [plan for plan, _ in found if plan is not None], [memory for _, memory in found]
+        raise NotImplementedError
 
     def standardise(self, motion: Floats) -> Floats:
         """Return motion (..., C) of the motion space in the units of the model."""
@@ -129,20 +129,10 @@ class RunsOnEngine:
     @property
     def model(self) -> Any:
         """Return the torch model of the engine. Raises ModelError for an engine that has none."""
-        try:
-            return self.engine.model  # type: ignore[attr-defined]
-        except AttributeError:
-            name = self.engine.name
-            raise ModelError(f"this listener runs on {name}: what looks into its model needs torch") from None
-
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        raise NotImplementedError
-
-    def build_graphs(self) -> Self:
-        """Build the engine's graphs and return this listener."""
-        self.engine.build_graphs(self.examples(1))
-        return self
+        model = getattr(self.engine, "model", None)
+        if model is None:
+            raise ModelError(f"this listener runs on {self.engine.name}: its model can be read with engine torch only")
+        return model
 
 
 def stacked(parts: Sequence[Array]) -> Array:
@@ -248,17 +238,15 @@ class OnnxEngine:
     """An `Engine` on onnxruntime.
 
     Args:
-        folder: of the listener, for messages.
+        folder: of the listener; its weights are read again whenever the number of threads changes.
         graphs: of its networks.
-        weights: returns the tensors of model.safetensors with their names, one after another; called again whenever the
-            number of threads changes.
         threads: that each network may use.
+
+    Raises ModelError as `checkpoint.stored_tensors`, and for a graph that onnxruntime does not take.
     """
 
-    def __init__(
-        self, folder: Path, graphs: GraphFolder, weights: Callable[[], Iterable[tuple[str, Array]]], threads: int = 1
-    ) -> None:
-        self._folder, self._graphs, self._weights = folder, graphs, weights
+    def __init__(self, folder: Path, graphs: GraphFolder, threads: int = 1) -> None:
+        self._folder, self._graphs = folder, graphs
         self.tensors: Mapping[str, Array] = {}
         self._threads = 0
         self._sessions: dict[str, tuple[Any, list[str]]] = {}  # of each network, with the names of its inputs
@@ -269,9 +257,6 @@ class OnnxEngine:
         """Return "onnx", the precision and the threads."""
         precision = " int8" if self._graphs.in_integers else ""
         return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
-
-    def build_graphs(self, examples: Examples) -> None:
-        """Do nothing: the networks are graphs already."""
 
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `Engine.run`."""
@@ -290,7 +275,7 @@ class OnnxEngine:
         plain = {name for graph in graphs.values() for name in {*graph.weights} - {*graph.rounded}}
         rounded = {name for graph in graphs.values() for name in graph.rounded}
         values, small = {}, {}
-        for name, weight in self._weights():
+        for name, weight in stored_tensors(self._folder / WEIGHTS, self._graphs.wanted):
             if name in plain:
                 values[name] = _value(weight)
             if name in rounded:
@@ -369,53 +354,25 @@ def whole_integers() -> bool:
 
 # --- Choice of an engine ----------------------------------------------------------------------------------------------
 #
-# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process_child`) measures
-# whether one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two
-# seconds and 200 MB.
+# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process`) measures whether
+# one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two seconds
+# and 200 MB.
 
 
-def engine_of(
-    folder: Path,
-    settings: config.ListenerSettings,
-    wanted: EngineName,
-    torch_engine: Callable[[], Engine],
-    precision: str = "fp32",
-    threads: int | None = None,
-) -> Engine:
-    """Load the engine of a listener's folder.
+def graphs_to_run(folder: Path, settings: config.ListenerSettings, wanted: EngineName) -> GraphFolder | None:
+    """Return the graphs to run; None for torch. `precision: auto` takes 8 bits where there are graphs of it.
 
-    Args:
-        folder: of the listener.
-        settings: of the listener.
-        wanted: the engine, or auto.
-        torch_engine: makes torch's, with the folder's weights.
-        precision: of large layers: fp32, int8, or auto, which is int8 where there are graphs of it.
-        threads: None for one, and with torch for the number that it uses.
-
-    Raises ModelError, and ConfigError where a package that `wanted` needs is not installed.
+    Raises ModelError.
     """
-    graphs = _graphs(folder, settings, wanted, precision)
-    if graphs is not None:
-        file, shapes = folder / WEIGHTS, graphs.wanted
-        return OnnxEngine(folder, graphs, lambda: stored_tensors(file, shapes), threads or 1)
-    with optional(f"{folder}: a listener without graphs of engine onnx"):
-        engine = torch_engine()
-    if threads is not None:
-        engine.set_threads(threads)
-    return engine
-
-
-def _graphs(folder: Path, settings: config.ListenerSettings, wanted: EngineName, precision: str) -> GraphFolder | None:
-    """Return the graphs to run; None for torch."""
-    if wanted == "torch" or (wanted == "auto" and not has_graphs(folder)):
-        return None
-    try:
-        graphs = read_graphs(folder, settings, integers=precision != "fp32")
-    except ModelError as error:
-        if wanted == "onnx" or find_spec("torch") is None:
-            raise
-        log.warning("torch in place of onnx: %s", error)
-        return None
-    if precision == "int8" and not graphs.in_integers:
+    precision = settings.precision if isinstance(settings, config.Arig) else "fp32"
+    found = None
+    if wanted == "onnx" or (wanted == "auto" and has_graphs(folder)):
+        try:
+            found = read_graphs(folder, settings, integers=precision != "fp32")
+        except ModelError as error:
+            if wanted == "onnx" or find_spec("torch") is None:
+                raise
+            log.warning("torch in place of onnx: %s", error)
+    if precision == "int8" and (found is None or not found.in_integers):
         raise ModelError(f"{folder}: precision int8, and no graphs in 8 bits: sfms-robot export --int8 {folder}")
-    return graphs
+    return found

@@ -1,7 +1,7 @@
 """Layers that both listeners share: attention, feed-forward, modulation, written out so that a step is plain to see.
 
-SFMS is made of `Block`s over sequences. ARIG makes one frame at a time, where calling a module costs as much as its
-product: its layers skip the hooks of `nn.Module` (`PlainModule`), and a query looks at a few tokens (`CrossAttention`).
+SFMS is made of `Block`s over sequences. ARIG makes one frame at a time: a query looks at a few tokens
+(`CrossAttention`).
 
 Shapes: B batch, T frames of the query, S frames of the memory, N samples, D width, h heads.
 """
@@ -9,6 +9,7 @@ Shapes: B batch, T frames of the query, S frames of the memory, N samples, D wid
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
@@ -38,15 +39,34 @@ def _operator(name: str, inputs: tuple[Any, ...], attributes: dict[str, Any], li
     return out
 
 
-def exported_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
-    """Return full attention (B, T, D) of q (B, T, D) over k, v (B, S, D) as one operator; `seen` (B, S) masks keys."""
-    mask = None if seen is None else seen.to(torch.int32)
-    return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
-
-
 def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
     """Return LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator."""
     return _operator("LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, x, 17)
+
+
+def split_heads(x: Tensor, heads: int) -> Tensor:
+    """Return x (N, S, D) as (N, h, S, D/h)."""
+    n, s, d = x.shape
+    return x.view(n, s, heads, d // heads).transpose(1, 2)
+
+
+def join_heads(x: Tensor) -> Tensor:
+    """Return x (N, h, S, D/h) as (N, S, D)."""
+    return x.transpose(1, 2).flatten(2)
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
+    """Return attention (N, T, D) of q (N, T, D) over k, v (N, S, D); `seen` (N, S) is True where it may look.
+
+    In 32 bits where a CPU trains in 16: its gradient is slow in those.
+    """
+    if torch.compiler.is_exporting():
+        mask = None if seen is None else seen.to(torch.int32)
+        return _operator("com.microsoft::MultiHeadAttention", (q, k, v, None, mask), {"num_heads": heads}, q)
+    mask, half = None if seen is None else seen[:, None, None], q.dtype == torch.bfloat16 and not q.is_cuda
+    q, k, v = (split_heads(each.float() if half else each, heads) for each in (q, k, v))
+    with torch.autocast(q.device.type, enabled=False) if half else nullcontext():
+        return join_heads(F.scaled_dot_product_attention(q, k, v, attn_mask=mask))
 
 
 # --- Blocks over sequences (SFMS) -------------------------------------------------------------------------------------
@@ -66,12 +86,8 @@ class Attention(nn.Module):
         """Return (B, T, D). `seen` (B, S) is True where the memory may be looked at, at least once per row."""
         if torch.compiler.is_exporting():
             return self._exported(x, memory, seen)
-        (b, t, d), s = x.shape, memory.shape[1]
-        q = self.query(x).view(b, t, self.heads, -1).transpose(1, 2)  # (B, h, T, D/h)
-        k, v = self.key_value(memory).view(b, s, 2, self.heads, -1).permute(2, 0, 3, 1, 4)  # (B, h, S, D/h)
-        mask = None if seen is None else seen[:, None, None, :]
-        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        out: Tensor = self.out(y.transpose(1, 2).reshape(b, t, d))
+        k, v = self.key_value(memory).chunk(2, dim=-1)
+        out: Tensor = self.out(attention(self.query(x), k, v, self.heads, seen))
         return out
 
     def _exported(self, x: Tensor, memory: Tensor, seen: Tensor | None) -> Tensor:
@@ -84,7 +100,7 @@ class Attention(nn.Module):
             return F.linear(y, self.out.weight, self.out.bias)
         # softmax(q (k + c)^T) does not depend on c, and a bias of all values is a bias of the result.
         k, v = F.linear(memory, other.weight).chunk(2, dim=-1)
-        y = exported_attention(self.query(x), k, v, self.heads, seen)
+        y = attention(self.query(x), k, v, self.heads, seen)
         bias = self.out.bias + self.out.weight @ other.bias.chunk(2)[1]
         return F.linear(y, self.out.weight, bias)
 
@@ -141,59 +157,13 @@ class Block(nn.Module):
 # --- Layers of single frames (ARIG) -----------------------------------------------------------------------------------
 
 
-class PlainModule(nn.Module):
-    """A module that is called without hooks, which nothing here uses: for one frame they cost as much as a product."""
-
-    def __call__(self, *args: Any) -> Any:
-        return self.forward(*args)
-
-
-class Linear(nn.Linear):
-    """A linear layer without hooks, as `PlainModule`."""
-
-    __call__ = nn.Linear.forward
-
-
-class LayerNorm(nn.LayerNorm):
-    """A LayerNorm without hooks, as `PlainModule`."""
-
-    __call__ = nn.LayerNorm.forward
-
-
-def split_heads(x: Tensor, heads: int) -> Tensor:
-    """Return x (N, S, D) as (N, h, S, D/h)."""
-    n, s, d = x.shape
-    return x.view(n, s, heads, d // heads).transpose(1, 2)
-
-
-def join_heads(x: Tensor) -> Tensor:
-    """Return x (N, h, S, D/h) as (N, S, D)."""
-    n, h, s, d = x.shape
-    return x.transpose(1, 2).reshape(n, s, h * d)
-
-
-def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Return full attention of (N, h, S, D/h), in 32 bits where a CPU trains in 16: its gradient is slow in those."""
-    if q.dtype == torch.bfloat16 and not q.is_cuda:
-        with torch.autocast(q.device.type, enabled=False):
-            return F.scaled_dot_product_attention(q.float(), k.float(), v.float())
-    return F.scaled_dot_product_attention(q, k, v)
-
-
-def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
-    """Return full attention (N, T, D) of q (N, T, D) over k, v (N, S, D)."""
-    if torch.compiler.is_exporting():
-        return exported_attention(q, k, v, heads)
-    return join_heads(attend(*(split_heads(each, heads) for each in (q, k, v))))
-
-
-class FeedForward(PlainModule):
+class FeedForward(nn.Module):
     """Widen to `hidden`, GELU, narrow."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.up = Linear(width, hidden)
-        self.down = Linear(hidden, width)
+        self.up = nn.Linear(width, hidden)
+        self.down = nn.Linear(hidden, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (..., D) of x (..., D)."""
@@ -201,7 +171,7 @@ class FeedForward(PlainModule):
         return out
 
 
-class Modulation(PlainModule):
+class Modulation(nn.Module):
     """adaLN (Peebles and Xie 2023; A.1): shifts, scales and gates of a block, computed from a condition.
 
     Ours: a new one leaves its block a plain one (shifts about 0, scales and gates about 1), because gates of 0, with
@@ -212,27 +182,26 @@ class Modulation(PlainModule):
         """Make vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
         super().__init__()
         self.parts = len(kinds)
-        self.linear = Linear(width, self.parts * size)
+        self.linear = nn.Linear(width, self.parts * size)
         nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
         with torch.no_grad():
             self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
 
     def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
-        return self.linear(condition).chunk(self.parts, dim=-1)
+        parts: tuple[Tensor, ...] = self.linear(condition).chunk(self.parts, dim=-1)
+        return parts
 
     def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
-        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample; (size,) if N is 1."""
-        parts = self.linear(condition)
-        return (parts[0] if parts.shape[0] == 1 else parts[:, None]).chunk(self.parts, dim=-1)
+        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample."""
+        parts: tuple[Tensor, ...] = self.linear(condition)[:, None].chunk(self.parts, dim=-1)
+        return parts
 
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """Return LayerNorm of x (..., D) without weights, then scaled and shifted; `shift`, `scale` broadcast to x."""
     if torch.compiler.is_exporting():
         return exported_norm(x, scale, shift)
-    if shift.dim() == 1:  # the same for all: LayerNorm applies it as its own weights
-        return torch.layer_norm(x, x.shape[-1:], scale, shift)
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
 
 
@@ -247,7 +216,7 @@ def windows(x: Tensor, size: int) -> Tensor:
     return padded.unfold(1, size, 1).transpose(-1, -2)
 
 
-class CrossAttention(PlainModule):
+class CrossAttention(nn.Module):
     """A query that looks at a few tokens, then a feed-forward; pre-norm, residual.
 
     Keys and values of a token do not depend on its slot: the meaning of a slot is added to the finished key. So a
@@ -257,12 +226,12 @@ class CrossAttention(PlainModule):
     def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = LayerNorm(width)
-        self.query = Linear(width, width)
-        self.key_value = Linear(width, 2 * width)
+        self.norm = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
         self.slots = nn.Parameter(torch.randn(slots, 2 * width) * 0.02)
-        self.out = Linear(width, width)
-        self.ffn_norm = LayerNorm(width)
+        self.out = nn.Linear(width, width)
+        self.ffn_norm = nn.LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
     def keys(self, tokens: Tensor) -> Tensor:

@@ -3,10 +3,10 @@
 In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
 model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.
 
-A listener that is loaded is not yet fast: it builds its graphs while the head eases in, tries whether more than one
-thread is faster, and measures what a plan takes on this machine. From that, and from how late the source has been for
-half a second, the parent chooses its hop. Every ten seconds the choice is compared with what has been measured since: a
-hop that does not fit any more is replaced by a shorter one, never by a longer one, so that it settles.
+A listener that is loaded tries, while the head eases in, whether more than one thread is faster, and measures what a
+plan takes on this machine. From that, and from how late the source has been for half a second, the parent chooses its
+hop. Every ten seconds the choice is compared with what has been measured since: a hop that does not fit any more is
+replaced by a shorter one, never by a longer one, so that it settles.
 
 `processes.LIMITS["listener"]` says when a child counts as hung and when it is started again. Signs of life:
 
@@ -30,10 +30,8 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -44,7 +42,7 @@ from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, calmed
+from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, listen
 from sfms_robot.ports import Listener
 from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, cores, give_way
 from sfms_robot.signals.quantiles import Quantiles
@@ -56,13 +54,11 @@ _LOOK_S: Final = 0.1  # between two checks of a child that loads, while nothing 
 _STATES: Final = {"backing off": "starting", "loading": "building", "running": "listening"}
 
 NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
-AWAKE_S: Final = 0.25
+AWAKE_S: Final = 0.02
 PROBE_S: Final = 0.5
 PROBE_PLANS: Final = 12
 
 log = logging.getLogger(__name__)
-
-Say = Callable[[tuple[str, Any, float]], object]
 
 
 class ListenerProcess:
@@ -273,12 +269,12 @@ class ListenerProcess:
 
 def main() -> None:
     """Load the listener of the first message, then listen until the pipe ends."""
-    parent, inbox, hops = ParentPipe(), Inbox(), queue.SimpleQueue[int]()
+    parent, inbox = ParentPipe(), Inbox()
     name, seed, calmness, engine = parent.receive()
 
     def sort(message: int | Calmness | SpeakerFrame) -> None:
         if isinstance(message, int):
-            hops.put(message)
+            inbox.hop = message
         elif isinstance(message, Calmness):
             inbox.calmness = message
         else:
@@ -287,11 +283,10 @@ def main() -> None:
     parent.forward(sort)
     give_way(NICE)
     try:
-        from sfms_robot.listeners.registry import at_hop, build_graphs, engine_name, hops_of, load_listener
+        from sfms_robot.listeners.registry import at_hop, engine_name, hops_of, load_listener
 
-        listener = load_listener(name, graphs=False, calmness=calmness, engine=engine, threads=1)
+        listener = load_listener(name, calmness=calmness, engine=engine, threads=1)
         parent.send(("loaded", engine_name(listener), 0.0))
-        build_graphs(listener)
         choices = hops_of(listener)
         if use_threads(at_hop(listener, min(choices)), threads()):
             parent.send(("loaded", engine_name(listener), 0.0))
@@ -308,19 +303,14 @@ def main() -> None:
     except RobotError as error:
         parent.send(("error", str(error), 0.0))
         return
-    listen(at_hop(listener, _hop(hops)), seed, inbox, parent.send, hops)
+    while inbox.hop is None:  # awake again and again: for the parent, a child that uses no processor time hangs
+        time.sleep(AWAKE_S)
+    listen(listener, seed, inbox, parent.send)
 
 
 def threads() -> int:
     """Return the number of threads that the child may use: one core is the servo loop's."""
     return max(1, cores() - 1)
-
-
-def _hop(hops: queue.SimpleQueue[int]) -> int:
-    """Wait for the hop, awake a few times a second: for the parent, a child that uses no processor time hangs."""
-    while True:
-        with suppress(queue.Empty):
-            return hops.get(timeout=AWAKE_S)
 
 
 def use_threads(listener: Listener, most: int) -> bool:
@@ -362,21 +352,3 @@ def plan_times_s(
         wait(max(0.0, FRAME_S - taken_s))
     p50_s, p99_s = np.percentile(planned_s or other_s, [50, 99])
     return float(p50_s), float(p99_s)
-
-
-def listen(listener: Listener, seed: int, inbox: Inbox, say: Say, hops: queue.SimpleQueue[int] | None = None) -> None:
-    """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
-    from sfms_robot.listeners.registry import at_hop
-
-    memory = listener.start(seed)
-    say(("ready", None, 0.0))
-    while (frame := inbox.next()) is not None:
-        if inbox.skipped:
-            say(("skipped", None, inbox.skipped))
-        memory = calmed(listener, memory, inbox)
-        while hops is not None and not hops.empty():
-            listener = at_hop(listener, hops.get())
-        began_s = time.perf_counter()
-        plan, memory = listener.step(frame, memory)
-        taken_ms = (time.perf_counter() - began_s) * 1e3
-        say(("done" if plan is None else "plan", plan, taken_ms))

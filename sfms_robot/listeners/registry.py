@@ -1,4 +1,4 @@
-"""Listeners by name: the kinds of `config.listener_kinds`, imported only when chosen."""
+"""Listeners by name: shipped ones, folders, and those of other packages. torch is imported only where it is needed."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from sfms_robot.config.listener import Calmness, listener_package
+from sfms_robot import config
+from sfms_robot.config.listener import Calmness
+from sfms_robot.errors import optional
+from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import load_config
-from sfms_robot.listeners.engine import Engine, EngineName
-from sfms_robot.listeners.eventful import EventfulListener, MotionModel
+from sfms_robot.listeners.engine import Engine, EngineName, OnnxEngine, graphs_to_run
+from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.idle import FILE as IDLE_FILE
 from sfms_robot.listeners.idle import IdleMotion
+from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.plugins import listener_folder, load_plugin
 from sfms_robot.ports import Listener
 
 
 def load_listener(
     name: str | Path,
-    graphs: bool = True,
     calmness: Calmness | None = None,
     engine: EngineName = "auto",
     threads: int | None = None,
@@ -29,9 +32,8 @@ def load_listener(
     Shipped ones are `engine.RunsOnEngine`s.
 
     Args:
-        graphs: make it ready to run at full speed, which takes torch another second; else call `build_graphs` later.
         calmness: rates of the events of a listener that decides them.
-        engine: what computes its networks (`onnx_engine`); auto: onnx where it can be, else torch.
+        engine: what computes its networks (`engine`); auto: onnx where it can be, else torch.
         threads: for its networks; None: one, and with torch as many as it is set to.
 
     Raises ConfigError or ModelError.
@@ -39,40 +41,51 @@ def load_listener(
     folder = listener_folder(str(name))
     if folder is None:
         return load_plugin(str(name))
-    settings = load_config(folder)
-    listener = cast(Listener, listener_package(settings.kind).load(folder, engine, threads))
-    if settings.events:
+    moves = load_folder(folder, engine, threads)
+    listener: Listener = moves
+    if moves.settings.events:
         resting = folder / IDLE_FILE
         idle = IdleMotion.load(resting) if resting.is_file() else None
-        listener = EventfulListener(cast(MotionModel, listener), EventModel.load(), calmness, idle)
-    if graphs:
-        build_graphs(listener)
+        listener = EventfulListener(moves, EventModel.load(), calmness, idle)
     return listener
+
+
+def load_folder(folder: Path, engine: EngineName = "auto", threads: int | None = None) -> SfmsListener | ArigListener:
+    """Return the model of motion of a folder with config.yaml and model.safetensors. Raises ConfigError, ModelError."""
+    settings = load_config(folder)
+    graphs = graphs_to_run(folder, settings, engine)
+    runs: Engine
+    if graphs is not None:
+        runs = OnnxEngine(folder, graphs, threads or 1)
+    else:
+        with optional(f"{folder}: a listener without graphs of engine onnx"):
+            from sfms_robot.listeners.torch_engine import load_model, torch_engine
+
+            runs = torch_engine(load_model(folder))
+        if threads is not None:
+            runs.set_threads(threads)
+    return model_of_motion(settings, runs, folder)
+
+
+def model_of_motion(settings: config.ListenerSettings, engine: Engine, folder: Path) -> SfmsListener | ArigListener:
+    """Return the stream of a configuration, whose networks an engine runs. Raises ConfigError or ModelError."""
+    if isinstance(settings, config.Sfms):
+        return SfmsListener(settings, engine, folder)
+    assert isinstance(settings, config.Arig)
+    return ArigListener(settings, engine, folder)
 
 
 def engine_name(listener: Listener) -> str | None:
     """Return what computes its networks, in words; None for a listener of another package."""
-    engine = _engine(listener)
+    engine: Engine | None = getattr(listener, "engine", None)
     return None if engine is None else engine.name
 
 
 def set_threads(listener: Listener, threads: int) -> None:
     """Use so many threads from now on; a listener of another package stays unchanged."""
-    engine = _engine(listener)
+    engine: Engine | None = getattr(listener, "engine", None)
     if engine is not None:
         engine.set_threads(threads)
-
-
-def _engine(listener: Listener) -> Engine | None:
-    found: Engine | None = getattr(getattr(listener, "how", listener), "engine", None)
-    return found
-
-
-def build_graphs(listener: Listener) -> None:
-    """Compile its networks, where it can; their weights must not change any more."""
-    build = getattr(listener, "build_graphs", None)
-    if build is not None:
-        build()
 
 
 def hops_of(listener: Listener) -> Sequence[int]:

@@ -23,7 +23,6 @@ from __future__ import annotations
 import logging
 import math
 import secrets
-import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -86,7 +85,6 @@ class RemoteListener:
         self._step_ms, self._rtt_ms, self._delay_ms = Quantiles(), Quantiles(), Quantiles()
         self._shown: deque[tuple[str, float]] = deque(maxlen=_SHOWN)
         self._asked_s = -math.inf
-        self._heard_s: float | None = None  # when anything came from the stream, or it began
         self._waiting_since_s: float | None = None  # for an answer to a frame
         self._skipped = self._unsent = self._refused_messages = 0
         self._joins = self._losses = 0
@@ -186,7 +184,7 @@ class RemoteListener:
     def _begin_loop(self, now_s: float) -> None:
         """Forget times of before the loop: they are of another clock."""
         if not self._looped:
-            self._looped, self._asked_s, self._heard_s = True, -math.inf, now_s
+            self._looped, self._asked_s = True, -math.inf
 
     def _attend(self, now_s: float) -> None:
         """Handle what came, and request a stream where that is due."""
@@ -229,10 +227,10 @@ class RemoteListener:
         if self._welcome is None or (self._welcome.horizon, self._welcome.hop) != (welcome.horizon, welcome.hop):
             self._buffer = JitterBuffer(welcome.horizon, welcome.hop)
         if self._welcome is None or self._welcome.server != welcome.server:
-            self._clock.forget()
+            self._clock = ClockOffset()
         self._buffer.restart(now_s)
         self._welcome, self._refusal, self._state = welcome, None, "listening"
-        self._heard_s, self._waiting_since_s = now_s, None
+        self._waiting_since_s = None
         self._joins += 1
         self._link.follow(welcome.stream)
         if self._joins > 1:
@@ -246,7 +244,7 @@ class RemoteListener:
             log.warning("%s%s answers again", PREFIX, self._name)
             self._state = "listening"
             self._buffer.restart(came_s)
-        self._heard_s, self._waiting_since_s = came_s, None
+        self._waiting_since_s = None
         self._step_ms.add(sent.step_ms)
         if 0.0 <= sent.echo_s <= came_s:
             self._clock.observe(sent.echo_s, sent.came_s, sent.sent_s, came_s)
@@ -258,7 +256,7 @@ class RemoteListener:
         """Report a hang when nothing has come for long, though frames went out."""
         if self._state != "listening" or self._waiting_since_s is None:
             return
-        silent_s = now_s - max(self._waiting_since_s, self._heard_s or 0.0)
+        silent_s = now_s - self._waiting_since_s
         if silent_s > HUNG_S:
             log.warning("%s%s has not answered for %.1f s", PREFIX, self._name, silent_s)
             self._lose("hung")
@@ -316,7 +314,6 @@ class ZenohLink:
         self.where = str(router)
         self._connection = Connection(session_config("call", router))
         self._received: deque[tuple[float, bytes]] = deque(maxlen=MOST_RECEIVED)
-        self._lock = threading.Lock()
         self._publisher: zenoh.Publisher | None = None
         self._subscriber: Any = None
 
@@ -355,10 +352,8 @@ class ZenohLink:
     def received(self) -> Sequence[tuple[float, bytes]]:
         """Return what came since the last call, each message with its age [s], in the order of arrival."""
         now_s = time.monotonic()
-        with self._lock:
-            taken = [(now_s - came_s, message) for came_s, message in self._received]
-            self._received.clear()
-        return taken
+        taken = [self._received.popleft() for _ in range(len(self._received))]
+        return [(now_s - came_s, message) for came_s, message in taken]
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
@@ -376,8 +371,7 @@ class ZenohLink:
             self._on_sample(reply.ok)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        with self._lock:
-            self._received.append((time.monotonic(), sample.payload.to_bytes()))
+        self._received.append((time.monotonic(), sample.payload.to_bytes()))
 
 
 # --- A listener by its name -------------------------------------------------------------------------------------------

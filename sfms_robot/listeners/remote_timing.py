@@ -55,38 +55,30 @@ class ClockSample:
 
 
 class ClockOffset:
-    """The samples of the last `WINDOW_S` that could still become the best one."""
+    """The samples of the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        self._samples: deque[ClockSample] = deque()  # delays rise: the first is the best
+        self._samples: deque[ClockSample] = deque()
 
     def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
         """Add an exchange: t1 to t4 of the module's text."""
-        sample = ClockSample(
-            came_s,
-            ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2,
-            max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s)),
-        )
-        if self._samples and abs(sample.offset_s - self._samples[0].offset_s) > SET_S + sample.delay_s:
+        offset_s = ((their_came_s - sent_s) + (their_sent_s - came_s)) / 2
+        delay_s = max(0.0, (came_s - sent_s) - (their_sent_s - their_came_s))
+        if self.best is not None and abs(offset_s - self.best.offset_s) > SET_S + delay_s:
             self._samples.clear()
-        while self._samples and self._samples[-1].delay_s >= sample.delay_s:
-            self._samples.pop()
-        self._samples.append(sample)
+        self._samples.append(ClockSample(came_s, offset_s, delay_s))
         while came_s - self._samples[0].at_s > WINDOW_S:
             self._samples.popleft()
-
-    def forget(self) -> None:
-        """Drop all samples: the server is another one."""
-        self._samples.clear()
 
     @property
     def best(self) -> ClockSample | None:
         """Return the sample with the least delay; None before the first."""
-        return self._samples[0] if self._samples else None
+        return min(self._samples, key=lambda sample: sample.delay_s, default=None)
 
     def theirs(self, our_s: float) -> float | None:
         """Return a time of our clock by the server's; None while nothing is known of it."""
-        return None if self.best is None else our_s + self.best.offset_s
+        best = self.best
+        return None if best is None else our_s + best.offset_s
 
 
 class JitterBuffer:
@@ -115,11 +107,6 @@ class JitterBuffer:
     def shift_s(self) -> float:
         """Return what is added to the times of plans at this moment [s]."""
         return self._shift_s
-
-    @property
-    def delay_s(self) -> float | None:
-        """Return the delay that the shift allows for; None before the first plan."""
-        return float(np.percentile(self._delays_s, PERCENT)) if self._delays_s else None
 
     def put(self, number: int, plan: Plan, came_s: float) -> None:
         """Add a plan, made for frame `number`, which came at `came_s`."""
@@ -156,7 +143,8 @@ class JitterBuffer:
         if made_at_s < self._from_s or delay_s > LONGEST_S:
             return
         self._delays_s.append(delay_s)
-        self._wanted_s = max(0.0, self._hop * FRAME_S + (self.delay_s or 0.0) + MARGIN_S - self._reach_s)
+        late_s = float(np.percentile(self._delays_s, PERCENT))
+        self._wanted_s = max(0.0, self._hop * FRAME_S + late_s + MARGIN_S - self._reach_s)
 
     def _is_due(self, number: int, now_s: float) -> bool:
         """Return whether it is the next in turn, or waiting longer for the one before is of no use."""

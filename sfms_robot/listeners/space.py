@@ -29,9 +29,9 @@ class MotionSpace:
 
     @classmethod
     def of(cls, settings: config.ListenerSettings, folder: Path | None = None) -> MotionSpace:
-        """A matrix is read from the listener's `folder`, if that is given: only what is shown needs it.
+        """Return the space of a listener; a matrix is read from its `folder`, if given: only showing motion needs it.
 
-        Raises ConfigError when the matrix file is missing or is none.
+        Raises ConfigError when the matrix file is missing or unreadable.
         """
         matrix = None
         if settings.flame_matrix is not None and folder is not None:
@@ -48,7 +48,7 @@ class MotionSpace:
         return spaces.limitation(self.name, self.flame)
 
     def decode(self, frames: Floats) -> tuple[Floats, Floats | None]:
-        """Frames (N, D) of the space -> our motion (N, 58), and the jaw (N, 3) rad where the space has one."""
+        """Return our motion (N, 58) of frames (N, D), and the jaw (N, 3) [rad] where the space has one."""
         if self.name == "arkit58":
             shown = np.array(frames, dtype=np.float32)
             np.clip(shown[:, 6:], 0.0, 1.0, out=shown[:, 6:])
@@ -59,7 +59,7 @@ class MotionSpace:
         return out.motion, out.jaw_rad
 
     def encode(self, motion: Floats) -> Floats:
-        """Our motion (N, 58) in the space (N, D). deca56 takes pose and jaw; its expression stays at rest."""
+        """Return our motion (N, 58) in the space (N, D). deca56 takes pose and jaw; its expression stays at rest."""
         if motion.shape[-1] != MOTION_DIM:
             raise ValueError(f"motion is {motion.shape}, not (N, {MOTION_DIM})")
         if self.name == "arkit58":

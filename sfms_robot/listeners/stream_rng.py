@@ -11,7 +11,6 @@ from enum import IntEnum
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.frames import Doubles, Floats
 
@@ -56,11 +55,6 @@ def uniforms(seed: int, frame: int, use: int, count: int, part: int = 0) -> Doub
     """Return (count,) numbers, 0 <= u < 1."""
     words = _GENERATORS.at(seed, frame, use, part).bit_generator.random_raw(count)
     return np.asarray((words >> np.uint64(11)) * TO_UNIT, np.float64)  # the upper 53 bits of a word
-
-
-def uniforms_of(seed: int, frames: NDArray[np.int64], use: int, count: int) -> Doubles:
-    """Return `uniforms` of each of N frames, (N, count)."""
-    return np.array([uniforms(seed, frame, use, count) for frame in frames.tolist()]).reshape(len(frames), count)
 
 
 def normals(seed: int, frame: int, use: int, *shape: int) -> Floats:

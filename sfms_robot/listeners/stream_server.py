@@ -20,7 +20,7 @@ import logging
 import math
 import secrets
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -45,7 +45,7 @@ from sfms_robot.listeners.remote_messages import (
     plan_message,
     words_message,
 )
-from sfms_robot.listeners.thread import MOST_WAITING
+from sfms_robot.listeners.thread import MOST_WAITING, calmed
 from sfms_robot.ports import Listener
 
 DEADLINE_S: Final = 0.080
@@ -60,17 +60,19 @@ _EMPTY: Final = np.zeros(0, np.float32)
 log = logging.getLogger(__name__)
 
 
-@dataclass(kw_only=True)
+_COUNTS: Final = tuple("heads plans deadline_misses batches steps skipped_frames lost_frames refused malformed".split())
+
+
+@dataclass(frozen=True, kw_only=True)
 class Figures:
-    """Counts of one `StreamServer`; those of several that serve one listener add up.
+    """Figures of one `StreamServer`; those of several that serve one listener add up.
 
     Attributes:
         server, listener: names.
         hop: frames between plans.
         deadline_s: promised from a frame to its plan.
-        heads: streams at this moment.
+        counts: by the names of `_COUNTS`: `heads` at this moment, the others so far.
         most_heads: number of heads that could be answered in time; None where all are admitted.
-        deadline_misses: plans later than the deadline.
         delays_s, batch_sizes: of the last plans, and of the last batches.
         cost_scale: by how much batches take longer than measured at the start; None where that was not measured.
         cpu_s: processor time of its process.
@@ -80,46 +82,24 @@ class Figures:
     listener: str
     hop: int
     deadline_s: float
-    heads: int = 0
-    most_heads: int | None = None
-    plans: int = 0
-    deadline_misses: int = 0
-    batches: int = 0
-    steps: int = 0
-    skipped_frames: int = 0
-    lost_frames: int = 0
-    refused: int = 0
-    malformed: int = 0
-    delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    batch_sizes: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT))
-    cost_scale: float | None = None
-    cpu_s: float = 0.0
-
-
-_COUNTS: Final = (
-    "heads",
-    "plans",
-    "deadline_misses",
-    "batches",
-    "steps",
-    "skipped_frames",
-    "lost_frames",
-    "refused",
-    "malformed",
-)
+    counts: Counter[str]
+    most_heads: int | None
+    delays_s: Sequence[float]
+    batch_sizes: Sequence[int]
+    cost_scale: float | None
+    cpu_s: float
 
 
 def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
     """Return the statistics of `serve`; `parts` are the processes of one server, one at least."""
     first = parts[0]
-    counts = {name: sum(getattr(each, name) for each in parts) for name in _COUNTS}
     scales = [each.cost_scale for each in parts if each.cost_scale is not None]
     return {
         "server": first.server,
         "listener": first.listener,
         "hop": first.hop,
         "processes": len(parts),
-        **counts,
+        **{name: sum(each.counts[name] for each in parts) for name in _COUNTS},
         "most_heads": None if first.most_heads is None else sum(each.most_heads or 0 for each in parts),
         "deadline_ms": first.deadline_s * 1e3,
         "delay_ms": _spread([delay_s * 1e3 for each in parts for delay_s in each.delays_s]),
@@ -161,12 +141,7 @@ class _Stream:
     calmness: Calmness | None = None
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Frames to be stepped together, and the streams that they are of."""
-
-    streams: Sequence[_Stream]
-    dues: Sequence[_Due]
+Batch = Sequence[tuple[_Stream, _Due]]  # frames to be stepped together
 
 
 class StreamServer:
@@ -179,7 +154,7 @@ class StreamServer:
         deadline_s: promised from a frame to its plan.
 
     Attributes:
-        counts: so far; `figures` completes them.
+        counts: so far, see `Figures`.
     """
 
     def __init__(
@@ -190,11 +165,10 @@ class StreamServer:
         server: str = "server",
         deadline_s: float = DEADLINE_S,
     ) -> None:
-        self._listener, self._capacity = listener, capacity
-        self._deadline_s = deadline_s
-        self.counts = Figures(
-            server=f"{server}-{secrets.token_hex(3)}", listener=name, hop=listener.hop, deadline_s=deadline_s
-        )
+        self._listener, self._name, self._capacity = listener, name, capacity
+        self._server, self._deadline_s = f"{server}-{secrets.token_hex(3)}", deadline_s
+        self.counts: Counter[str] = Counter()
+        self._delays_s, self._batch_sizes = deque[float](maxlen=RECENT), deque[int](maxlen=RECENT)
         self._streams: dict[str, _Stream] = {}
         self._most = self._batch_limit()
 
@@ -211,7 +185,7 @@ class StreamServer:
     @property
     def waits(self) -> bool:
         """Return whether `batch` has something to return."""
-        return any(each.waiting and not each.stepping for each in self._streams.values())
+        return bool(self._ready())
 
     # --- coming and going --------------------------------------------------------------------------------------------
 
@@ -224,15 +198,15 @@ class StreamServer:
             answer = self._admit(said, now_s)
         except RobotError as error:
             self._count_malformed("join", error)
-            answer = Refusal(f"server {self.counts.server} cannot take that: {error}", final=True)
+            answer = Refusal(f"server {self._server} cannot take that: {error}", final=True)
         if isinstance(answer, Refusal):
-            self.counts.refused += 1
+            self.counts["refused"] += 1
             log.info("refused: %s", answer.reason)
         return words_message(answer)
 
     def _admit(self, join: Join, now_s: float) -> Welcome | Refusal:
         if not OURS.fits(join.interface):
-            return Refusal(f"this robot is {join.interface}; server {self.counts.server} is {OURS}", final=True)
+            return Refusal(f"this robot is {join.interface}; server {self._server} is {OURS}", final=True)
         calmness = None if join.calmness is None else parse(Calmness, dict(join.calmness), "calmness")
         known = next((each for each in self._streams.values() if each.client == join.client), None)
         if known is None:
@@ -246,8 +220,8 @@ class StreamServer:
         listener = self._listener
         return Welcome(
             stream=known.name,
-            server=self.counts.server,
-            listener=self.counts.listener,
+            server=self._server,
+            listener=self._name,
             horizon=listener.horizon,
             hop=listener.hop,
         )
@@ -261,7 +235,7 @@ class StreamServer:
             return None
         after = "not be kept up with" if math.isinf(delay_s) else f"be answered after {delay_s * 1e3:.0f} ms"
         return (
-            f"server {self.counts.server} is full: with {self.heads} heads one more would {after}, "
+            f"server {self._server} is full: with {self.heads} heads one more would {after}, "
             f"{self._deadline_s * 1e3:.0f} ms are promised"
         )
 
@@ -290,8 +264,8 @@ class StreamServer:
             return []
 
     def _count_malformed(self, origin: str, error: RobotError) -> None:
-        self.counts.malformed += 1
-        if self.counts.malformed == 1:
+        self.counts["malformed"] += 1
+        if self.counts["malformed"] == 1:
             log.warning("%s: %s (more malformed messages are only counted)", origin, error)
 
     def _heed(self, stream: _Stream, message: bytes) -> None:
@@ -308,7 +282,7 @@ class StreamServer:
             gap = sent.number - stream.expected
             if gap < 0:
                 return []  # it came late, and an empty one has taken its place; or twice
-            self.counts.lost_frames += gap
+            self.counts["lost_frames"] += gap
             for back in range(min(gap, MOST_FILLED), 0, -1):
                 empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, _EMPTY)
                 filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
@@ -319,7 +293,7 @@ class StreamServer:
             return []
         left_out = len(stream.waiting) - 1
         stream.waiting = deque([stream.waiting[-1]])
-        self.counts.skipped_frames += left_out
+        self.counts["skipped_frames"] += left_out
         return [words_message(Notice("skipped", frames=left_out))]
 
     def _due(self, sent: SentFrame, now_s: float) -> _Due:
@@ -331,22 +305,19 @@ class StreamServer:
 
     def batch(self) -> Batch | None:
         """Return what is to be stepped next, or None. Its streams are in no other batch until `finish`."""
-        ready = [each for each in self._streams.values() if each.waiting and not each.stepping]
-        if not ready:
-            return None
-        ready.sort(key=_urgency)
-        chosen = ready[: self._most]
-        for stream in chosen:
+        # A frame that needs no plan may wait until the one that does.
+        ready = sorted(self._ready(), key=lambda each: each.waiting[0].deadline_s + each.to_plan * FRAME_S)
+        for stream in ready[: self._most]:
             stream.stepping = True
-            if stream.calmness is not None and (change := getattr(self._listener, "calmed", None)) is not None:
-                stream.memory = change(stream.memory, stream.calmness)
-            stream.calmness = None
-        return Batch(chosen, [stream.waiting.popleft() for stream in chosen])
+            stream.memory, stream.calmness = calmed(self._listener, stream.memory, stream.calmness), None
+        return [(stream, stream.waiting.popleft()) for stream in ready[: self._most]] or None
+
+    def _ready(self) -> list[_Stream]:
+        return [each for each in self._streams.values() if each.waiting and not each.stepping]
 
     def step(self, batch: Batch) -> list[tuple[Plan | None, Any]]:
         """Step the streams of a batch; return (plan, memory) of each. Raises what the listener raises."""
-        speakers = [due.sent.frame for due in batch.dues]
-        return step_each(self._listener, speakers, [stream.memory for stream in batch.streams])
+        return step_each(self._listener, [due.sent.frame for _, due in batch], [stream.memory for stream, _ in batch])
 
     def finish(
         self, batch: Batch, answers: Sequence[tuple[Plan | None, Any]], began_s: float, now_s: float
@@ -354,7 +325,7 @@ class StreamServer:
         """Keep the memories; return the messages to be sent, each with its stream. `began_s`: when the step did."""
         step_s = now_s - began_s
         messages = []
-        for stream, due, (plan, memory) in zip(batch.streams, batch.dues, answers, strict=True):
+        for (stream, due), (plan, memory) in zip(batch, answers, strict=True):
             stream.memory, stream.stepping = memory, False
             stream.to_plan = self._listener.hop - 1 if plan is not None else max(0, stream.to_plan - 1)
             if plan is not None and stream.name in self._streams:
@@ -369,31 +340,28 @@ class StreamServer:
                 )
                 messages.append((stream.name, plan_message(sent, earlier)))
                 stream.events.append(plan.events)
-                self._planned(now_s - due.came_s)
-        self.counts.batches += 1
-        self.counts.steps += len(batch.streams)
-        self.counts.batch_sizes.append(len(batch.streams))
+                delay_s = now_s - due.came_s
+                self._delays_s.append(delay_s)
+                self.counts.update(plans=1, deadline_misses=delay_s > self._deadline_s)
+        self.counts.update(batches=1, steps=len(batch))
+        self._batch_sizes.append(len(batch))
         self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
         return messages
 
     def failed(self, batch: Batch) -> None:
         """Drop the streams of a batch whose step raised: they join again."""
-        for stream in batch.streams:
+        for stream, _ in batch:
             self._streams.pop(stream.name, None)
-
-    def _planned(self, delay_s: float) -> None:
-        self.counts.plans += 1
-        self.counts.deadline_misses += delay_s > self._deadline_s
-        self.counts.delays_s.append(delay_s)
 
     def _weigh(self, plans: int, steps: int, step_s: float) -> None:
         """Adapt the scale of the costs to how long this batch took."""
         if self._capacity is None:
             return
-        expected_s = self._capacity.scaled(1.0).batch_s(plans, steps - plans)
+        scale = self._capacity.scale
+        expected_s = self._capacity.batch_s(plans, steps - plans) / scale
         if expected_s > 0:
             ratio = min(max(step_s / expected_s, 0.25), 4.0)
-            self._capacity = self._capacity.scaled(self._capacity.scale + _SCALE_STEP * (ratio - self._capacity.scale))
+            self._capacity = replace(self._capacity, scale=scale + _SCALE_STEP * (ratio - scale))
 
     def _batch_limit(self) -> int:
         """Return the number of streams of a batch that takes half of the deadline, all planning."""
@@ -409,15 +377,15 @@ class StreamServer:
     def figures(self) -> Figures:
         """Return what it has done so far."""
         capacity = self._capacity
-        return replace(
-            self.counts,
-            heads=self.heads,
+        return Figures(
+            server=self._server,
+            listener=self._name,
+            hop=self._listener.hop,
+            deadline_s=self._deadline_s,
+            counts=self.counts + Counter(heads=self.heads),
+            delays_s=[*self._delays_s],
+            batch_sizes=[*self._batch_sizes],
             most_heads=None if capacity is None else capacity.most(self._deadline_s),
             cost_scale=None if capacity is None else capacity.scale,
             cpu_s=time.process_time(),
         )
-
-
-def _urgency(stream: _Stream) -> float:
-    """Return when its next frame must be stepped: one that needs no plan may wait for the one that does."""
-    return stream.waiting[0].deadline_s + stream.to_plan * FRAME_S

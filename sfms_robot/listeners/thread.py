@@ -11,7 +11,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from sfms_robot.config.listener import Calmness
@@ -26,6 +26,8 @@ LATE_S: Final = 1.0
 MOST_WAITING: Final = FRAME_HZ // 2  # frames
 CATCH_UP: Final = 0.5  # frames by which fewer must wait after each, while it catches up: twice the person's pace
 
+Say = Callable[[tuple[str, Any, float]], object]
+
 log = logging.getLogger(__name__)
 
 
@@ -38,7 +40,8 @@ class Inbox:
 
     Attributes:
         skipped: frames left out before the last one returned.
-        calmness: requested since `calmed` looked; None: none.
+        calmness: requested since the last frame; None: none.
+        hop: requested; None: the listener's own.
     """
 
     def __init__(self, most: int = MOST_WAITING) -> None:
@@ -48,6 +51,7 @@ class Inbox:
         self._waiting: deque[SpeakerFrame | None] = deque()
         self.skipped = 0
         self.calmness: Calmness | None = None
+        self.hop: int | None = None
 
     def put(self, frame: SpeakerFrame | None) -> None:
         """Add a frame, or None for the end. Never blocks."""
@@ -69,11 +73,29 @@ class Inbox:
         return self._waiting.popleft()
 
 
-def calmed(listener: Listener, memory: Any, inbox: Inbox) -> Any:
+def calmed(listener: Listener, memory: Any, calmness: Calmness | None) -> Any:
     """Return the memory with the rates that were requested since the last frame, if the listener has any."""
-    calmness, inbox.calmness = inbox.calmness, None
     change = getattr(listener, "calmed", None)
     return memory if calmness is None or change is None else change(memory, calmness)
+
+
+def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
+    """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
+    from sfms_robot.listeners.registry import at_hop
+
+    memory = listener.start(seed)
+    say(("ready", None, 0.0))
+    while (frame := inbox.next()) is not None:
+        if inbox.skipped:
+            say(("skipped", None, inbox.skipped))
+        calmness, inbox.calmness = inbox.calmness, None
+        memory = calmed(listener, memory, calmness)
+        if inbox.hop is not None:
+            listener = at_hop(listener, inbox.hop)
+        began_s = time.perf_counter()
+        plan, memory = listener.step(frame, memory)
+        taken_ms = (time.perf_counter() - began_s) * 1e3
+        say(("done" if plan is None else "plan", plan, taken_ms))
 
 
 class Lateness:
@@ -110,26 +132,23 @@ class ListenerThread:
     def __init__(self, listener: Listener, seed: int) -> None:
         self._listener, self._seed = listener, seed
         self._inbox = Inbox()
-        self._plans: queue.SimpleQueue[Plan] = queue.SimpleQueue()
+        self._said: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
         self._step_ms = Quantiles()
         self._lateness = Lateness()
-        self._pushed = self._taken = 0  # frames; each is counted by one thread alone
-        self._dropped = self._skipped = 0
-        self._since_s = 0.0  # nothing was waiting, or a frame was taken
-        self._seen_taken = 0
+        self._unanswered = self._skipped = 0  # frames
+        self._since_s = 0.0  # nothing was waiting, or an answer came
         self._state = "listening"
         self._thread = threading.Thread(target=self._work, name="listener", daemon=True)
         self._thread.start()
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Hand over a frame. Never blocks; while the listener hangs, frames are dropped and counted."""
-        waiting = self._pushed - self._taken
-        if self._state not in ("listening", "hung") or waiting > 2 * MOST_WAITING:
-            self._dropped += 1
+        if self._state not in ("listening", "hung") or self._unanswered > 2 * MOST_WAITING:
+            self._skipped += 1
             return
-        if not waiting:
+        if not self._unanswered:
             self._since_s = now_s
-        self._pushed += 1
+        self._unanswered += 1
         self._inbox.put(frame)
 
     def calm(self, calmness: Calmness) -> None:
@@ -139,12 +158,22 @@ class ListenerThread:
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Return plans that came. Never blocks."""
         plans = []
-        while not self._plans.empty():
-            plans.append(self._plans.get_nowait())
-            self._lateness.came(plans[-1], now_s)
-        taken = self._taken
-        if taken == self._pushed or taken != self._seen_taken:
-            self._seen_taken, self._since_s = taken, now_s
+        while not self._said.empty():
+            kind, value, number = self._said.get_nowait()
+            self._since_s = now_s
+            if kind == "error":
+                self._state = value
+            elif kind == "skipped":
+                self._skipped += int(number)
+                self._unanswered -= int(number)
+            elif kind != "ready":
+                self._unanswered -= 1
+            if kind == "plan":
+                self._step_ms.add(number)
+                self._lateness.came(value, now_s)
+                plans.append(value)
+        if not self._unanswered:
+            self._since_s = now_s
         silent_s = now_s - self._since_s
         hung = silent_s > HUNG_S
         if hung and self._state == "listening":
@@ -165,7 +194,7 @@ class ListenerThread:
         return {
             "state": self._lateness.named(self._state),
             "restarts": 0,
-            "skipped_frames": self._dropped + self._skipped,
+            "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
         }
 
@@ -176,16 +205,7 @@ class ListenerThread:
 
     def _work(self) -> None:
         try:
-            memory = self._listener.start(self._seed)
-            while (frame := self._inbox.next()) is not None:
-                self._skipped += self._inbox.skipped
-                memory = calmed(self._listener, memory, self._inbox)
-                began_s = time.perf_counter()
-                plan, memory = self._listener.step(frame, memory)
-                if plan is not None:
-                    self._step_ms.add((time.perf_counter() - began_s) * 1e3)
-                    self._plans.put(plan)
-                self._taken += 1 + self._inbox.skipped
+            listen(self._listener, self._seed, self._inbox, self._said.put)
         except Exception as error:
-            self._state = f"failed: {type(error).__name__}: {error}"
+            self._said.put(("error", f"failed: {type(error).__name__}: {error}", 0.0))
             log.exception("the listener failed; the run continues without it")

@@ -1,4 +1,4 @@
-"""Networks on torch: run as modules or traced graphs, or written as ONNX graphs without weights.
+"""Networks on torch: run as modules, or written as ONNX graphs without weights.
 
 `TorchEngine` runs a listener's networks. `export` writes them for `engine.OnnxEngine`: torch.export traces a network
 for any number of streams, torch.onnx writes it, onnxscript simplifies it. Weights keep the names that they have in
@@ -8,25 +8,35 @@ configuration run on them. `export` needs the extra `export`.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError, optional
-from sfms_robot.listeners.checkpoint import WEIGHTS, Array
-from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Examples, digest
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.arig.networks import large_layers
+from sfms_robot.listeners.arig.networks import networks as arig_networks
+from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
+from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, RunsOnEngine, digest
+from sfms_robot.listeners.registry import model_of_motion
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.model import networks as sfms_networks
+from sfms_robot.signals.control import COLUMNS
 
 Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
 
-WARM_UPS: Final = 3  # torch.jit specialises a graph in its first two runs
 MODEL: Final = "model."  # before the name of a weight, in every network
 MOST_STREAMS: Final = 4096
 EXAMPLE_STREAMS: Final = 3
@@ -41,44 +51,64 @@ class TorchEngine:
         networks: of the model.
     """
 
+    name = "torch"
+
     def __init__(self, model: nn.Module, networks: Networks) -> None:
         self.model = model.eval()
-        state = {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
-        self.tensors = {name: value.detach().numpy() for name, value in state.items() if not value.is_quantized}
+        self.tensors = {name: value.detach().numpy() for name, value in model.state_dict().items()}
         self._networks = networks
-        self._graphs: dict[str, Callable[..., Any]] = {}
-
-    @property
-    def name(self) -> str:
-        """Return "torch"."""
-        return "torch"
-
-    @torch.inference_mode()
-    def build_graphs(self, examples: Examples) -> None:
-        """Trace every network for a single stream: a small model takes a fifth less time. The weights must not change.
-
-        Sizes that a module turns into Python numbers stay those of the example. torch.jit is being retired; what takes
-        its place needs a C++ compiler on the machine that runs.
-        """
-        for name, inputs in examples.items():
-            network, example = self._networks[name].eval(), _tensors(inputs.values())
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                traced = torch.jit.trace(network, example, check_trace=False)  # type: ignore[no-untyped-call]
-                self._graphs[name] = torch.jit.freeze(traced)
-            for _ in range(WARM_UPS):
-                self._graphs[name](*example)
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `engine.Engine.run`."""
-        tensors = _tensors(inputs)
-        module = self._graphs.get(network) if max(map(len, tensors)) == 1 else None
-        return tuple(output.numpy() for output in (module or self._networks[network])(*tensors))
+        return tuple(output.numpy() for output in self._networks[network](*_tensors(inputs)))
 
     def set_threads(self, threads: int) -> None:
         """Use this many threads in the whole process: torch has no other setting."""
         torch.set_num_threads(threads)
+
+
+class Recorder(TorchEngine):
+    """An engine that keeps the inputs of the last call of each network, by name, as examples."""
+
+    def __init__(self, model: nn.Module, networks: Networks) -> None:
+        super().__init__(model, networks)
+        self.examples: dict[str, dict[str, Tensor]] = {}
+
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """Return the outputs of a network, see `engine.Engine.run`."""
+        module, streams = self._networks[network], max(map(len, inputs))
+        names = [*signature(module.forward).parameters]
+        if further := getattr(module, "further", ()):  # in place of *parts
+            names[-1:] = further
+        arrays = _tensors(np.broadcast_to(each, (streams, *each.shape[1:])) for each in inputs)
+        self.examples[network] = dict(zip(names, arrays, strict=False))
+        return super().run(network, *inputs)
+
+
+def new_model(settings: config.ListenerSettings) -> SfmsModel | ArigModel:
+    """Return the model of a configuration with weights drawn by torch's seed."""
+    if isinstance(settings, config.Sfms):
+        return SfmsModel(settings)
+    assert isinstance(settings, config.Arig)
+    return ArigModel(settings)
+
+
+def load_model(folder: Path) -> SfmsModel | ArigModel:
+    """Load the torch model of a listener's folder. Raises ConfigError or ModelError."""
+    model = new_model(load_config(folder))
+    load_weights(folder / WEIGHTS, model)
+    return model.eval()
+
+
+def networks_of(model: SfmsModel | ArigModel) -> Networks:
+    """Return the networks of a model by name."""
+    return arig_networks(model) if isinstance(model, ArigModel) else sfms_networks(model)
+
+
+def torch_engine(model: SfmsModel | ArigModel) -> TorchEngine:
+    """Return an engine for a model in memory."""
+    return TorchEngine(model, networks_of(model))
 
 
 def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
@@ -91,55 +121,47 @@ def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
 # What is done to the graph of a network:
 #
 #     1. torch.export: a program in which the number of streams N is a symbol. Modules write attention and LayerNorm as
-#        the one operator that onnxruntime has for each (`layers.exported_attention`).
+#        the one operator that onnxruntime has for each (`layers.attention`).
 #     2. torch.onnx: initialisers hold the weights, "model.NAME", and constants.
 #     3. Weights become inputs, onnxscript folds constants and removes what is not used, weights become initialisers
 #        again. As initialisers they would be folded into the graph; values of inputs are not known.
-#     4. For 8 bits, each product of a large layer is replaced (`_with_integers`):
-#
-#            W -> Transpose -> MatMul(x, .) -> Add(., b)   }
-#            Gemm(x, W, b)                                 }  ->  DynamicQuantizeMatMul(x, W.int8, W.scale, -, b)
-#
-#        onnxruntime rounds x by its own range, multiplies integers and scales the result.
-#     5. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
+#     4. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
 #        their content, which `engine` hands to the session (`_written`).
 
 
-def export(
-    folder: Path,
-    settings: config.ListenerSettings,
-    networks: Networks,
-    examples: Examples,
-    integers: Iterable[str] = (),
-) -> list[Path]:
-    """Write the graphs of a listener into its folder and return the files. Takes half a minute to two.
+def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
+    """Write the graphs of a listener's folder below `out` and return the files. Takes half a minute to two.
 
-    Args:
-        folder: of the listener.
-        settings: of the listener.
-        networks: modules with the model as their attribute `model`.
-        examples: inputs of every network, of several streams.
-        integers: weights of layers, by name, for a second graph of each network that has them in 8 bits.
+    `int8`: a second graph of each network has its large layers in 8 bits. SFMS, whose layers are small, has none.
 
-    Raises MissingExtra, and ModelError where the folder cannot be written.
+    Raises ConfigError, MissingExtra, and ModelError where `out` cannot be written.
     """
-    layers = list(integers)
+    settings = load_config(folder)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = new_model(settings).eval()
+    recorder = Recorder(model, networks_of(model))
+    listener: RunsOnEngine = model_of_motion(settings, recorder, folder)
+    control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
+    speakers = [SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32)) for _ in range(EXAMPLE_STREAMS)]
+    memories = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
+    listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
+    models: dict[str, SfmsModel | ArigModel] = {"": model}
+    if int8 and isinstance(model, ArigModel) and large_layers(model):
+        models[".int8"] = in_integers(model)
     graphs: dict[str, Any] = {}
-    for name, network in networks.items():
-        example = dict(zip(examples[name], _tensors(examples[name].values()), strict=True))
-        with torch.no_grad():
-            network(*example.values())  # fills caches, which must not be traced
-            graphs[name] = _graph(network.eval(), example, several=name != ONE_STREAM)
-        if layers:
-            graphs[f"{name}.int8"] = _with_integers(graphs[name], layers)
-    state: dict[str, Tensor] = next(iter(networks.values())).get_submodule("model").state_dict()
+    for suffix, each in models.items():
+        for name, network in networks_of(each).items():
+            with torch.no_grad():
+                graphs[name + suffix] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
+    state: dict[str, Tensor] = model.state_dict()
     known: dict[str, Any] = {}
     files: list[Path] = []
     try:
-        (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
         for name, graph in graphs.items():
             data, known[name] = _written(graph, state)
-            files.append(folder / FOLDER / f"{name}.onnx")
+            files.append(out / FOLDER / f"{name}.onnx")
             files[-1].write_bytes(data)
         manifest = {
             "format": FORMAT,
@@ -147,11 +169,44 @@ def export(
             "tensors": {name: (list(value.shape), value.is_floating_point()) for name, value in state.items()},
             "networks": known,
         }
-        files.append(folder / FOLDER / MANIFEST)
+        files.append(out / FOLDER / MANIFEST)
         files[-1].write_text(json.dumps(manifest, indent=0) + "\n", encoding="utf-8")
     except OSError as error:
-        raise ModelError(f"{folder / FOLDER}: cannot be written: {error.strerror}") from error
+        raise ModelError(f"{out / FOLDER}: cannot be written: {error.strerror}") from error
     return files
+
+
+class IntegerWeight(nn.Module):
+    """Names and shapes of a weight in 8 bits, which is rounded when a graph is loaded (`engine.integers`)."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        self.int8 = nn.Buffer(torch.zeros(weight.T.shape, dtype=torch.int8))
+        self.scale = nn.Buffer(torch.zeros(len(weight)))
+
+
+class IntegerLinear(nn.Module):
+    """A linear layer of a graph that multiplies in 8 bits (step 1)."""
+
+    def __init__(self, layer: nn.Linear) -> None:
+        super().__init__()
+        self.weight, self.bias = IntegerWeight(layer.weight), layer.bias
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., out) of x (..., in)."""
+        product, shape = "com.microsoft::DynamicQuantizeMatMul", (*x.shape[:-1], len(self.weight.scale))
+        inputs = (x, self.weight.int8, self.weight.scale, None, self.bias)  # None: zero point of 0
+        out: Tensor = torch.onnx.ops.symbolic(product, inputs, dtype=x.dtype, shape=shape)
+        return out
+
+
+def in_integers(model: ArigModel) -> ArigModel:
+    """Return a copy of a model whose `large_layers` multiply in 8 bits, for a graph."""
+    model = copy.deepcopy(model)
+    for name in large_layers(model):
+        parent, own = model.get_submodule(name.rpartition(".")[0].rpartition(".")[0]), name.split(".")[-2]
+        setattr(parent, own, IntegerLinear(getattr(parent, own)))
+    return model
 
 
 def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> Any:
@@ -199,7 +254,7 @@ def _like_arguments(network: nn.Module, shapes: list[Any]) -> tuple[Any, ...]:
 
 
 def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, Any]]:
-    """Return the file of a graph (step 5) and its entry in the manifest."""
+    """Return the file of a graph (step 4) and its entry in the manifest."""
     import onnx
     import onnx_ir
 
@@ -235,70 +290,3 @@ def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, 
         "integers": sorted(layers),
     }
     return data, known
-
-
-def _with_integers(model: Any, layers: Iterable[str]) -> Any:
-    """Return a copy whose `layers` multiply in 8 bits (step 4)."""
-    import onnx_ir
-    from onnx_ir.passes.common import RemoveUnusedNodesPass
-
-    model = onnx_ir.from_proto(onnx_ir.to_proto(model))
-    graph = model.graph
-    for layer in layers:
-        weight = graph.initializers.get(MODEL + layer)
-        if weight is None:
-            continue
-        size = [int(each) for each in weight.shape]
-        rounded = _placeholder(f"{MODEL}{layer}.int8", size[::-1], onnx_ir.DataType.INT8)
-        scale = _placeholder(f"{MODEL}{layer}.scale", size[:1], onnx_ir.DataType.FLOAT)
-        graph.initializers.update({rounded.name: rounded, scale.name: scale})
-        for node, index in list(weight.uses()):
-            if node.op_type == "Gemm" and index == 1:
-                _replace(graph, node, node.inputs[0], rounded, scale, node.inputs[2] if len(node.inputs) > 2 else None)
-            elif node.op_type == "Transpose":
-                for product, _ in list(node.outputs[0].uses()):
-                    last, bias = _biased(graph, product)
-                    _replace(graph, last, product.inputs[0], rounded, scale, bias)
-            else:
-                raise ModelError(f"{layer}: used by {node.op_type}, which has no product in 8 bits")
-    RemoveUnusedNodesPass()(model)
-    for name in [name for name, value in graph.initializers.items() if not value.uses()]:
-        del graph.initializers[name]
-    model.opset_imports["com.microsoft"] = 1
-    return model
-
-
-def _placeholder(name: str, shape: list[int], kind: Any) -> Any:
-    """Return an initialiser that gets its content when the graph is loaded."""
-    import onnx_ir
-
-    value = onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
-    value.const_value = onnx_ir.ExternalTensor(WEIGHTS, None, None, kind, shape=onnx_ir.Shape(shape), name=name)
-    return value
-
-
-def _biased(graph: Any, product: Any) -> tuple[Any, Any]:
-    """Return the node that adds a bias to a product, and the bias; the product and None where there is none."""
-    uses = list(product.outputs[0].uses())
-    if len(uses) == 1 and uses[0][0].op_type == "Add":
-        node, index = uses[0]
-        bias = node.inputs[1 - index]
-        if bias.name in graph.initializers and len(bias.shape) == 1:
-            return node, bias
-    return product, None
-
-
-def _replace(graph: Any, node: Any, x: Any, rounded: Any, scale: Any, bias: Any) -> None:
-    """Put a product in 8 bits in the place of `node`, under the name of its output."""
-    import onnx_ir
-
-    inputs = [x, rounded, scale] if bias is None else [x, rounded, scale, None, bias]  # None: zero point of 0
-    product = onnx_ir.Node("com.microsoft", "DynamicQuantizeMatMul", inputs)
-    product.outputs[0].name = node.outputs[0].name
-    graph.insert_before(node, product)
-    for user, index in list(node.outputs[0].uses()):
-        user.replace_input_with(index, product.outputs[0])
-    for index, output in enumerate(graph.outputs):
-        if output is node.outputs[0]:
-            graph.outputs[index] = product.outputs[0]
-    graph.remove(node, safe=True)

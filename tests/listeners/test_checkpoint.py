@@ -8,7 +8,8 @@ from safetensors.torch import load_file, save_file
 from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.listeners import checkpoint, sfms
+from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.model import SfmsModel
 
 
@@ -20,7 +21,7 @@ def folder(tmp_path, tiny):
 
 
 def test_a_saved_listener_plans_as_before(folder, tiny):
-    loaded = sfms.load(folder)
+    loaded = load_folder(folder)
     assert loaded.settings == tiny.settings
     speaker = speech(9)
     for index, plan in plans_of(loaded, speaker).items():
@@ -30,10 +31,10 @@ def test_a_saved_listener_plans_as_before(folder, tiny):
 def test_missing_files_are_named(folder):
     (folder / "model.safetensors").unlink()
     with pytest.raises(ModelError, match=r"model\.safetensors: no such weights file"):
-        sfms.load(folder)
+        load_folder(folder)
     (folder / "config.yaml").unlink()
     with pytest.raises(ConfigError, match=r"config\.yaml: no such file"):
-        sfms.load(folder)
+        load_folder(folder)
 
 
 @pytest.mark.parametrize("size", [0, 7, 200])
@@ -41,7 +42,7 @@ def test_corrupt_weights_are_named(folder, size):
     file = folder / "model.safetensors"
     file.write_bytes(file.read_bytes()[:size])
     with pytest.raises(ModelError, match=r"model\.safetensors: not a readable safetensors file"):
-        sfms.load(folder)
+        load_folder(folder)
 
 
 def _rewrite(folder, change):
@@ -77,13 +78,13 @@ SLOTS = "predictor.slots"
 def test_a_tensor_that_does_not_fit_is_named(folder, change, said):
     _rewrite(folder, change)
     with pytest.raises(ModelError, match=said):
-        sfms.load(folder)
+        load_folder(folder)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_any_float_will_do(folder, dtype):
     _rewrite(folder, lambda tensors: tensors.update({"predictor.slots": tensors["predictor.slots"].to(dtype)}))
-    assert next(iter(sfms.load(folder).model.parameters())).dtype == torch.float32
+    assert next(iter(load_folder(folder).model.parameters())).dtype == torch.float32
 
 
 def test_a_folder_that_cannot_be_written_is_one_line_and_nothing_is_left(tmp_path, tiny):

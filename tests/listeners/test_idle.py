@@ -37,33 +37,6 @@ def made_sway(seed: int = 0, amplitude: float = 0.01, spread: float = 0.0) -> np
     return draw_sway(np.tile(amplitude * np.eye(6, dtype=np.float32), (BANDS, 1, 1)), spread, seed)
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 100])
-def test_frame_by_frame_it_is_the_whole(chunk: int):
-    times_s = np.arange(700) * 0.04
-    whole = sway_at(made_sway(), times_s)
-    parts = [sway_at(made_sway(), times_s[at : at + chunk]) for at in range(0, 700, chunk)]
-    np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0, atol=1e-9)
-
-
-def test_it_begins_at_rest_and_has_set_in_soon():
-    out = sway_at(made_sway(), np.array([-1.0, 0.0, EASE_S / 100, EASE_S, 60.0]))
-    assert not out[:2].any() and np.abs(out[2]).max() < 1e-4 < np.abs(out[3:]).max()
-
-
-def test_its_size_is_what_was_asked_also_after_an_hour():
-    some = np.stack([made_sway(seed) for seed in range(200)])
-    wanted = 0.01 * BANDS**0.5
-    for since_s in (10.0, 3600.0):
-        out = sway_at(some, since_s + np.arange(20) * 11.0)
-        assert float(out.std()) == pytest.approx(wanted, rel=0.05)
-
-
-def test_people_differ_in_size_by_the_spread():
-    times_s = 10 + np.arange(400) * 1.7
-    sizes = np.array([np.log(sway_at(made_sway(seed, spread=0.5), times_s).std()) for seed in range(60)])
-    assert 0.35 < float(sizes.std()) < 0.65
-
-
 def powers(sway: np.ndarray) -> np.ndarray:
     """(BANDS, S, S) what the channels of a stream (3, 1 + L, S) do together in each band, in the long run."""
     _, size, phase = sway[:, 1:].reshape(3, BANDS, LINES, -1)
@@ -83,14 +56,6 @@ def test_every_stream_has_the_powers_that_were_learned_and_a_manner_within_what_
         manners.append(np.log(ratio.mean()) / 2)
     assert float(np.std(manners)) == pytest.approx(0.3, rel=0.15)
     assert np.abs(manners).max() == pytest.approx(0.3 * WIDEST, rel=1e-3)  # some of 300 would be beyond
-
-
-def test_it_is_slow_and_does_not_step():
-    motion = sway_at(made_sway(), 10 + np.arange(5000) * 0.04).astype(np.float64)
-    power = np.square(np.abs(np.fft.rfft(motion, axis=0))).sum(1)
-    hz = np.fft.rfftfreq(5000, 0.04)
-    assert float(power[hz > (1 + UNEVEN) * BANDS_HZ[-1]].sum() / power.sum()) < 0.01
-    assert np.abs(np.diff(motion, axis=0)).max() < 0.2 * (1 + UNEVEN) * np.abs(motion).max()  # 2 pi 0.8 Hz 0.04 s
 
 
 def test_a_head_stands_and_shifts_and_its_turns_and_its_shifts_at_other_times():
@@ -115,13 +80,6 @@ def test_channels_go_together_as_they_are_mixed_and_every_other_stream_is_mirror
     assert np.mean(r) == pytest.approx(-0.91, abs=0.05) and max(r) < -0.6
     r = [np.corrcoef(sway_at(draw_sway(mixture, 0.0, seed, [1]), times_s).T)[0, 1] for seed in range(30)]
     assert np.mean(np.abs(r)) == pytest.approx(0.91, abs=0.05) and min(r) < -0.6 and max(r) > 0.6
-
-
-def test_streams_and_channels_go_their_own_ways():
-    times_s = 10 + np.arange(3000) * 0.2
-    one, other = sway_at(made_sway(1), times_s), sway_at(made_sway(2), times_s)
-    together = np.corrcoef(np.concatenate([one, other], axis=1).T)
-    assert np.abs(together - np.eye(12)).max() < 0.4
 
 
 @pytest.mark.parametrize("name", ["sfms-small", "arig-small"])
@@ -189,44 +147,10 @@ def faces(frames, level=0.5):
     return np.full((frames, MOTION_DIM), level, np.float32)
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 100])
-def test_piece_by_piece_it_is_the_whole(chunk):
-    stream, times_s = made().start(3), (np.arange(400) + 1) * 0.04
-    whole = stream.added(faces(400), times_s)
-    parts = [stream.added(faces(len(some)), some) for some in np.split(times_s, range(chunk, 400, chunk))]
-    np.testing.assert_allclose(np.concatenate(parts), whole, atol=1e-6)
-
-
-def test_it_sets_in_from_rest_and_leaves_the_head_alone():
-    out = made().start(1).added(faces(3), np.array([0.0, EASE_S / 100, 60.0])) - 0.5
-    assert not out[0].any() and np.abs(out[1]).max() < 1e-4 < np.abs(out[2]).max()
-    assert not out[:, : SHAPES.start].any()
-
-
-def test_the_idle_motion_has_the_size_that_was_asked_also_after_an_hour():
-    for since_s in (10.0, 3600.0):
-        moved = [made().start(seed).added(faces(40), since_s + np.arange(40) * 2.3) - 0.5 for seed in range(150)]
-        assert float(np.std([one[:, SHAPES][:, BROW] for one in moved])) == pytest.approx(0.02, rel=0.05)
-
-
 def test_faces_stay_faces():
     for level in (0.0, 1.0):
         out = made(0.4).start(0).added(faces(500, level), np.arange(500) * 0.04)
         assert out[:, SHAPES].min() >= 0 and out[:, SHAPES].max() <= 1 and out[:, SHAPES].std() > 0.01
-
-
-def test_it_is_no_faster_than_its_bands():
-    moved = made().start(2).added(faces(5000), 10 + np.arange(5000) * 0.04)[:, SHAPES][:, BROW].astype(np.float64)
-    power, hz = np.abs(np.fft.rfft(moved - moved.mean())) ** 2, np.fft.rfftfreq(5000, 0.04)
-    assert power[hz > IDLE_BANDS_HZ[-1] + 0.05].sum() < 0.01 * power.sum()
-
-
-def test_streams_go_their_own_ways_and_people_differ_by_the_spread():
-    times_s = 10 + np.arange(2000) * 0.2
-    one, other = (made().start(seed).added(faces(2000), times_s)[:, SHAPES][:, BROW] for seed in (1, 2))
-    assert abs(np.corrcoef(one, other)[0, 1]) < 0.3
-    stds = [made(spread=0.4).start(s).added(faces(300), 10 + np.arange(300) * 1.3)[:, SHAPES].std() for s in range(60)]
-    assert 0.25 < np.std(np.log(stds)) < 0.55
 
 
 def test_what_is_saved_is_loaded(tmp_path):
@@ -300,3 +224,60 @@ def test_a_listener_tells_it_how_long_its_own_voice_has_been_silent(hop):
         silent_s = (newest - before[-1]) * FRAME_S + still.times_s - still.times_s[0] if before else np.inf
         expected = idle.start(5).added(still.frames, still.times_s, silent_s)
         np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
+
+
+# --- Laws of both -----------------------------------------------------------------------------------------------------
+
+
+def of_sway(seed, times_s, spread=0.0):
+    return sway_at(made_sway(seed, spread=spread), times_s).astype(np.float64)
+
+
+def of_idle(seed, times_s, spread=0.0):
+    moved = made(spread=spread).start(seed).added(faces(len(times_s)), times_s).astype(np.float64) - 0.5
+    assert not moved[:, : SHAPES.start].any()  # the head is left alone
+    return moved[:, SHAPES][:, [BROW, BROW + 1]]
+
+
+BOTH = pytest.mark.parametrize(
+    ("motion", "size", "fastest_hz"),
+    [(of_sway, 0.01 * BANDS**0.5, (1 + UNEVEN) * BANDS_HZ[-1]), (of_idle, 0.02, IDLE_BANDS_HZ[-1] + 0.05)],
+    ids=["sway", "idle"],
+)
+
+
+@BOTH
+@pytest.mark.parametrize("chunk", [1, 7, 100])
+def test_piece_by_piece_it_is_the_whole(motion, size, fastest_hz, chunk):
+    times_s = (np.arange(400) + 1) * 0.04
+    parts = [motion(3, some) for some in np.split(times_s, range(chunk, 400, chunk))]
+    np.testing.assert_allclose(np.concatenate(parts), motion(3, times_s), atol=1e-6)
+
+
+@BOTH
+def test_it_sets_in_from_rest(motion, size, fastest_hz):
+    out = np.abs(motion(1, np.array([-1.0, 0.0, EASE_S / 100, EASE_S, 60.0]))).max(1)
+    assert not out[:2].any() and out[2] < 1e-4 < out[3:].max()
+
+
+@BOTH
+def test_its_size_is_what_was_asked_also_after_an_hour_and_people_differ_by_the_spread(motion, size, fastest_hz):
+    for since_s in (10.0, 3600.0):
+        found = [motion(seed, since_s + np.arange(40) * 2.3) for seed in range(150)]
+        assert float(np.std(found)) == pytest.approx(size, rel=0.05)
+    sizes = [np.log(motion(seed, 10 + np.arange(300) * 1.7, spread=0.5).std()) for seed in range(60)]
+    assert 0.3 < float(np.std(sizes)) < 0.65
+
+
+@BOTH
+def test_it_is_no_faster_than_its_bands(motion, size, fastest_hz):
+    moved = motion(2, 10 + np.arange(5000) * 0.04)
+    power, hz = np.square(np.abs(np.fft.rfft(moved - moved.mean(0), axis=0))).sum(1), np.fft.rfftfreq(5000, 0.04)
+    assert power[hz > fastest_hz].sum() < 0.01 * power.sum()
+
+
+@BOTH
+def test_streams_and_channels_go_their_own_ways(motion, size, fastest_hz):
+    times_s = 10 + np.arange(3000) * 0.2
+    together = np.corrcoef(np.concatenate([motion(1, times_s), motion(2, times_s)], axis=1).T)
+    assert np.abs(together - np.eye(len(together))).max() < 0.4

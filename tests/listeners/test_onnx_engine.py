@@ -7,13 +7,17 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 
+from sfms_robot.config.listener import parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, stored_tensors
+from sfms_robot.listeners.arig.networks import large_layers
+from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, save_config
 from sfms_robot.listeners.engine import HALF, OnnxEngine, digest, integers, read_graphs
-from sfms_robot.listeners.registry import at_hop, engine_name, load_listener
+from sfms_robot.listeners.registry import engine_name, load_listener
+from sfms_robot.listeners.torch_engine import new_model
 
 LISTENERS = data_dir("configs") / "listeners"
 SHIPPED = ["sfms-small", "arig-small"]
@@ -42,7 +46,7 @@ def streamed(listener, speaker, seed=1):
 
 @pytest.fixture(scope="module", params=SHIPPED)
 def both(request):
-    return [load_listener(request.param, graphs=False, engine=engine) for engine in ("onnx", "torch")]
+    return [load_listener(request.param, engine=engine) for engine in ("onnx", "torch")]
 
 
 def test_plans_are_those_of_torch(both):
@@ -54,38 +58,17 @@ def test_plans_are_those_of_torch(both):
         assert one.events == other.events
 
 
-def test_streams_of_any_age_together_are_each_one_alone(both):
-    for listener in both:
-        listener = at_hop(listener, 4 if listener.horizon > 1 else 1)
-        begins, speakers = (0, 3, 10), [people(30, seed) for seed in (4, 5, 6)]
-        alone = [streamed(listener, speaker, seed)[0] for seed, speaker in enumerate(speakers)]
-        memories, together = [listener.start(seed) for seed in range(3)], [[] for _ in begins]
-        for now in range(30):
-            live = [row for row, begin in enumerate(begins) if begin <= now]
-            told = [speakers[row][now - begins[row]] for row in live]
-            for row, (plan, memory) in zip(
-                live, listener.step_each(told, [memories[row] for row in live]), strict=True
-            ):
-                memories[row] = memory
-                together[row] += [] if plan is None else [plan]
-        for one, many in zip(alone, together, strict=True):
-            for plan, other in zip(one, many, strict=False):
-                np.testing.assert_allclose(plan.frames, other.frames, atol=2e-5)
-
-
 def test_auto_is_onnx_where_there_are_graphs(both):
-    assert engine_name(load_listener("sfms-small", graphs=False)) == "onnx, 1 thread"
+    assert engine_name(load_listener("sfms-small")) == "onnx, 1 thread"
     assert [engine_name(listener) for listener in both] == ["onnx, 1 thread", "torch"]
 
 
 @pytest.mark.parametrize("folder", [each for each in FOLDERS if (each / "onnx").is_dir()], ids=lambda each: each.name)
 def test_graphs_that_ship_are_of_the_configuration_and_the_weights_that_ship(folder):
     """If this fails: sfms-robot export (with --int8 for arig-paper)."""
-    settings = load_config(folder)
-    found = read_graphs(folder, settings)
-    weights = folder / WEIGHTS
-    if weights.is_file():
-        OnnxEngine(folder, found, lambda: stored_tensors(weights, found.wanted))
+    found = read_graphs(folder, load_config(folder))
+    if (folder / WEIGHTS).is_file():
+        OnnxEngine(folder, found)
 
 
 def test_no_torch_where_the_engine_is_onnx():
@@ -107,9 +90,9 @@ def copied(tmp_path):
     return shutil.copytree(LISTENERS / "sfms-small", tmp_path / "mine")
 
 
-def refused(folder) -> str:
+def refused(folder, engine="onnx") -> str:
     with pytest.raises(ModelError) as caught:
-        load_listener(folder, engine="onnx")
+        load_listener(folder, engine=engine)
     text = str(caught.value)
     assert caught.value.exit_code == 5 and "\n" not in text
     return text
@@ -131,7 +114,7 @@ def test_graphs_of_another_model_are_refused(copied):
 def test_a_listener_without_graphs_runs_on_torch_unless_onnx_is_asked_for(copied):
     shutil.rmtree(copied / "onnx")
     assert "no graphs of this listener for engine onnx" in refused(copied)
-    assert engine_name(load_listener(copied, graphs=False)) == "torch"
+    assert engine_name(load_listener(copied)) == "torch"
 
 
 def test_a_manifest_that_is_none_is_refused(copied):
@@ -142,7 +125,7 @@ def test_a_manifest_that_is_none_is_refused(copied):
 
 def test_with_auto_graphs_that_do_not_fit_leave_the_listener_to_torch(copied, caplog):
     (copied / "onnx" / "graphs.json").write_text("{")
-    assert engine_name(load_listener(copied, graphs=False)) == "torch"
+    assert engine_name(load_listener(copied)) == "torch"
     assert "torch in place of onnx" in caplog.text
 
 
@@ -155,6 +138,25 @@ def test_graphs_hang_on_what_they_hold_and_on_nothing_else():
     settings = load_config(LISTENERS / "sfms-small")
     other = settings.model_copy(update={"description": "another", "hop": 2})
     assert digest(settings) == digest(other) != digest(settings.model_copy(update={"ramp_frames": 3}))
+
+
+def test_large_layers_are_in_integers_and_the_blocks_of_the_sampler_too():
+    small = {"kind": "arig", "heads": 4, "context_chunks": 8, "diffusion": {"steps": 4, "train_steps": 50, "blocks": 1}}
+    names = {
+        width: large_layers(new_model(parse_listener(small | {"width": width, "feedforward": 2 * width}, "test")))
+        for width in (16, 256)
+    }
+    assert not [name for name in names[16] if not name.startswith("head.")]
+    assert {name.split(".")[0] for name in names[256]} >= {"short", "long", "progress", "head"}
+    assert {name for name in names[256] if name.startswith("head.")} <= {
+        "head.modulation.linear.weight", "head.up.0.weight", "head.down.0.weight"
+    }  # fmt: skip
+
+
+def test_integers_without_graphs_of_them_are_refused(tmp_path):
+    settings = parse_listener(yaml.safe_load((LISTENERS / "arig-small" / "config.yaml").read_text()), "test")
+    save_config(tmp_path, settings.model_copy(update={"precision": "int8"}))
+    assert f"no graphs in 8 bits: sfms-robot export --int8 {tmp_path}" in refused(tmp_path, "torch")
 
 
 def test_a_layer_in_integers_is_the_layer_within_a_percent_or_two():

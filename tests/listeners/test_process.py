@@ -14,8 +14,8 @@ from virtual_time import Time
 
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
-from sfms_robot.listeners.process import REVIEW_S, SETTLED_FRAMES, ListenerProcess, listen, plan_times_s
-from sfms_robot.listeners.thread import HUNG_S, Inbox
+from sfms_robot.listeners.process import REVIEW_S, SETTLED_FRAMES, ListenerProcess, plan_times_s
+from sfms_robot.listeners.thread import HUNG_S, Inbox, listen
 from sfms_robot.processes import LIMITS
 
 SILENCE = np.zeros(640, np.float32)

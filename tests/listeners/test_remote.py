@@ -103,7 +103,7 @@ def test_an_event_is_told_once_though_it_is_sent_with_three_plans_and_some_are_l
 def test_frames_that_are_lost_do_not_shift_time():
     network = Network(0.02, 0.0, 0.10, seed=5)
     head = robot(network).run(30.0)
-    assert head.server.core.counts.lost_frames > 50
+    assert head.server.core.counts["lost_frames"] > 50
     (stream,) = head.server.core._streams.values()
     assert abs(stream.memory[1] - 30.0 / 0.04) <= 10
 

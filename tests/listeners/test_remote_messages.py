@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from same import same
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import EVENT_KINDS, FaceFrame, ListenerEvent, Plan, SpeakerFrame
@@ -62,15 +63,6 @@ def plans(draw):
 
 def sent_plan(plan):
     return SentPlan(number=0, plan=plan, echo_s=1.0, came_s=1.0, sent_s=1.0, step_ms=1.0)
-
-
-def same(a, b):
-    """Whether two values are the same, arrays included, NaN equal to itself."""
-    if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and np.array_equal(a, b)
-    if hasattr(a, "__dataclass_fields__"):
-        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
-    return a == b or (a != a and b != b)
 
 
 @given(st.integers(0, 2**31 - 1), FRAMES, TIMES, TIMES | st.just(math.nan))

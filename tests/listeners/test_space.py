@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
-from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS
 from sfms_robot.listeners.space import MotionSpace
@@ -81,8 +80,3 @@ def test_a_wrong_space_is_one_clear_line(changes, line):
     with pytest.raises(ConfigError, match=line) as told:
         tiny_settings(**changes)
     assert "\n" not in str(told.value)
-
-
-def test_an_unknown_kind_of_listener_names_the_known_ones():
-    with pytest.raises(ConfigError, match=r"kind = 'lstm'.*sfms"):
-        config.parse_listener({"kind": "lstm"}, "x.yaml")

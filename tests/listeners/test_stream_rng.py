@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.listeners.stream_rng import Use, normals, uniforms, uniforms_of
+from sfms_robot.listeners.stream_rng import Use, normals, uniforms
 
 
 def philox(seed: int, frame: int, use: int) -> np.random.Philox:
@@ -17,6 +17,4 @@ def test_numbers_are_those_of_a_new_generator_whatever_was_drawn_before(seed, fr
         np.testing.assert_array_equal(normals(seed, frame, use, 15, 58), wanted)
         wanted = (philox(seed, frame, use).random_raw(7) >> np.uint64(11)) * 2.0**-53
         np.testing.assert_array_equal(uniforms(seed, frame, use, 7), wanted)
-        np.testing.assert_array_equal(uniforms_of(seed, np.array([frame, 3]), use, 7)[0], wanted)
         normals(1, 2, Use.TOKENS, 3)
-    assert uniforms_of(seed, np.zeros(0, np.int64), use, 7).shape == (0, 7)

@@ -5,9 +5,9 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.frames import BLENDSHAPES, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
-from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.torch_engine import torch_engine
 from sfms_robot.signals.control import control_track
 
 
@@ -30,7 +30,7 @@ def tiny_listener(**changes) -> SfmsListener:
     settings = tiny_settings(**changes)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
+        return SfmsListener(settings, torch_engine(SfmsModel(settings)))
 
 
 def told_listener(**changes) -> SfmsListener:

@@ -147,7 +147,7 @@ def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
     try:
         answers = server.step(batch)
     except Exception:
-        log.exception("a batch of %d streams failed: they join again", len(batch.streams))
+        log.exception("a batch of %d streams failed: they join again", len(batch))
         server.failed(batch)
         return []
     return server.finish(batch, answers, began_s, time.monotonic())

@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 PAPER: Final = "sfms-paper"  # ships as a training only
 TRAINED, SEEDED = "trained", "seeded, not trained"
-EAGER, BF16 = "eager", "torch bf16"
+EAGER: Final = "eager"
 TURN_HOPS: Final = 4
 _TURNS: Final = 20
 _LIMIT_S: Final = 20.0  # for all engines of a listener: a busy machine gives fewer turns
@@ -96,19 +97,13 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
     folder, weights = with_weights(name, scratch)
     settings = config.load_listener(folder / "config.yaml")
     ways, speaker = engines_of(folder, scratch), talk()
-    loaded = {
-        way: load_listener(where, graphs=way != EAGER, engine=engine, threads=1)
-        for way, (where, engine) in ways.items()
-    }
-    if isinstance(settings, config.Arig):
-        loaded[BF16] = _in_bf16(ways[EAGER][0], settings)
+    loaded = {way: load_listener(where, engine=engine, threads=1) for way, (where, engine) in ways.items()}
     streams = {way: Stream(one, aged(one, one.start(0), speaker)) for way, one in loaded.items()}
     take_turns(streams, speaker)
     rows = {f"{name} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
     for way in streams.keys() - {EAGER}:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
-        if way in ways:
-            rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
+        rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
     auto = [*ways][-1]
     rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
@@ -125,19 +120,6 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
             "samplers": samplers(_how(loaded[EAGER]), speaker) if weights == TRAINED else None,
         }
     return rows
-
-
-def _in_bf16(where: Path, settings: config.Arig) -> Listener:
-    """Return an ARIG on torch with its large layers in bf16. No configuration asks for it: its row shows why."""
-    from sfms_robot.listeners.arig import networks, torch_engine
-
-    found = load_listener(where, graphs=False, engine="torch", threads=1)
-    how = _how(found)
-    how.engine = torch_engine(
-        settings.model_copy(update={"precision": "fp32"}), networks.with_layers(how.model, networks.Bf16Linear)
-    )
-    how.build_graphs()
-    return found
 
 
 def _how(listener: Listener) -> Any:
@@ -173,9 +155,9 @@ def _sfms_paper() -> dict[str, Row]:
     """Measure the paper's size of SFMS with seeded weights, on torch."""
     import torch
 
-    from sfms_robot.listeners.sfms import torch_engine
     from sfms_robot.listeners.sfms.model import SfmsModel
     from sfms_robot.listeners.sfms.stream import SfmsListener
+    from sfms_robot.listeners.torch_engine import torch_engine
 
     training = config.load_training(data_dir("configs") / "training" / f"{PAPER}.yaml")
     if not isinstance(training, config.Training):
@@ -183,16 +165,11 @@ def _sfms_paper() -> dict[str, Row]:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
-    streams: dict[str, Stream] = {}
-    for way in (EAGER, "torch"):
-        found = SfmsListener(training.listener, torch_engine(training.listener, model))
-        streams[way] = Stream(found if way == EAGER else found.build_graphs(), found.start(0))
-    take_turns(streams, talk())
+    found = SfmsListener(training.listener, torch_engine(model))
+    stream = Stream(found, found.start(0))
+    take_turns({EAGER: stream}, talk())
     params = sum(each.numel() for each in model.parameters())
-    return {
-        f"{PAPER} {way}": stream.figures(streams[EAGER]) | {"params": params, "weights": SEEDED}
-        for way, stream in streams.items()
-    }
+    return {f"{PAPER} {EAGER}": stream.figures(stream) | {"params": params, "weights": SEEDED}}
 
 
 def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minutes: int = _MINUTES) -> Any:
@@ -322,7 +299,7 @@ def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]
     """
     settings = checkpoint.load_config(folder)
     exact = _of_precision(folder, settings, "fp32", scratch)
-    found: dict[str, tuple[Path, EngineName]] = {EAGER: (exact, "torch"), "torch": (folder, "torch")}
+    found: dict[str, tuple[Path, EngineName]] = {EAGER: (exact, "torch")}
     if has_graphs(folder):
         found["onnx"] = (exact, "onnx")
         if read_graphs(folder, settings, integers=True).in_integers:
@@ -359,17 +336,21 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
     """
     import torch
 
+    from sfms_robot.listeners.arig.networks import networks
     from sfms_robot.listeners.arig.sampler import Denoiser
+    from sfms_robot.listeners.torch_engine import Recorder
 
     head = listener.model.head
     if not isinstance(head, Denoiser):
         return {}
+    listener = copy(listener)
+    listener.engine = recorder = Recorder(listener.model, networks(listener.model))
     memory, conditions = listener.start(0), []
     for index, frame in enumerate(speaker):
-        if index % _EVERY == _EVERY - 1:
-            conditions.append(listener.condition(frame, memory)[0])
         _, memory = listener.step(frame, memory)
-    repeated = torch.from_numpy(np.concatenate(conditions)).repeat_interleave(_DRAWS, dim=0)
+        if index % _EVERY == _EVERY - 1:
+            conditions.append(recorder.examples["draw"]["z"])
+    repeated = torch.cat(conditions).repeat_interleave(_DRAWS, dim=0)
 
     @torch.inference_mode()
     def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -163,7 +163,7 @@ def budget() -> BenchResult:
 
 def _counted(name: str) -> dict[str, Any]:
     folder = data_dir("configs") / "listeners" / name
-    listener = load_listener(folder, graphs=False, engine="torch")
+    listener = load_listener(folder, engine="torch")
     memory: Any = listener.start(0)
     rng = np.random.default_rng(0)
     costs, took_s = [], []

@@ -39,8 +39,16 @@ from sfms_robot.lab.learning.events.event_trainer import (
 )
 from sfms_robot.lab.learning.events.labels import meeting_evidence
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
-from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, STEP_FRAMES, STEP_S, DecideMemory, EventModel
-from sfms_robot.listeners.stream_rng import Use, uniforms_of
+from sfms_robot.listeners.events.model import (
+    AT_PERSON,
+    LEAD_FRAMES,
+    STEP_FRAMES,
+    STEP_S,
+    EventMemory,
+    EventModel,
+    last_shift,
+)
+from sfms_robot.listeners.stream_rng import Use, uniforms
 
 _SILENT: Final = {
     **PHASE,
@@ -82,14 +90,14 @@ def decisions(
     most = most_in(model, heard[steps], calmness or Calmness())
     found = []
     for seed in seeds:
-        draws = uniforms_of(seed, steps, Use.EVENT, len(EVENT_KINDS))[:, model.draws]
+        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
         frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
-        found.append(_decided(model, heard, frames, model.start(seed, calmness).decided))
+        found.append(_decided(model, heard, frames, model.start(seed, calmness)))
     return found
 
 
 def _decided(
-    model: EventModel, heard: Doubles, frames: Sequence[int], memory: DecideMemory
+    model: EventModel, heard: Doubles, frames: Sequence[int], memory: EventMemory
 ) -> tuple[ListenerEvent, ...]:
     """Decide at the end of each of `frames`, the last of which is beyond the end."""
     found = list[ListenerEvent]()
@@ -98,7 +106,7 @@ def _decided(
         ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
         found += decision.events
         at += frame == frames[at]
-        look = next((event for event in reversed(memory.done) if event.kind == "gaze_shift"), None)
+        look = last_shift(memory.done)
         over = math.inf  # the step at which the newest look is over, if it goes aside
         if look is not None and look.target_rad != AT_PERSON:
             step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)

@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
+from sfms_robot import config
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles
@@ -38,7 +39,8 @@ from sfms_robot.lab.learning.corpus import in_space
 from sfms_robot.lab.learning.sfms.features import frames_of, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_scores
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import reconstruction_error
-from sfms_robot.listeners.sfms import load as load_sfms
+from sfms_robot.listeners.checkpoint import CONFIG
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
@@ -50,8 +52,9 @@ _TRAIN_DYADS: Final = 200  # from which the heuristics take their means
 
 def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
     """Return the held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
-    listener = load_sfms(find("listeners", name, "config.yaml"), "torch")
-    model, settings = listener.model, listener.settings
+    folder = find("listeners", name, "config.yaml")
+    settings, listener = config.load(config.Sfms, folder / CONFIG), load_folder(folder, "torch")
+    model = listener.model
     dyads = open_for(listener.space.name, data, "validation", order)
     corpus = gather(dyads, model.tokenizer.window, listener.space, None, settings)
     placements = [

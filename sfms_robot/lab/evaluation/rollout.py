@@ -26,16 +26,17 @@ from torch import Tensor
 from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.learning.sfms.features import frames_of
 from sfms_robot.listeners.arig.stream import ArigMemory
+from sfms_robot.listeners.capacity import step_each
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
 from sfms_robot.listeners.registry import at_hop, hops_of, load_listener, one_thread
-from sfms_robot.listeners.sfms.draw import PlanInputs, later, passed, revoked
+from sfms_robot.listeners.sfms.draw import Context, later, passed, revoked
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
 from sfms_robot.processes import process_pool
@@ -169,8 +170,11 @@ def rollout(
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
     decided: list[list[ListenerEvent]] = [[] for _ in seeds]
     for index, frame in enumerate(speaker):
-        plans, memories = _step(listener, frame, memories, control_at(listener, events, index))
-        for row, plan in enumerate(plans):
+        control = control_at(listener, events, index)
+        controls = () if control is None else ([control] * len(seeds),)
+        stepped = step_each(listener, [frame] * len(seeds), memories, *controls)
+        memories = [memory for _, memory in stepped]
+        for row, (plan, _) in enumerate(stepped):
             if plan is not None:
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
                 decided[row] += plan.events
@@ -179,17 +183,6 @@ def rollout(
             if isinstance(how, ArigMemory):
                 states[row, index + 1] = paper_state(how.state)
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
-
-
-def _step(
-    listener: Any, frame: SpeakerFrame, memories: Sequence[Any], control: Floats | None
-) -> tuple[Sequence[Plan | None], Sequence[Any]]:
-    given = () if control is None else (control,)
-    if hasattr(listener, "step_many"):
-        plans, after = listener.step_many(frame, memories, *([one] * len(memories) for one in given))
-        return plans, after
-    stepped = [listener.step(frame, memory, *given) for memory in memories]
-    return [plan for plan, _ in stepped], [memory for _, memory in stepped]
 
 
 def rollouts(
@@ -251,7 +244,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             control, before = listener.told([asked]), later(control, frames_passed)
             tokens, settled = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
-        seen = PlanInputs(
+        seen = Context(
             face=face[None, window],
             face_known=known[None, window],
             voice=voice[None, window],
@@ -259,9 +252,8 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             phase=phase[None, window],
             tokens=tokens,
             control=np.repeat(control, streams, axis=0),
-            settled=np.broadcast_to(settled, streams),
         )
-        tokens, path = listener.plan(seen, path, seeds, [now] * streams)
+        tokens, path = listener.plan(seen, np.broadcast_to(settled, streams), path, seeds, [now] * streams)
         shown[:, now + 1 : now + 1 + ahead] = listener.shown(path)
         drawn[:, now + 1 : now + 1 + ahead] = tokens[:, -ahead:]
     sway = np.stack([listener.sway.start(seed) for seed in seeds])

@@ -26,10 +26,10 @@ from sfms_robot.lab.learning.corpus import without_gaze
 from sfms_robot.lab.learning.sfms.features import gather, tokenise
 from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.torch_engine import torch_engine
 
 DYADS = 8  # that are rolled out
 COURSE_DYADS = 128  # for their nods and smiles, without roll-outs
@@ -80,7 +80,7 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
 
     The model is left in evaluation mode.
     """
-    listener = SfmsListener(settings, torch_engine(settings, model.eval()))
+    listener = SfmsListener(settings, torch_engine(model.eval()))
     wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
     rolled = [
         offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))

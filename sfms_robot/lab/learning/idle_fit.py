@@ -21,7 +21,6 @@ from rich.progress import Progress
 from scipy.optimize import nnls
 
 from sfms_robot.config import find
-from sfms_robot.config.listener import listener_package
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.collection import usable
@@ -30,7 +29,7 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.idle import FILE, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
-from sfms_robot.listeners.registry import one_thread
+from sfms_robot.listeners.registry import load_folder, one_thread
 from sfms_robot.signals.events import runs
 
 WINDOW: Final = 2 * FRAME_HZ
@@ -199,7 +198,7 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
         raise ConfigError(
             f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
         )
-    how = listener_package(settings.kind).load(folder)
+    how = load_folder(folder)
     with Progress(console=Console(stderr=True)) as progress:
         playing = progress.add_task(f"{name} listens", total=len(chosen))
         shown = rollouts(how, chosen, seed, lambda: progress.advance(playing))

@@ -46,6 +46,7 @@ def features(row: Tensor) -> Tensor:
     """Return features (..., FEATURES) of control rows (..., K); the first of them is 1."""
     found = [torch.ones_like(row[..., :1])]
     for kind in KINDS:
+        # 0 while no such event is under way: then the kind has no features.
         size = (row[..., _AT[f"{kind}.active"]] * row[..., _AT[f"{kind}.size"]])[..., None]
         over, since = (row[..., _AT[f"{kind}.{name}"], None] for name in ("over", "since"))
         found += [size * _hats(over, _OVER), size * _hats(since, _SINCE)]
@@ -75,9 +76,11 @@ def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
     to come: the drift of a Brownian bridge, which brings any deviation to 0 by the end, however long the event is.
     """
     active, over = ([_AT[f"{kind}.{name}"] for kind in KINDS] for name in ("active", "over"))
+    # left: share of the event still to come, at this row; 0 in the first row behind it.
     left = 1 - now[..., over] * now[..., active]
     left = torch.where((before[..., active] > 0) & (now[..., active] == 0), 0.0, left)
     was = (1 - before[..., over] * before[..., active]).clamp(min=LEAST)
+    # Events that overlap each take back what they move: their shares multiply.
     share: Tensor = torch.where(moves, (left / was).clamp(0, 1)[..., None], 1.0).prod(dim=-2)
     return share
 
@@ -85,6 +88,7 @@ def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
 def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:
     """Return (..., knots) of x (..., 1) within the knots: 1 at its own knot, 0 at the next ones, linear in between."""
     at = torch.tensor(knots, dtype=x.dtype, device=x.device)
+    # A hat is the lower of two lines, rising to its knot and falling from it.
     gap = at.diff()
     below, above = (x - at[:-1]) / gap, (at[1:] - x) / gap
     rise = torch.cat([torch.ones_like(x), below], dim=-1)
@@ -94,6 +98,7 @@ def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:
 
 def fit(rows: Tensor, motion: Tensor) -> Tensor:
     """Return the weights (FEATURES, C) of ridge regression for motion (N, C) at control rows (N, K)."""
+    # Normal equations (X^T X + r I) W = X^T Y, summed in pieces and in double precision.
     gram = torch.zeros(FEATURES, FEATURES, dtype=torch.float64)
     moved = torch.zeros(FEATURES, motion.shape[1], dtype=torch.float64)
     for row, made in zip(torch.split(rows, 65536), torch.split(motion, 65536), strict=True):

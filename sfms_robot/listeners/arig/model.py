@@ -12,6 +12,16 @@ the same by a law of the tests. Buffers that training sets from its data: `motio
 `sound_std`, and of the diffusion head `low`, `high`, the range of what it draws. Everything that goes in and out here
 is in plain units: motion of the listener's motion space, sound features of `audio_frontend.track`.
 
+Sections of the paper and the files of this folder that follow them:
+
+    3.1, (1), (2)   what a frame is made from            model.py; streaming: stream.py
+    3.2             interactive behaviour understanding  modules.py, ShortRange and LongRange
+    3.3             conversational states                modules.py, StateUnderstanding
+    3.4             progressive motion prediction        modules.py, Progressive
+    3.4, (3), (4)   diffusion head                       sampler.py
+    ours            curves of events                     event_curves.py
+    ours            networks of a stream, 8-bit layers   networks.py
+
 B batch, N frames, C channels of the motion space, A sound features, D width, K numbers of a control row.
 """
 
@@ -30,7 +40,7 @@ from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
 from sfms_robot.listeners.arig.stream import CONTROL_ROWS, FIRST
 from sfms_robot.listeners.audio_frontend import WIDTHS
 from sfms_robot.listeners.idle import BANDS, head_channels
-from sfms_robot.listeners.layers import Linear, weighted_mean, windows
+from sfms_robot.listeners.layers import weighted_mean, windows
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
@@ -94,22 +104,6 @@ class ArigDyad:
     voiced: Tensor
     control: Tensor | None = None
 
-    def check(self, sound: int, channels: int, events: bool = False) -> None:
-        """Raise ValueError, naming the array, when one has another shape or there are fewer than two frames."""
-        b, n = self.agent_motion.shape[:2]
-        wanted = {"user_motion": (b, n, channels), "agent_motion": (b, n, channels), "voiced": (b, n, 2)}
-        wanted |= {"user_sound": (b, n, sound), "agent_sound": (b, n, sound)}
-        flags: dict[str, tuple[int, ...]] = dict.fromkeys(("user_heard", "agent_heard", "user_seen"), (b, n))
-        for name, shape in (wanted | flags).items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"{name} is {found}, not {shape}")
-        rows = None if self.control is None else tuple(self.control.shape)
-        if events and rows != (b, n, len(COLUMNS)):
-            raise ValueError(f"control is {rows}, not {(b, n, len(COLUMNS))}")
-        if n < 2:
-            raise ValueError(f"a dyad needs two frames or more, got {n}")
-
 
 @dataclass(frozen=True)
 class SamplerCondition:
@@ -139,7 +133,7 @@ class ArigModel(nn.Module):
         self._register_scales()
         self.sounds_read = self.sound_width - (0 if settings.phase else phase.FEATURES)  # the place in a phrase is last
         self.sound_in = _mlp(self.sounds_read, d, d)
-        self.motion_in = Linear(self.channels, d)
+        self.motion_in = nn.Linear(self.channels, d)
         self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_face = nn.Parameter(torch.randn(d) * 0.02) if settings.visual else None
@@ -256,14 +250,14 @@ class ArigModel(nn.Module):
 
     # --- Sampler (3.4) ------------------------------------------------------------------------------------------------
 
-    def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
-        """Return a draw (N, C), the mean included; z of `beside`, noise and levels of `Denoiser.sample`.
+    def sample(self, z: Tensor, noise: Tensor) -> Tensor:
+        """Return a draw (N, C), the mean included; z of `beside`, noise of `Denoiser.sample`.
 
         What is drawn around the mean has the sampler's range, and so has the sum: no step is larger than in the data.
         """
         if not isinstance(self.head, Denoiser):
             return self.head.sample(z, noise)
-        drawn = self.head.sample(z, noise, levels)
+        drawn = self.head.sample(z, noise)
         return drawn if self.mean is None else (drawn + self.mean(z)).clamp(self.head.low, self.head.high)
 
     def sample_loss(
@@ -320,9 +314,8 @@ class ArigModel(nn.Module):
         """Return the inputs of the sampler for frames 1..N-1 at once.
 
         `states` (B, N): the state of every frame; each frame is given the one before. Without, each frame continues
-        from the model's own answer, as a stream does. Raises ValueError for shapes that do not fit.
+        from the model's own answer, as a stream does.
         """
-        dyad.check(self.sound_width, self.channels, self.settings.events)
         user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
         agent = self.embed_sound(dyad.agent_sound, dyad.agent_heard, self.no_agent_sound)
         standard = self.standardise(dyad.agent_motion)[:, :-1]
@@ -379,4 +372,4 @@ class ArigModel(nn.Module):
 
 
 def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(Linear(inputs, hidden), nn.GELU(), Linear(hidden, outputs))
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, outputs))

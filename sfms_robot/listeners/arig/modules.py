@@ -23,10 +23,7 @@ from sfms_robot.listeners.arig.stream import QUANTILES, rotary
 from sfms_robot.listeners.layers import (
     CrossAttention,
     FeedForward,
-    LayerNorm,
-    Linear,
     Modulation,
-    PlainModule,
     attention,
     join_heads,
     modulated,
@@ -36,13 +33,13 @@ from sfms_robot.listeners.layers import (
 # --- Short range (3.2, A.1) -------------------------------------------------------------------------------------------
 
 
-class Merge(PlainModule):
+class Merge(nn.Module):
     """Sound and motion of one frame of one track -> its behaviour I_t; sound alone without the visual modality."""
 
     def __init__(self, width: int, visual: bool) -> None:
         super().__init__()
         self.visual = visual
-        self.mlp = nn.Sequential(Linear((1 + visual) * width, width), nn.GELU(), Linear(width, width))
+        self.mlp = nn.Sequential(nn.Linear((1 + visual) * width, width), nn.GELU(), nn.Linear(width, width))
 
     def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
         """Return (..., D) of (..., D) and (..., D)."""
@@ -56,8 +53,8 @@ class TrackSide(nn.Module):
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
         self.modulation = Modulation(width, width, "scgscg")
-        self.qkv = Linear(width, 3 * width)
-        self.out = Linear(width, width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
         self.ffn = FeedForward(width, hidden)
 
     def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -67,11 +64,12 @@ class TrackSide(nn.Module):
 
     def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
         """Return (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
+        # adaLN (A.1): gates of the attention and of the feed-forward, both modulated by the newest sound of the track.
         x = torch.addcmul(x, parts[2], self.out(seen))
         return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
 
 
-class Bidirectional(PlainModule):
+class Bidirectional(nn.Module):
     """Each track reads itself, and both see each other through one attention, as in MMDiT (figure 7)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -90,7 +88,7 @@ class Bidirectional(PlainModule):
         return self.agent.answer(agent, of_agent, agent_parts), self.user.answer(user, of_user, user_parts)
 
 
-class Integrated(PlainModule):
+class Integrated(nn.Module):
     """Both tracks as one sequence; attention and feed-forward side by side (figure 8, Dehghani et al. 2023)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
@@ -98,8 +96,8 @@ class Integrated(PlainModule):
         self.heads = heads
         self.asked, self.hidden = 3 * width, hidden
         self.modulation = Modulation(width, width, "scg")
-        self.wide = Linear(width, 3 * width + hidden)
-        self.narrow = Linear(width + hidden, width)
+        self.wide = nn.Linear(width, 3 * width + hidden)
+        self.narrow = nn.Linear(width + hidden, width)
 
     def forward(self, x: Tensor, condition: Tensor, wanted: int) -> Tensor:
         """Return the first `wanted` tokens (N, wanted, D) of x (N, 2c, D); condition (N, D) with SiLU applied."""
@@ -117,7 +115,7 @@ def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
     return attention(q[:, :wanted], k, v, heads)
 
 
-class ShortRange(PlainModule):
+class ShortRange(nn.Module):
     """The last c behaviours of both tracks -> one summary, of the agent's part (A.1)."""
 
     def __init__(self, settings: config.Arig) -> None:
@@ -126,12 +124,12 @@ class ShortRange(PlainModule):
         linear = settings.interaction == "linear"  # ablation of table 4: plain layers in place of the blocks
         depths = (0, 0) if linear else (settings.bidirectional_layers, settings.integrated_layers)
         self.places = nn.Parameter(torch.randn(2, chunk, width) * 0.02)
-        self.plain = nn.ModuleList(Linear(width, width) for _ in range(2)) if linear else None
-        self.plain_both = Linear(4 * width, width) if linear else None
+        self.plain = nn.ModuleList(nn.Linear(width, width) for _ in range(2)) if linear else None
+        self.plain_both = nn.Linear(4 * width, width) if linear else None
         self.bidirectional = nn.ModuleList(Bidirectional(width, hidden, heads) for _ in range(depths[0]))
         self.integrated = nn.ModuleList(Integrated(width, hidden, heads) for _ in range(depths[1]))
-        self.norm = LayerNorm(width)
-        self.compress = Linear(chunk * width, width)
+        self.norm = nn.LayerNorm(width)
+        self.compress = nn.Linear(chunk * width, width)
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> Tensor:
         """Return the summary (N, D) of behaviours (N, c, D), oldest first, and the newest sounds (N, D)."""
@@ -156,16 +154,16 @@ class ShortRange(PlainModule):
 # --- Long range (3.2) -------------------------------------------------------------------------------------------------
 
 
-class ContextLayer(PlainModule):
+class ContextLayer(nn.Module):
     """One layer of the causal decoder: a summary looks at itself and at whole chunks before it."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm = LayerNorm(width)
-        self.qkv = Linear(width, 3 * width)
-        self.out = Linear(width, width)
-        self.ffn_norm = LayerNorm(width)
+        self.norm = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.ffn_norm = nn.LayerNorm(width)
         self.ffn = FeedForward(width, hidden)
 
     def project(self, x: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -211,7 +209,7 @@ class LongRange(nn.Module):
         width, hidden, heads = settings.width, settings.feedforward, settings.heads
         self.chunk, self.capacity, self.head_width = settings.chunk_frames, settings.context_chunks, width // heads
         self.layers = nn.ModuleList(ContextLayer(width, hidden, heads) for _ in range(settings.context_layers))
-        self.norm = LayerNorm(width)
+        self.norm = nn.LayerNorm(width)
 
     def _layers(self) -> list[ContextLayer]:
         return [layer for layer in self.layers if isinstance(layer, ContextLayer)]
@@ -249,6 +247,7 @@ class LongRange(nn.Module):
         Returns:
             cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, in case it is the last of its chunk.
         """
+        # 3.2: the chunk in progress is one token; keys and values of whole chunks never change.
         x, made = summary[:, None], []
         turned, view = rotary.transpose(0, 1)[:, :, None, None], seen[:, None, None]
         for layer, keys, values in zip(self._layers(), past[::2], past[1::2], strict=True):
@@ -274,7 +273,7 @@ class LongRange(nn.Module):
 # (`stream.draw_sojourn`), and feedback that is seen (a nod, a smile) is a state of its own.
 
 
-class StateUnderstanding(PlainModule):
+class StateUnderstanding(nn.Module):
     """Cross attention of the previous state over voice activity and cis-token -> the state feature and the state.
 
     With events its states are `EVENT_STATES`, and it also has statistics of the data: `durations` (7, 33), quantiles of
@@ -291,11 +290,12 @@ class StateUnderstanding(PlainModule):
         self.previous = nn.Embedding(states, width)
         self.voices = nn.Parameter(torch.randn(2, 2, width) * 0.02)  # track, silent or speaking
         self.look = CrossAttention(width, settings.feedforward, settings.heads, slots=3)
-        self.norm = LayerNorm(width)
-        self.classify = Linear(width, states)
+        self.norm = nn.LayerNorm(width)
+        self.classify = nn.Linear(width, states)
 
     def condition(self, cis: Tensor, voiced: Tensor) -> Tensor:
         """Return the state condition (N, 3, 2D) of cis (N, D) and voiced (N, 2): agent now, user one frame before."""
+        # 3.3: C^s_T, the voices of both and the cis-token.
         told = torch.where(voiced[..., None], self.voices[:, 1], self.voices[:, 0])  # (N, 2, D)
         return self.look.keys(torch.cat([told, cis[:, None]], dim=1))
 
@@ -324,7 +324,7 @@ class StateUnderstanding(PlainModule):
 # the final motion (`sampler`).
 
 
-class Progressive(PlainModule):
+class Progressive(nn.Module):
     """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
 
     Ours: events are one token more of the second.
@@ -336,7 +336,7 @@ class Progressive(PlainModule):
         self.coarse = CrossAttention(*sizes, settings.sound_frames)
         self.fine = CrossAttention(*sizes, 2 + settings.state_guidance + settings.events)
         self.temporal = CrossAttention(*sizes, settings.motion_frames)
-        self.norm = LayerNorm(settings.width)
+        self.norm = nn.LayerNorm(settings.width)
 
     def refine(
         self,

@@ -1,8 +1,8 @@
 """The computation of one frame of a stream, as functions of tensors: `FrameNetwork` up to the sampler, `DrawNetwork`.
 
 Offline the same parts run over all frames at once (`model.condition`); that both agree is a law of the tests. As
-functions of tensors alone they can be traced or exported. `RestNetwork` makes the memory before the first frame. Below
-them is the fast path: large layers in 8-bit integers.
+functions of tensors alone they can be exported. `RestNetwork` makes the memory before the first frame. Below them:
+which layers graphs may have in 8-bit integers.
 
 N streams, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of a chunk, S
 whole chunks that are kept, L layers that look at them.
@@ -10,22 +10,13 @@ whole chunks that are kept, L layers that look at them.
 
 from __future__ import annotations
 
-import copy
-import warnings
-from collections.abc import Callable
-from typing import Any
-
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from sfms_robot.errors import ModelError
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.arig.sampler import Denoiser
-from sfms_robot.listeners.layers import PlainModule
 
 
-class RestNetwork(PlainModule):
+class RestNetwork(nn.Module):
     """A still face and silence as the memory of a stream: called once, when a listener is loaded."""
 
     def __init__(self, model: ArigModel) -> None:
@@ -38,12 +29,14 @@ class RestNetwork(PlainModule):
         return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
 
 
-class FrameNetwork(PlainModule):
+class FrameNetwork(nn.Module):
     """Sounds and face of one frame, and the memory of the stream -> the inputs of the sampler for the next."""
 
     def __init__(self, model: ArigModel) -> None:
         super().__init__()
         self.model = model
+        layers = range(model.settings.context_layers)
+        self.further = [f"{part}_{layer}" for layer in layers for part in ("keys", "values")]  # names of `past`
 
     def forward(
         self,
@@ -104,23 +97,12 @@ class FrameNetwork(PlainModule):
         return z, logits, made, now, agent_behaviour, user_behaviour, sound_keys
 
 
-class DrawNetwork(PlainModule):
+class DrawNetwork(nn.Module):
     """Inputs of the sampler and its noise -> the agent's motion, and the memory of it."""
 
-    levels: Tensor | None
-    places: Tensor | None
-
-    def __init__(self, model: ArigModel, kept: bool = True) -> None:
-        """Make one of a model. `kept`: embed the constant noise levels once, else in every frame from the weights."""
+    def __init__(self, model: ArigModel) -> None:
         super().__init__()
         self.model = model
-        head, levels, places = model.head, None, None
-        if isinstance(head, Denoiser):
-            places = head.places[head.levels]
-            with torch.no_grad():
-                levels = head.time(places) if kept else None
-        self.register_buffer("levels", levels, persistent=False)
-        self.register_buffer("places", places, persistent=False)
 
     def forward(
         self,
@@ -143,10 +125,7 @@ class DrawNetwork(PlainModule):
             next motion_keys.
         """
         model = self.model
-        levels = self.levels
-        if levels is None and self.places is not None and isinstance(model.head, Denoiser):
-            levels = model.head.time(self.places)
-        made = model.drawn(model.sample(z, noise, levels), standard, rows, speaks)  # equation (4), then ours
+        made = model.drawn(model.sample(z, noise), standard, rows, speaks)  # equation (4), then ours
         motion = model.embed_own(made)  # M^a_T, the past of the next frame
         keys = push(motion_keys, model.progress.temporal.keys(motion))
         return model.restore(made), made, model.moved(made, standard, rows), motion, keys
@@ -162,88 +141,24 @@ def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
     return torch.where(first[:, None, None], new[:, None], push(queue, new))
 
 
-def networks(model: ArigModel, kept: bool = True) -> dict[str, PlainModule]:
-    """Return all networks by name. `kept`: see `DrawNetwork`."""
-    return {"rest": RestNetwork(model), "frame": FrameNetwork(model), "draw": DrawNetwork(model, kept)}
+def networks(model: ArigModel) -> dict[str, nn.Module]:
+    """Return all networks by name."""
+    return {"rest": RestNetwork(model), "frame": FrameNetwork(model), "draw": DrawNetwork(model)}
 
 
 # --- Large layers in 8 bits -------------------------------------------------------------------------------------------
 #
-# Dynamic quantization. One frame at a time, a layer costs what it takes to read its weights; in bytes that is a
-# quarter. Weights are rounded per output row, the input by its own range. Small layers stay in 32 bits: they gain
-# nothing. Nor does the sampler on torch; in graphs, where a product costs no more than reading its weights, its blocks
-# in integers stay in the fastest cache.
+# Dynamic quantization, of graphs. One frame at a time, a layer costs what it takes to read its weights; in bytes that
+# is a quarter. Weights are rounded per output row, the input by its own range. Small layers stay in 32 bits: they gain
+# nothing. The sampler's blocks in integers stay in the fastest cache.
 
 PARTS = ("sound_in", "merge_agent", "merge_user", "short", "long", "states", "progress")
-SAMPLER = ("head.modulation.", "head.up.", "head.down.")  # in graphs: all products of every step but the first and last
+SAMPLER = ("head.modulation.", "head.up.", "head.down.")  # all products of every step but the first and last
 SMALLEST = 64 * 1024  # weights of a layer below which integers gain nothing
 
 
-class Int8Linear(nn.Module):
-    """A stand-in for an nn.Linear."""
-
-    def __init__(self, linear: nn.Linear) -> None:
-        super().__init__()
-        weight = linear.weight.detach()
-        scale = weight.abs().amax(1).clamp(min=1e-12).double() / 127
-        with warnings.catch_warnings():  # torch will rename the function that makes such tensors
-            warnings.simplefilter("ignore", UserWarning)
-            zero = torch.zeros(len(scale), dtype=torch.long)
-            rounded = torch.quantize_per_channel(weight, scale, zero, 0, torch.qint8)
-        self.packed: Any = torch.ops.quantized.linear_prepack(rounded, linear.bias)
-        self.half_range = not torch.cpu._is_vnni_supported()  # older processors add pairs of products in 16 bits
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (..., out) of x (..., in)."""
-        out: Tensor = torch.ops.quantized.linear_dynamic(x, self.packed, self.half_range)
-        return out
-
-    __call__ = forward  # as PlainModule
-
-
-class Bf16Linear(nn.Module):
-    """A stand-in for an nn.Linear that reads half as much. For benches: integers are faster wherever they exist."""
-
-    def __init__(self, linear: nn.Linear) -> None:
-        super().__init__()
-        self.weight = linear.weight.detach().bfloat16()
-        self.bias = linear.bias.detach().bfloat16()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (..., out) of x (..., in)."""
-        return F.linear(x.bfloat16(), self.weight, self.bias).float()
-
-    __call__ = forward  # as PlainModule
-
-
-def supported() -> bool:
-    """Return whether this processor multiplies such integers fast."""
-    return torch.backends.quantized.engine in ("x86", "fbgemm", "onednn")
-
-
-def with_precision(model: ArigModel, precision: str) -> ArigModel:
-    """Return the model to run: itself (fp32), or a copy with large layers in integers (int8, or auto if supported).
-
-    Raises ModelError for int8 where the processor has none.
-    """
-    if precision == "fp32" or (precision == "auto" and not supported()):
-        return model
-    if not supported():
-        raise ModelError("precision: int8 needs an x86 processor (valid here: auto, fp32)")
-    return with_layers(model, Int8Linear)
-
-
-def with_layers(model: ArigModel, kind: Callable[[nn.Linear], nn.Module]) -> ArigModel:
-    """Return a copy of the model with large layers of another kind, except those of the sampler."""
-    out = copy.deepcopy(model)
-    for name, part in out.named_children():
-        if name in PARTS:
-            _replace(part, kind)
-    return out
-
-
 def large_layers(model: ArigModel) -> list[str]:
-    """Return the weights, by name, of layers that graphs have in integers: those of `with_precision`, the sampler's."""
+    """Return the weights, by name, of the layers that graphs have in integers."""
     return [
         f"{name}.weight"
         for name, part in model.named_modules()
@@ -251,12 +166,3 @@ def large_layers(model: ArigModel) -> list[str]:
         and (name.split(".")[0] in PARTS or name.startswith(SAMPLER))
         and part.weight.numel() >= SMALLEST
     ]
-
-
-def _replace(module: nn.Module, kind: Callable[[nn.Linear], nn.Module]) -> None:
-    for name, child in module.named_children():
-        if isinstance(child, nn.Linear):
-            if child.weight.numel() >= SMALLEST:
-                setattr(module, name, kind(child))
-        else:
-            _replace(child, kind)

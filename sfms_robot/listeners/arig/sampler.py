@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.layers import Linear, Modulation, modulated, sinusoidal, weighted_mean
+from sfms_robot.listeners.layers import Modulation, modulated, sinusoidal, weighted_mean
 from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
@@ -31,6 +31,7 @@ COSINE_END = 0.98  # share of the quarter circle that the schedule covers
 
 def cosine_alpha_bar(levels: int) -> Tensor:
     """Return alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
+    # Nichol and Dhariwal 2021: ab = cos^2 of an angle that grows evenly with the level.
     angle = torch.arange(1, levels + 1, dtype=torch.float64) / levels
     return torch.cos(angle * COSINE_END * math.pi / 2) ** 2
 
@@ -46,16 +47,17 @@ class Denoiser(nn.Module):
         self.low = nn.Buffer(torch.full((channels,), -most))  # range of standardised motion in the data
         self.high = nn.Buffer(torch.full((channels,), most))
         self.alpha_bar = nn.Buffer(cosine_alpha_bar(settings.train_steps).float(), persistent=False)
-        self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)
+        self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)  # of all noise levels
         # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
-        self.time = nn.Sequential(Linear(width, width), nn.SiLU(), Linear(width, width))
-        self.condition = Linear(condition, width)
+        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.condition = nn.Linear(condition, width)
         self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
-        self.enter = Linear(channels, width)
-        self.up = nn.ModuleList(Linear(width, width) for _ in range(settings.blocks))
-        self.down = nn.ModuleList(Linear(width, width) for _ in range(settings.blocks))
-        self.leave = Linear(width, channels)
+        self.enter = nn.Linear(channels, width)
+        self.up = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
+        self.down = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
+        self.leave = nn.Linear(width, channels)
         self.levels = torch.linspace(0, settings.train_steps - 1, settings.steps).round().long().tolist()
+        self.level_places = nn.Buffer(self.places[self.levels], persistent=False)
         self.table = steps_of(self.levels, settings)
         # sigma of each step times the temperature of each channel, (K, C); the first row is the initial noise. Ours:
         # early noise decides what happens, late noise is jitter, so the temperature may change from first to last step.
@@ -78,13 +80,12 @@ class Denoiser(nn.Module):
 
     def forward(self, noisy: Tensor, parts: Parts) -> Tensor:
         """Return the noise (N, C) in noisy (N, C); `parts`: `modulate` of its level and condition."""
-        return _denoise(noisy, parts, self._weights())
-
-    def _weights(self) -> list[tuple[Tensor, Tensor]]:
-        """Return weight and bias of each layer in order, looked up once for all steps: a call outweighs its product."""
-        blocks = [layer for pair in zip(self.up, self.down, strict=True) for layer in pair]
-        layers = [self.enter, *blocks, self.leave]
-        return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
+        x = self.enter(noisy)
+        for block, (up, down) in enumerate(zip(self.up, self.down, strict=True)):
+            shift, scale, gate = parts[3 * block : 3 * block + 3]
+            x = torch.addcmul(x, gate, down(F.silu(up(modulated(x, shift, scale)))))
+        out: Tensor = self.leave(modulated(x, parts[-2], parts[-1]))
+        return out
 
     def loss(
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
@@ -103,47 +104,35 @@ class Denoiser(nn.Module):
         alpha_bar = self.alpha_bar[t][:, None]
         # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
+        # eps_theta(M_t | t, z)
         found = self(noisy, self.modulate(z, self.level(t)))
         return weighted_mean((noise - found).square(), weights)
 
-    def sample(self, z: Tensor, noise: Tensor, levels: Tensor | None = None) -> Tensor:
+    def sample(self, z: Tensor, noise: Tensor) -> Tensor:
         """Return standardised motion (N, C) of conditions, equation (4).
 
         Args:
             z: (N, D) conditions.
             noise: (N, K, C) standard normal: the start, then the noise added after each step but the last.
-            levels: `level` of `self.levels` (K, W), for a caller that has them.
         """
-        n, k = noise.shape[:2]
+        k = noise.shape[1]
         if k != len(self.levels):
             raise ValueError(f"noise for {k} steps, the sampler takes {len(self.levels)}")
-        if levels is None:
-            levels = self.level(torch.tensor(self.levels, device=z.device))
-        # Ours, for speed: the modulation of all steps in one product, the noisiest last; of a single sample as vectors.
-        told = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
+        levels = self.time(self.level_places)  # (K, W)
+        # Ours, for speed: the modulation of all steps in one product, the noisiest last.
+        parts = self.modulation.linear(F.silu(self.condition(z)[:, None] + levels)).flatten(1)
         kinds = self.modulation.parts
-        parts = (told if n > 1 else told[0]).chunk(k * kinds, dim=-1)
+        parts = parts.chunk(k * kinds, dim=-1)
         x, *added = (noise * self.spreads).flatten(1).chunk(k, dim=-1)
-        low, high, weights = self.low, self.high, self._weights()
         for index, step in enumerate(self.table):
             level = kinds * (k - 1 - index)
-            found = _denoise(x, parts[level : level + kinds], weights)
+            found = self(x, parts[level : level + kinds])
             # Ours: the clean motion is clamped to the range of the data; (4) does not do that (`clamp: false`).
-            clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(low, high)
+            clean = found.mul_(step.denoise[1]).add_(x, alpha=step.denoise[0]).clamp_(self.low, self.high)
             x = clean.mul_(step.motion).add_(x, alpha=step.stay)  # the mean of M_s, `steps_of`
             if step.spread:  # sigma_t eps
                 x.add_(added[index])
         return x
-
-
-def _denoise(noisy: Tensor, parts: Parts, weights: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Return the noise (N, C) of noisy (N, C), with modulation (N, W) or (W,) each and `Denoiser._weights`."""
-    x = F.linear(noisy, *weights[0])
-    for block in range(len(weights) // 2 - 1):
-        shift, scale, gate = parts[3 * block : 3 * block + 3]
-        y = F.linear(F.silu(F.linear(modulated(x, shift, scale), *weights[2 * block + 1])), *weights[2 * block + 2])
-        x = torch.addcmul(x, gate, y)
-    return F.linear(modulated(x, parts[-2], parts[-1]), *weights[-1])
 
 
 @dataclass(frozen=True)
@@ -199,14 +188,15 @@ class CodeHead(nn.Module):
     def __init__(self, channels: int, width: int, condition: int, levels: tuple[int, ...]) -> None:
         super().__init__()
         self.levels = nn.Buffer(as_levels([levels]), persistent=False)
-        self.encode = nn.Sequential(Linear(channels, width), nn.GELU(), Linear(width, len(levels)))
-        self.decode = nn.Sequential(Linear(len(levels), width), nn.GELU(), Linear(width, channels))
-        self.classify = Linear(condition, math.prod(levels))
+        self.encode = nn.Sequential(nn.Linear(channels, width), nn.GELU(), nn.Linear(width, len(levels)))
+        self.decode = nn.Sequential(nn.Linear(len(levels), width), nn.GELU(), nn.Linear(width, channels))
+        self.classify = nn.Linear(condition, math.prod(levels))
 
     def loss(
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
     ) -> Tensor:
         """Return cross-entropy of the code plus squared error of the code, (N,); arguments as `Denoiser.loss`."""
+        # B.1: the softmax learns which code; encoder and decoder learn from what the code makes of the motion.
         code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
         index = codes_to_indices(code.detach(), self.levels)[:, 0]
@@ -215,6 +205,7 @@ class CodeHead(nn.Module):
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
         """Return the motion (N, C) of a code drawn by the softmax; z (N, D), noise (N, 1, 1) standard normal."""
+        # Inverse transform: the code at which the cumulated softmax passes a uniform number.
         share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
         mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
         index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)

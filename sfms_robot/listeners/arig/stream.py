@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
-from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
@@ -86,6 +86,7 @@ def draw_sojourn(
         before: that of the frame before.
         uniforms: (2,) in 0..1: which state, and for how long.
     """
+    # The voices of both leave some of the seven states (figure 3).
     may = possible[int(voiced[0]), int(voiced[1])] > 0  # (7,), a new array
     if before.left > 0 and may[before.state]:
         return Sojourn(before.state, before.left - 1)
@@ -107,16 +108,11 @@ def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
     They turn keys and queries of the long range; the halves of `size` are the two coordinates of each plane. Computed
     in double precision: after days of running the angles of two chunks still differ.
     """
-    turns, signs = _planes(size)
-    angles = chunks[:, None] * turns
-    return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
-
-
-@lru_cache(maxsize=8)
-def _planes(size: int) -> tuple[Doubles, Doubles]:
-    """Return radians per chunk (size,), and signs of the sines, read-only."""
     half = size // 2
-    return np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2), np.where(np.arange(size) < half, -1.0, 1.0)
+    turns = np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2)  # radians per chunk
+    angles = chunks[:, None] * turns  # place of a chunk: attention depends on how far apart two are, not on when
+    signs = np.where(np.arange(size) < half, -1.0, 1.0)
+    return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
 
 
 # --- Stream -----------------------------------------------------------------------------------------------------------
@@ -171,13 +167,6 @@ REMEMBERED: Final = (
 )
 
 
-FRAME_INPUTS: Final = (
-    *("sounds", "heard", "voiced", "face", "seen", "first", "state", "rotary", "view"),
-    *REMEMBERED,
-    "rows",
-)
-
-
 class BothPeople(NamedTuple):
     """One frame of both people, of N streams.
 
@@ -199,22 +188,20 @@ class BothPeople(NamedTuple):
 class ArigListener(RunsOnEngine):
     """ARIG as a stream; its engine runs `networks`."""
 
-    hop = horizon = 1
+    def __init__(self, settings: config.Arig, engine: Engine, folder: Path | None = None) -> None:
+        """Take the matrix that the settings may name from `folder`.
 
-    def __init__(self, settings: config.Arig, engine: Engine, space: MotionSpace | None = None) -> None:
-        """Raise ModelError for a model of features that are not computed here (sound: wav2vec2)."""
+        Raises ConfigError, and ModelError for a model of features that are not computed here (sound: wav2vec2).
+        """
         if settings.sound != "mel":
             raise ModelError(f"sound = {settings.sound!r}: such a model can be trained and evaluated, not run (mel)")
         self.settings = settings
         self.engine = engine
-        self.space = space or MotionSpace.of(settings)
+        self.space = MotionSpace.of(settings, folder)
         self.sway = HeadSway(settings, engine.tensors)
+        if settings.events:
+            self.control_frames = (1, CONTROL_ROWS - 1)
         self._noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
-
-    @property
-    def control_frames(self) -> tuple[int, int]:
-        """Return how many control rows a step takes: up to the newest frame, and after it."""
-        return (1, CONTROL_ROWS - 1) if self.settings.events else (0, 0)
 
     def start(self, seed: int) -> ArigMemory:
         """Return the memory of a stream without sound so far and with a neutral face (A.2)."""
@@ -244,35 +231,14 @@ class ArigListener(RunsOnEngine):
             sway=self.sway.start(seed),
         )
 
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        memories, rows = [self.start(seed) for seed in range(streams)], self._rows(None, streams)
-        heard = self._hear([SpeakerFrame(0.0, np.zeros(0, np.float32))] * streams, memories)
-        inputs = self._frame_inputs(heard, memories, rows)
-        past = [f"{part}_{layer}" for layer in range(self.settings.context_layers) for part in ("keys", "values")]
-        draw = {
-            "z": self.engine.run("frame", *inputs)[0],
-            "noise": np.zeros((streams, *self._noise_shape), np.float32),
-            **{name: _stacked(memories, name) for name in ("standard", "motion_keys")},
-        }
-        if self.settings.events:
-            draw |= {"rows": rows, "speaks": heard.voiced[:, 0]}
-        frame = dict(zip((*FRAME_INPUTS, *past), inputs, strict=True))
-        return {"rest": {"still": memories[0].standard[None]}, "frame": frame, "draw": draw}
-
-    def condition(
-        self, speaker: SpeakerFrame, memory: ArigMemory, control: Floats | None = None
-    ) -> tuple[Floats, ArigMemory]:
-        """Return the inputs of the sampler for the next frame, (1, its width), and the memory without what it draws."""
-        rows = self._rows(None if control is None else [control], 1)
-        z, _, (now,) = self._conditions(self._hear([speaker], [memory]), [memory], rows)
-        return z, now
-
-    def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory], controls: Sequence[Floats | None] | None
+    def step_each(
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[ArigMemory],
+        controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, ArigMemory]]:
         """Move every stream one frame on; each plans its next frame."""
-        rows = self._rows(controls, len(memories))
+        rows = self._rows(controls or [None] * len(memories))
         heard = self._hear(speakers, memories)
         # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         z, logits, now = self._conditions(heard, memories, rows)
@@ -285,7 +251,7 @@ class ArigListener(RunsOnEngine):
         sojourns, states = self._states(logits, now, rows, heard)
         out: list[tuple[Plan | None, ArigMemory]] = []
         for index, memory in enumerate(now):
-            time_s = speakers[min(index, len(speakers) - 1)].time_s
+            time_s = speakers[index].time_s
             frames, jaw_rad = self.space.decode(shown[index])
             plan = Plan(time_s, np.array([time_s + FRAME_S]), frames, jaw_rad)
             own = dict(
@@ -324,27 +290,28 @@ class ArigListener(RunsOnEngine):
             draw_sojourn(durations, possible, scores, voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, voiced, last, own in zip(logits, heard.voiced, before, now, strict=True)
         ]
+        # A nod or a smile under way makes listening a state of its own.
         drawn = np.array([sojourn.state for sojourn in sojourns])
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
-    def _rows(self, controls: Sequence[Floats | None] | None, streams: int) -> Floats:
-        """Return control as (streams, 2K); (streams, 0) without events."""
-        if not self.settings.events:
-            if controls is not None:
-                raise ValueError("control is for a listener with events: true")
-            return np.zeros((streams, 0), np.float32)
+    def _rows(self, controls: Sequence[Floats | None]) -> Floats:
+        """Return the control of N streams as (N, 2K), 0 where it is None; (N, 0) without events."""
         wanted = (CONTROL_ROWS, len(COLUMNS))
-        if controls is None:
-            return np.zeros((streams, CONTROL_ROWS * len(COLUMNS)), np.float32)
-        rows = np.stack([np.asarray(control, np.float32) for control in controls])
-        if rows.shape != (streams, *wanted):
-            raise ValueError(f"control is {rows.shape[1:]} of {len(rows)}, not {wanted} of {streams}")
-        return rows.reshape(streams, -1)
+        if not self.settings.events:
+            if any(control is not None for control in controls):
+                raise ValueError("control is for a listener with events: true")
+            wanted = (0, 0)
+        rows = [np.zeros(wanted, np.float32) if control is None else np.asarray(control) for control in controls]
+        for row in rows:
+            if row.shape != wanted:
+                raise ValueError(f"control is {row.shape}, not {wanted}")
+        return np.stack(rows).astype(np.float32).reshape(len(rows), -1)
 
     def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> BothPeople:
-        """Return both people in the newest frame of each stream; a single speaker is that of all streams."""
+        """Return both people in the newest frame of each stream."""
+        # Equation (2): A^u_(T-1) of the user, and A^a_T of the agent, which is one frame ahead.
         samples = [track for one in speakers for track in (one.audio, fit_frame(one.agent_audio))]
-        before = [voice for memory in memories[: len(speakers)] for voice in (memory.user_voice, memory.agent_voice)]
+        before = [voice for memory in memories for voice in (memory.user_voice, memory.agent_voice)]
         sounds, present, after = hear_each(samples, before)
         voices = list(zip(after[::2], after[1::2], strict=True))
         face = np.zeros((len(speakers), len(self.settings.channels)), np.float32)
@@ -355,14 +322,12 @@ class ArigListener(RunsOnEngine):
             if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
-        streams = len(memories) // len(speakers)
-        parts = (sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen)
-        first, there, speak, faces, known = (np.repeat(part, streams, axis=0) for part in parts)
-        return BothPeople(first, there, speak, faces, known, voices * streams)
+        return BothPeople(sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen, voices)
 
     def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
         """Return the inputs of the network `frame`."""
         settings = self.settings
+        # 3.2: chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view, w - 1 are whole.
         frames = np.array([memory.frames for memory in memories])
         chunks, room = frames // settings.chunk_frames, settings.context_chunks - 1
         return [

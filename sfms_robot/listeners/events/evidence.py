@@ -206,13 +206,9 @@ def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[Listener
 
 
 def remembered(events: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
-    """Return the events, in order, that may still matter: nods of the last minute, of every other kind the newest."""
+    """Return the events, in order, that may still matter: those of the last minute, of every kind the newest."""
     newest = {event.kind: event for event in events}
-    return tuple(
-        event
-        for event in events
-        if newest[event.kind] is event or (event.kind == "nod" and event.end_s > now_s - REMEMBERED_S)
-    )
+    return tuple(event for event in events if newest[event.kind] is event or event.end_s > now_s - REMEMBERED_S)
 
 
 # --- Signs of a face --------------------------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from sfms_robot.config import Calmness, Model, load
@@ -51,7 +50,7 @@ STEP_FRAMES: Final = 2
 STEP_S: Final = 0.08
 FILE: Final = "events.yaml"  # in sim/listeners
 _BOUND: Final = 30.0  # of log-odds
-_LONG_AGO: Final = 50.0  # on the axis of curves, beyond every knot
+_IS_NUMBER: Final = np.array([name in NUMBERS for name in EVIDENCE])
 
 Curve = Annotated[dict[NonNegative, Finite], Field(min_length=2)]
 Quantiles = Annotated[tuple[NonNegative, ...], Field(min_length=2)]
@@ -131,90 +130,54 @@ def load_tables(file: Path | None = None) -> EventTables:
     return load(EventTables, data_dir("sim") / "listeners" / FILE if file is None else file)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _CurveKnots:
-    """All knots of all curves of all kinds, one after the other (K,), and numbers as curves of one knot.
-
-    Attributes:
-        column: of the evidence.
-        weight: value at the knot.
-        left, left_slope, right, right_slope: zeros of its hat on the axis, and the slopes from there.
-        number: it multiplies a number.
-        first: (T,) index of the first knot of each term; `kind`: (H,) index of the first term of each kind.
-    """
-
-    column: NDArray[np.int64]
-    weight: Doubles
-    left: Doubles
-    left_slope: Doubles
-    right: Doubles
-    right_slope: Doubles
-    number: NDArray[np.bool_]
-    first: NDArray[np.int64]
-    kind: NDArray[np.int64]
-
-
 class HazardBank:
-    """All hazards at once, of one row of evidence or of many."""
+    """All hazards at once, of one row of evidence or of many.
+
+    A curve is its first value plus slopes times the part of each interval between two knots that has passed; a number
+    is one interval without ends.
+    """
 
     def __init__(self, hazards: Mapping[str, Hazard]) -> None:
         self.kinds: tuple[str, ...] = tuple(hazards)
         self.terms: tuple[tuple[str, ...], ...] = tuple(tuple(hazards[kind].weights) for kind in self.kinds)
         self._intercepts = np.array([hazards[kind].intercept for kind in self.kinds])
-        self._knots = _flat(hazards)
-        self._starts = [int(start) for start in self._knots.kind]
+        self._first_term = np.cumsum([0, *map(len, self.terms)])  # of each kind
+        base: list[float] = []  # first value of each term
+        first: list[int] = []  # interval of each term
+        intervals: list[tuple[float, ...]] = []  # column of the evidence, first knot, least and most passed, slope
+        for hazard in hazards.values():
+            for name, weight in hazard.weights.items():
+                first.append(len(intervals))
+                if isinstance(weight, Mapping):
+                    at, values = log_time(list(weight)), np.array([*weight.values()])
+                    base.append(values[0])
+                    columns = np.full(len(at) - 1, AT[name]), at[:-1], np.zeros(len(at) - 1)
+                    intervals += zip(*columns, np.diff(at), np.diff(values) / np.diff(at), strict=True)
+                else:
+                    base.append(0.0)
+                    intervals.append((AT[name], 0.0, -np.inf, np.inf, weight))
+        self._base, self._first = np.array(base), np.array(first)
+        column, self._knot, self._least, self._most, self._slope = np.array(intervals, np.float64).T
+        self._column = column.astype(np.int64)
 
     def contributions(self, evidence: Doubles) -> Doubles:
         """Return (..., T), the terms of the log-odds of each kind, of evidence (..., len(EVIDENCE)); NaN adds 0."""
-        k = self._knots
-        value = evidence[..., k.column]
-        time = np.minimum(log_time(np.maximum(evidence, 0.0)), _LONG_AGO)[..., k.column]
-        hat = np.minimum((time - k.left) * k.left_slope, (k.right - time) * k.right_slope)
-        hat = np.minimum(np.maximum(hat, 0.0), 1.0)
-        each = np.where(np.isnan(value), 0.0, k.weight * np.where(k.number, value, hat))
-        return np.asarray(np.add.reduceat(each, k.first, axis=-1), np.float64)
+        axis = np.where(_IS_NUMBER, evidence, log_time(np.maximum(evidence, 0.0)))
+        passed = np.minimum(np.maximum(axis[..., self._column] - self._knot, self._least), self._most)
+        terms = self._base + np.add.reduceat(self._slope * passed, self._first, axis=-1)
+        return np.where(np.isnan(terms), 0.0, terms)
 
     def log_odds(self, contributions: Doubles) -> Doubles:
         """Return the log-odds (..., H) of terms (..., T); always finite."""
-        total = self._intercepts + np.add.reduceat(contributions, self._knots.kind, axis=-1)
+        total = self._intercepts + np.add.reduceat(contributions, self._first_term[:-1], axis=-1)
         return np.asarray(np.minimum(np.maximum(np.where(np.isnan(total), 0.0, total), -_BOUND), _BOUND), np.float64)
 
     def largest(self, contributions: Doubles, kind: str, most: int = 4) -> dict[str, float]:
         """Return the largest terms of one kind, by evidence, of terms (T,)."""
         at = self.kinds.index(kind)
-        own = contributions[self._starts[at] : self._starts[at] + len(self.terms[at])]
-        largest = sorted(range(len(own)), key=lambda index: -abs(own[index]))[:most]
-        return {self.terms[at][index]: round(float(own[index]), 3) for index in largest if own[index]}
-
-
-def _flat(hazards: Mapping[str, Hazard]) -> _CurveKnots:
-    rows: list[tuple[float, ...]] = []
-    first: list[int] = []
-    kind: list[int] = []
-    for hazard in hazards.values():
-        kind.append(len(first))
-        for name, weight in hazard.weights.items():
-            first.append(len(rows))
-            rows += _curve(AT[name], weight)
-    column, weights, left, left_slope, right, right_slope, number = np.array(rows, np.float64).T
-    return _CurveKnots(
-        column=column.astype(np.int64), weight=weights, left=left, left_slope=left_slope, right=right,
-        right_slope=right_slope, number=number.astype(bool), first=np.array(first), kind=np.array(kind),
-    )  # fmt: skip
-
-
-def _curve(column: int, weight: float | Mapping[float, float]) -> list[tuple[float, ...]]:
-    """Return a row of `_CurveKnots` for each knot. The first hat is 1 before its knot, the last behind it."""
-    if not isinstance(weight, Mapping):
-        return [(column, weight, 0.0, 0.0, 0.0, 0.0, True)]
-    at = log_time(list(weight)).tolist()
-    rows: list[tuple[float, ...]] = []
-    for index, value in enumerate(weight.values()):
-        low, high = index == 0, index == len(at) - 1
-        left, left_slope = (-1.0, 1e9) if low else (at[index - 1], 1 / (at[index] - at[index - 1]))
-        right, right_slope = (np.inf, 1.0) if high else (at[index + 1], 1 / (at[index + 1] - at[index]))
-        rows.append((column, value, left, left_slope, right, right_slope, False))
-    return rows
+        own = zip(self.terms[at], contributions[self._first_term[at] :].tolist(), strict=False)
+        largest = sorted(own, key=lambda term: -abs(term[1]))[:most]
+        return {name: round(value, 3) for name, value in largest if value}
 
 
 # --- Decisions --------------------------------------------------------------------------------------------------------
@@ -253,28 +216,22 @@ class Decision:
     hazards_hz: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class DecideMemory:
-    """The memory of one stream of its own events.
+@dataclass(frozen=True, kw_only=True)
+class EventMemory:
+    """The memory of one stream.
 
     Attributes:
+        sensed: of the person.
         seed, calmness: of the stream.
-        done: events decided, in order, as far as they still matter.
+        done: own events decided, in order, as far as they still matter.
         hazards_hz: the last ones that were drawn.
     """
 
+    sensed: SenseMemory
     seed: int
     calmness: Calmness
     done: tuple[ListenerEvent, ...] = ()
     hazards_hz: Mapping[str, float] | None = None
-
-
-@dataclass(frozen=True)
-class EventMemory:
-    """The memory of one stream: of the person, and of its own events."""
-
-    sensed: SenseMemory
-    decided: DecideMemory
 
 
 class EventModel:
@@ -295,30 +252,28 @@ class EventModel:
     def start(self, seed: int, calmness: Calmness | None = None) -> EventMemory:
         """Return the memory of a new stream."""
         asked = calmness or Calmness()
-        return EventMemory(SenseMemory(addressed=asked.addressed), DecideMemory(seed, asked))
+        return EventMemory(sensed=SenseMemory(addressed=asked.addressed), seed=seed, calmness=asked)
 
     def calmed(self, memory: EventMemory, calmness: Calmness) -> EventMemory:
         """Return the memory with other rates from now on."""
-        return EventMemory(
-            changed(memory.sensed, addressed=calmness.addressed), changed(memory.decided, calmness=calmness)
-        )
+        return changed(memory, sensed=changed(memory.sensed, addressed=calmness.addressed), calmness=calmness)
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
     ) -> list[tuple[Decision, EventMemory]]:
         """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
-        decided = self.decide_each([one for one, _ in sensed], [memory.decided for memory in memories])
+        decided = self.decide_each([one for one, _ in sensed], memories)
         return [
-            (decision, EventMemory(heard, own)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
+            (decision, changed(own, sensed=heard)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
         ]
 
     def decide_each(
         self,
         sensed: Sequence[Sensed],
-        memories: Sequence[DecideMemory],
+        memories: Sequence[EventMemory],
         histories: Sequence[Sequence[ListenerEvent]] | None = None,
-    ) -> list[tuple[Decision, DecideMemory]]:
+    ) -> list[tuple[Decision, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
         `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
@@ -338,8 +293,8 @@ class EventModel:
         return found
 
     def _drawn(
-        self, sensed: Sensed, memory: DecideMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
-    ) -> tuple[Decision, DecideMemory]:
+        self, sensed: Sensed, memory: EventMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
+    ) -> tuple[Decision, EventMemory]:
         """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
@@ -378,7 +333,7 @@ class EventModel:
 
     def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
         """Return the look back at the person, once looking away is over."""
-        shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+        shift = last_shift(history)
         if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:
             return ()
         until_s = 60.0 / self.tables.hazards["gaze_shift"].per_minute
@@ -407,6 +362,11 @@ def quantile(values: Sequence[float], share: float) -> float:
     return float(np.interp(share * (len(values) - 1), np.arange(len(values)), values))
 
 
+def last_shift(events: Sequence[ListenerEvent]) -> ListenerEvent | None:
+    """Return the newest gaze shift, if there is any."""
+    return next((event for event in reversed(events) if event.kind == "gaze_shift"), None)
+
+
 def _begin_s(frame: int) -> float:
     return (frame + 1 + LEAD_FRAMES) * FRAME_S
 
@@ -416,7 +376,7 @@ def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) 
     silence_s, own_s, phrase_s, last_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
-    shift = next((event for event in reversed(history) if event.kind == "gaze_shift"), None)
+    shift = last_shift(history)
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
         under_way.add("gaze_shift")
     return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not EXCLUDES[kind] & under_way)

@@ -62,6 +62,29 @@ class LastKeyframes(NamedTuple, Generic[A]):
     at: A
 
 
+class Context(NamedTuple, Generic[A]):
+    """Inputs of the predictor, arrays or tensors, in the order in which the network `ahead` takes them.
+
+    Attributes:
+        face: (B, P, C) speaker's standardised motion; arbitrary where not `face_known`.
+        face_known: (B, P) bool.
+        voice: (B, P, W) sound as `SpeakerEncoder.listen` returns it; arbitrary where not `heard`.
+        heard: (B, P) bool.
+        phase: (B, P, F) the speaker's place in a phrase; arbitrary where not `heard`; F = 0 without.
+        tokens: (B', P + H, G) the listener's own: past, the part of the future that is drawn already, UNDECIDED.
+            B' = B, or any number when B = 1: many answers to one speaker.
+        control: (B', P + H, K) events in each of those frames; K = 0 without.
+    """
+
+    face: A
+    face_known: A
+    voice: A
+    heard: A
+    phase: A
+    tokens: A
+    control: A
+
+
 def last_keyframes(tokens: Tokens) -> LastKeyframes[Tokens]:
     """Return the last keyframes at every frame of tokens (B, T, G), that frame included; frame -1 for none."""
     windows, frames, groups = tokens.shape
@@ -77,12 +100,9 @@ def last_keyframes(tokens: Tokens) -> LastKeyframes[Tokens]:
 
 def with_drawn(recent: LastKeyframes[Tokens], drawn: Tokens, frame: int) -> LastKeyframes[Tokens]:
     """Return the last keyframes (..., G, 2) after the tokens (..., G) `drawn` for `frame`."""
-    key, tokens, at = drawn > 0, recent.tokens.copy(), recent.at.copy()
-    for part in (tokens, at):
-        np.copyto(part[..., 1], part[..., 0], where=key)
-    np.copyto(tokens[..., 0], drawn, where=key)
-    np.copyto(at[..., 0], frame, where=key)
-    return LastKeyframes(tokens, at)
+    key, now = drawn[..., None] > 0, np.full_like(drawn, frame)
+    tokens, at = (np.stack([new, old[..., 0]], -1) for new, old in zip((drawn, now), recent, strict=True))
+    return LastKeyframes(np.where(key, tokens, recent.tokens), np.where(key, at, recent.at))
 
 
 def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
@@ -121,16 +141,8 @@ def passed(tokens: Tokens, path: Floats, frames: int = 1, holds: bool = False) -
     moved = np.concatenate([tokens[:, frames:], np.full_like(tokens[:, :frames], UNDECIDED)], axis=1)
     np.maximum(moved[:, :-horizon], 0, out=moved[:, :-horizon])
     if holds:
-        moved[:, 0] = _newest(tokens[:, : frames + 1])
+        moved[:, 0] = last_keyframes(tokens[:, : frames + 1]).tokens[:, -1, :, 0]
     return moved, np.concatenate([path[:, frames:], np.repeat(path[:, -1:], frames, axis=1)], axis=1)
-
-
-def _newest(tokens: Tokens) -> Tokens:
-    """Return the last keyframe of each group (B, G) of tokens (B, T, G), 0 where there is none."""
-    out: Tokens = np.maximum(tokens[:, 0], 0)
-    for frame in range(1, tokens.shape[1]):
-        out = np.where(tokens[:, frame] > 0, tokens[:, frame], out)
-    return out
 
 
 def later(control: Floats, frames: int = 1) -> Floats:
@@ -167,7 +179,7 @@ def anchored(tokens: Tokens, drawn: NDArray[np.bool_], settled: Tokens, ramp: in
     ahead = (tokens > 0) & (behind & (frame < settled[:, None] + ramp))[..., None]
     first = ahead.argmax(1)  # the next keyframe of each group, if there is any
     is_new = np.take_along_axis(new, first[:, None], axis=1)[:, 0]
-    held = _newest(np.where(behind[..., None], 0, tokens))
+    held = last_keyframes(np.where(behind[..., None], 0, tokens)).tokens[:, -1, :, 0]
     out[stream, settled] = np.where(ahead.any(1) & is_new, held, tokens[stream, settled])
     return out
 
@@ -353,24 +365,6 @@ def _turned(control: Floats, told: NDArray[np.bool_]) -> tuple[Doubles, Doubles]
 # --- Drawing ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanInputs:
-    """Inputs of a plan: the parts of `predictor.Context`, those of the speaker for 1 or B streams.
-
-    Attributes:
-        settled: (B,) the last frame of each window whose motion is fixed: no new ramp begins before it.
-    """
-
-    face: Floats
-    face_known: NDArray[np.bool_]
-    voice: Floats
-    heard: NDArray[np.bool_]
-    phase: Floats
-    tokens: Tokens
-    control: Floats
-    settled: Tokens
-
-
 class Sampler:
     """Draws the tokens of one listener: frame by frame, every group at once, many streams at a time."""
 
@@ -384,11 +378,12 @@ class Sampler:
         self._classes = [group.codes + 1 for group in groups]
         self._ramp = settings.ramp_frames or 0
 
-    def draw(self, seen: PlanInputs, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
+    def draw(self, seen: Context[NDArray[Any]], settled: Tokens, seeds: Sequence[int], frames: Sequence[int]) -> Tokens:
         """Return `seen.tokens` (B, P + H, G) with its undecided frames drawn.
 
         Args:
             seen: undecided frames are the last ones of a stream; how many may differ from stream to stream.
+            settled: (B,) the last frame of each window whose motion is fixed: no new ramp begins before it.
             seeds: of each stream.
             frames: the number, in the life of each stream, of the last frame of its window.
         """
@@ -396,8 +391,7 @@ class Sampler:
         window = tokens.shape[1]
         first = window - int((tokens[..., 0] == UNDECIDED).sum(1).max())
         recent = last_keyframes(tokens)
-        parts = (seen.face, seen.face_known, seen.voice, seen.heard, seen.phase, tokens, seen.control)
-        (slots,) = self._engine.run("ahead", *parts, *recent)
+        (slots,) = self._engine.run("ahead", *seen, *recent)
         last = LastKeyframes(recent.tokens[:, first - 1], recent.at[:, first - 1])
         before = min(first, 2)  # rows that say how fast a swing is, and that it has just ended
         rows = seen.control[:, first - before :]
@@ -405,7 +399,7 @@ class Sampler:
         for frame in range(first, window):
             (flat,) = self._engine.run("next", slots[:, frame - window], *last, np.array([frame - 1]))
             logits = by_group(flat, self._classes)  # (B, G, V)
-            since = frame - np.maximum(last.at[..., 0], seen.settled[:, None] if self._ramp else -1)
+            since = frame - np.maximum(last.at[..., 0], settled[:, None] if self._ramp else -1)
             np.copyto(logits, np.float32(-np.inf), where=self._reach.too_soon(last.tokens[..., 0], since))
             logits /= self._temperature
             for told, course in courses:
@@ -420,7 +414,7 @@ class Sampler:
             known = tokens[:, frame]
             tokens[:, frame] = np.where(known == UNDECIDED, drawn, known)
             last = with_drawn(last, tokens[:, frame], frame)
-        return anchored(tokens, seen.tokens == UNDECIDED, seen.settled, self._ramp) if self._ramp else tokens
+        return anchored(tokens, seen.tokens == UNDECIDED, settled, self._ramp) if self._ramp else tokens
 
 
 def by_group(flat: Floats, classes: Sequence[int]) -> Floats:

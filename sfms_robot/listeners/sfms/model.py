@@ -3,7 +3,16 @@
     Inpainter    sparse to dense (IV-B5): keyframes -> every frame
     Tokenizer    motion <-> tokens (IV-B): placement, codes, inpainter
     SfmsModel    tokenizer and predictor, with the scales of motion and sound: the weights of one listener
-    networks     functions of tensors alone that `stream.SfmsListener` calls; they run as modules, traced, or as ONNX
+    networks     functions of tensors alone that `stream.SfmsListener` calls; they run as modules or as ONNX
+
+Sections of the paper and the files of this folder that follow them:
+
+    IV-A   features of sound                         audio_frontend.py (shared with ARIG)
+    IV-B2  keyframe discovery                        placement.py, piecewise_linear.py
+    IV-B4  codes of keyframes                        quantizer.py
+    IV-B5  from keyframes to every frame             model.py
+    IV-C   predictor of listening motion             predictor.py
+    ours   drawing tokens, and running as a stream   draw.py, stream.py
 
 B batch or streams, T frames, P past and H future frames, C channels, G groups, D digits of a code, W width.
 """
@@ -20,10 +29,10 @@ from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.idle import BANDS, head_channels
 from sfms_robot.listeners.layers import Block, sinusoidal
-from sfms_robot.listeners.sfms.draw import LastKeyframes, neutral_mask
+from sfms_robot.listeners.sfms.draw import Context, LastKeyframes, neutral_mask
 from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place
-from sfms_robot.listeners.sfms.predictor import Context, Predictor
+from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.space import MotionSpace
 
@@ -49,10 +58,13 @@ class Inpainter(nn.Module):
         self.width = width
         self.residual = settings.inpainter == "residual"
         self.ramp = settings.ramp_frames
+        # z^kf of equation (9): codes of all groups at a frame, and which groups have a keyframe there.
         self.keyframe_in = nn.Linear(groups * (quantizer.dims + 1), width)
         self.keyframe_encoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        # z^tf of equation (10): codes on the line between the neighbours, and T^tf as binary positions (IV-B5).
         self.transition_in = nn.Linear(groups * (quantizer.dims + 2 * POSITION_BITS + 3), width)
         self.transition_encoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
+        # Phi^full of equation (10), the decoder.
         self.join = nn.Linear(2 * width, width)
         self.decoder = nn.ModuleList(Block(width, heads) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
@@ -76,19 +88,21 @@ class Inpainter(nn.Module):
         """
         if around is None:
             neighbours = Neighbours.in_mask(mask, self.ramp)
-            rows, seen, found = _every(mask)
+            seen = (mask > 0.5).any(-1)  # every frame is looked up, so that learned placement gets its gradient
+            seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
-            rows, seen, found = around.rows, around.seen, around.places
+            seen = around.seen
         places = sinusoidal(mask.shape[1], self.width).to(codes)  # (T, W)
         # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
-        # Other frames are not looked at and not kept; but the gradient that learned placement needs passes there.
-        z_keys = F.embedding(rows, z_kf.flatten(0, 1))  # (B, K, W): the keyframes of each window, in a row
+        # (B, K, W): the keyframes of each window, in a row; other frames are not looked at and not kept.
+        z_keys = z_kf if around is None else F.embedding(around.rows, z_kf.flatten(0, 1))
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
-        z_kf = F.embedding(found, z_keys.flatten(0, 1)) * mask.amax(-1, keepdim=True)
+        z_kf = z_keys if around is None else F.embedding(around.places, z_keys.flatten(0, 1))
+        z_kf = z_kf * mask.amax(-1, keepdim=True)
         between = neighbours.interpolate(keyed)  # codes on straight lines, (B, T, G, D)
         query = torch.cat([between, neighbours.positions()], dim=-1).flatten(2)  # concatenated, not added (IV-B5)
         z_tf = self.transition_in(query) + places  # Phi^tf of equation (10): T^tf queries z^kf
@@ -106,21 +120,6 @@ class Inpainter(nn.Module):
         return out + quantizer.by_channel(lines.interpolate(quantizer.decoder(keyed)))
 
 
-def _every(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `Around.rows`, `seen` and `places` of a mask (B, T, G) with every frame among the keyframes of its window.
-
-    Where no gradient is needed, only frames that are a keyframe in any window.
-    """
-    seen = (mask > 0.5).any(-1)
-    seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
-    windows, frames = seen.shape
-    frame = torch.arange(frames, device=mask.device)
-    keys = frame if torch.is_grad_enabled() else seen.any(0).nonzero()[:, 0]
-    window = torch.arange(windows, device=mask.device)[:, None]
-    place = torch.zeros_like(frame).index_copy(0, keys, torch.arange(len(keys), device=mask.device))
-    return window * frames + keys, seen[:, keys], window * len(keys) + place
-
-
 class Tokenizer(nn.Module):
     """Motion <-> tokens (B, T, G): 0 at a transition frame, 1 + code index at a keyframe. Motion is standardised."""
 
@@ -133,6 +132,7 @@ class Tokenizer(nn.Module):
         self.window = settings.window_frames
         self.keyframes = [group.keyframes or 0 for group in groups]  # 0 where a keyframe has a cost instead
         self.costs = [group.keyframe_cost or 0.0 for group in groups]
+        # Ours: groups of channels, each with its own mask and codebook; `preset: one` is the paper's single mask.
         member = [[float(name in group.channels) for name in settings.channels] for group in groups]
         self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
         levels = [group.levels for group in groups]
@@ -155,6 +155,7 @@ class Tokenizer(nn.Module):
         motion.
         """
         frames = motion.shape[1]
+        # k of IV-B2 is of a window; a longer stretch gets as many a second.
         scaled = [max(1, round(count * frames / self.window)) for count in self.keyframes]
         return place(
             motion,
@@ -171,7 +172,7 @@ class Tokenizer(nn.Module):
 
     def encode(self, motion: Tensor, mask: Tensor) -> Tensor:
         """Return the tokens (B, T, G) of motion (B, T, C) with keyframes at a mask (B, T, G)."""
-        indices = self.quantizer.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
+        indices = self.quantizer.codebook.indices(self.quantizer.encode(motion))  # every frame as if it were a keyframe
         return torch.where(mask > 0.5, indices + 1, 0)
 
     def decode(self, tokens: Tensor, last: int | None = None, around: Around | None = None) -> Tensor:
@@ -179,7 +180,8 @@ class Tokenizer(nn.Module):
 
         `last`, `around`: see `Inpainter`.
         """
-        codes = self.quantizer.codes((tokens - 1).clamp(min=0))  # of transitions arbitrary: the mask hides them
+        # Class 0 is the transition frame, class 1 + i the code c_i of the codebook D (IV-C2).
+        codes = self.quantizer.codebook.codes((tokens - 1).clamp(min=0))  # of transitions: any
         out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 
@@ -194,6 +196,7 @@ class SfmsModel(nn.Module):
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
+        self.settings = settings
         width, bins = len(settings.channels), SHAPES[settings.audio][1]
         self.motion_mean = nn.Buffer(torch.zeros(width))
         self.motion_std = nn.Buffer(torch.ones(width))
@@ -229,13 +232,15 @@ class Network(nn.Module):
 
     Attributes:
         free: inputs of (B, K, ...), K any number but the same for all of them.
+        further: names of the inputs of `forward` that have none there.
     """
 
     free: tuple[str, ...] = ()
+    further: tuple[str, ...] = ()
 
-    def __init__(self, model: SfmsModel, settings: config.Sfms) -> None:
+    def __init__(self, model: SfmsModel) -> None:
         super().__init__()
-        self.model = model
+        self.model, settings = model, model.settings
         self.future = settings.future_frames
         self.codes = [group.codes for group in settings.groups.values()]
 
@@ -247,7 +252,7 @@ class Rest(Network):
         """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
         quantizer = self.model.tokenizer.quantizer
         indices = torch.arange(max(self.codes))[:, None] % torch.tensor(self.codes)
-        return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codes(indices)[None])
+        return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codebook.codes(indices)[None])
 
 
 class Hear(Network):
@@ -261,29 +266,11 @@ class Hear(Network):
 class Ahead(Network):
     """The predictor up to the point where the drawn keyframes matter."""
 
-    def forward(
-        self,
-        face: Tensor,
-        face_known: Tensor,
-        voice: Tensor,
-        heard: Tensor,
-        phase: Tensor,
-        tokens: Tensor,
-        control: Tensor,
-        last: Tensor,
-        at: Tensor,
-    ) -> tuple[Tensor]:
+    further = (*Context._fields, "last", "at")
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor]:
         """Return slots (B, H, W) of the parts of a `Context` and its last keyframes (B, P + H, G, 2)."""
-        context = Context(
-            face=face,
-            face_known=face_known,
-            voice=voice,
-            heard=heard,
-            phase=phase,
-            tokens=tokens,
-            control=control,
-        )
-        return (self.model.predictor(context, LastKeyframes(last, at)),)
+        return (self.model.predictor(Context(*inputs[:-2]), LastKeyframes(*inputs[-2:])),)
 
 
 class Next(Network):
@@ -318,7 +305,7 @@ def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
     return model.tokenizer.encode(model.standardise(still), mask[None])[0]
 
 
-def networks(model: SfmsModel, settings: config.Sfms) -> dict[str, Network]:
+def networks(model: SfmsModel) -> dict[str, Network]:
     """Return all networks by name."""
     kinds = {"rest": Rest, "hear": Hear, "ahead": Ahead, "next": Next, "decode": Decode}
-    return {name: kind(model, settings).eval() for name, kind in kinds.items()}
+    return {name: kind(model).eval() for name, kind in kinds.items()}

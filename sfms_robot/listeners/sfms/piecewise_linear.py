@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-
-from sfms_robot.frames import Doubles
+from torch.nn import functional as F
 
 POSITION_BITS = 6  # distances to the neighbouring keyframes up to 63 frames, as binary digits
 
@@ -41,6 +40,14 @@ class Around(NamedTuple):
     rows: Tensor
     seen: Tensor
     places: Tensor
+
+
+def nearest_keys(mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the last keyframe at or before each frame of a mask (B, T, ...), -1 for none, and the next, T for none."""
+    t = mask.shape[1]
+    frame = torch.arange(t, device=mask.device).view(-1, *[1] * (mask.dim() - 2))
+    before = torch.where(mask > 0.5, frame, -1).cummax(1).values
+    return before, torch.where(mask > 0.5, frame, t).flip(1).cummin(1).values.flip(1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +75,7 @@ class Neighbours:
     @classmethod
     def in_mask(cls, mask: Tensor, ramp: int | None = None) -> Neighbours:
         """Return the neighbours in a mask (B, T, G)."""
-        t = mask.shape[1]
-        frame = torch.arange(t, device=mask.device)[:, None]
-        key = mask > 0.5
-        before = torch.where(key, frame, -1).cummax(1).values
-        after = t - 1 - torch.where(key, t - 1 - frame, -1).flip(1).cummax(1).values.flip(1)
-        return cls.at(before, after, ramp)
+        return cls.at(*nearest_keys(mask), ramp)
 
     @classmethod
     def at(cls, before: Tensor, after: Tensor, ramp: int | None = None) -> Neighbours:
@@ -114,6 +116,7 @@ class Neighbours:
     @cached_property
     def weight(self) -> Tensor:
         """Return the weight (B, T, G) of the keyframe after: 0 at the one before, 1 at the one after."""
+        # Share of the way from the keyframe before (0) to the one after (1); held until the ramp begins.
         begin = self.before if self.ramp is None else torch.maximum(self.before, self.after - self.ramp)
         span = (self.after - begin).clamp(min=1)
         return ((self.frame - begin) / span).clamp(0.0, 1.0)
@@ -126,6 +129,7 @@ class Neighbours:
 
     def positions(self) -> Tensor:
         """Return binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
+        # IV-B5: T^tf as a binary vector, so that one frame more changes the input clearly; ours: to both neighbours.
         powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
         bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
         ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
@@ -170,42 +174,14 @@ class Segments:
         )
 
 
-def segments(gram: Tensor) -> Segments:
-    """Return the errors of every stretch from the Gram matrix (N, T, T) of the frames, <x_s, x_t>.
-
-    With w = (s - i) / (j - i) the frame s on the line is (1 - w) x_i + w x_j, so its squared error is
-
-        |x_s|^2 - 2 (1 - w) <x_s, x_i> - 2 w <x_s, x_j> + (1 - w)^2 |x_i|^2 + 2 w (1 - w) <x_i, x_j> + w^2 |x_j|^2,
-
-    a sum of Gram entries weighted by 1, s and s^2: prefix sums over s make every stretch O(1).
-    """
-    t = gram.shape[-1]
-    s = torch.arange(t, dtype=gram.dtype, device=gram.device)
-    square = gram.diagonal(dim1=-2, dim2=-1)  # |x_s|^2, (N, T)
-    p0, p1 = gram.cumsum(-2), (gram * s[:, None]).cumsum(-2)  # sums over frames s of <x_s, x_i> and s <x_s, x_i>
-    norm = square.cumsum(-1)
-
-    own0, own1 = p0.diagonal(dim1=-2, dim2=-1), p1.diagonal(dim1=-2, dim2=-1)  # at s = i
-    # Sums over i < s <= j, as matrices (i, j); the interpolation error is zero at s = j, so j may be included.
-    sum0_i = p0.transpose(-1, -2) - own0[..., :, None]  # of <x_s, x_i>
-    sum1_i = p1.transpose(-1, -2) - own1[..., :, None]  # of s <x_s, x_i>
-    sum0_j = own0[..., None, :] - p0  # of <x_s, x_j>
-    sum1_j = own1[..., None, :] - p1  # of s <x_s, x_j>
-    n = (s[None, :] - s[:, None]).clamp(min=1.0)  # j - i
-    i = s[:, None]
-    w_i = sum0_i - (sum1_i - i * sum0_i) / n  # sum of (1 - w) <x_s, x_i>
-    w_j = (sum1_j - i * sum0_j) / n  # sum of w <x_s, x_j>
-    ww = (n + 1) * (2 * n + 1) / (6 * n)  # sum of w^2 over s = i + 1 .. j
-    w1w = (n + 1) / 2 - ww  # sum of w (1 - w)
-    vv = n - (n + 1) + ww  # sum of (1 - w)^2
-    error = norm[..., None, :] - norm[..., :, None] - 2 * w_i - 2 * w_j
-    error = error + vv * square[..., :, None] + 2 * w1w * gram + ww * square[..., None, :]
-    inside = error.clamp(min=0.0).masked_fill(s[None, :] <= s[:, None], torch.inf)
-
-    total0 = p0[..., -1, :]  # sum over all s of <x_s, x_i>
-    before = norm - 2 * own0 + (s + 1) * square
-    after = norm[..., -1:] - norm - 2 * (total0 - own0) + (t - 1 - s) * square
-    return Segments(inside, before.clamp(min=0.0), after.clamp(min=0.0))
+def segments(x: Tensor) -> Segments:
+    """Return the errors of every stretch of tracks x (N, T, c), straight lines all the way."""
+    t = x.shape[1]
+    before, band, after = stretches(x, t)
+    frame = torch.arange(t, device=x.device)
+    gap = frame - frame[:, None]  # j - i
+    inside = band[:, frame, gap.clamp(min=0)]  # [i, j] = band[j, j - i]
+    return Segments(inside.masked_fill(gap <= 0, torch.inf), before, after)
 
 
 def best_frames(cost: Segments, count: int) -> Tensor:
@@ -213,6 +189,7 @@ def best_frames(cost: Segments, count: int) -> Tensor:
 
     best[j] = min_i best[i] + inside[i, j], `count` - 1 times; the way back from the cheapest end gives the frames.
     """
+    # best[j]: least error up to j of the keyframes placed so far, the last of them at j.
     best, parents = cost.before, []
     for _ in range(count - 1):
         best, parent = (best[:, :, None] + cost.inside).min(dim=1)
@@ -235,6 +212,7 @@ def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
     for _ in range(most - 1):
         ahead.append((ahead[-1][:, :, None] + allowed.inside).amin(dim=1))
         behind.append((allowed.inside + behind[-1][:, None, :]).amin(dim=2))
+    # Of k keyframes, m stand up to t and k + 1 - m from t on; the best split counts.
     forward, backward = torch.stack(ahead, 1), torch.stack(behind, 1)  # (N, most, T)
     totals = [(forward[:, :k] + backward[:, :k].flip(1)).amin(dim=1) for k in range(1, most + 1)]
     return torch.stack(totals, 1)
@@ -242,10 +220,9 @@ def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
 
 def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
     """Return the error (N,) of a mask (N, T): the sum over its stretches, infinite for a mask without keyframes."""
-    key = mask > 0.5
-    frame = torch.arange(mask.shape[1], device=mask.device).expand(mask.shape)
-    last = torch.where(key, frame, -1).cummax(1).values
-    previous = torch.cat([torch.full_like(last[:, :1], -1), last[:, :-1]], dim=1)
+    # Each keyframe pays for the stretch that ends with it, the last one for the frames behind it too.
+    key, last = mask > 0.5, nearest_keys(mask)[0]
+    previous = F.pad(last[:, :-1], (1, 0), value=-1)
     between = cost.inside.gather(1, previous.clamp(min=0)[:, None])[:, 0]
     at_key = torch.where(previous >= 0, between, cost.before)
     behind = cost.after.gather(1, last[:, -1:].clamp(min=0))[:, 0]
@@ -288,68 +265,65 @@ def place_penalised(
     """
     t = motion.shape[1]
     gap = t if max_gap is None else min(max_gap, t)
-    cost = np.array(costs, np.float64)
-    if not (cost > 0).all():
+    if not min(costs) > 0:
         raise ValueError(f"keyframe costs: not all above 0: {list(costs)}")
-    mask = torch.zeros(len(motion), t, len(cost), dtype=motion.dtype)
-    for row, one in enumerate(motion.detach().double().cpu().numpy()):
-        own = [one[:, channels > 0.5] for channels in member.cpu().numpy()]
-        parts = [_stretches(x, gap, ramp) for x in own]
-        before, inside, after = (np.stack(part) for part in zip(*parts, strict=True))
-        for group, frames in enumerate(_cheapest(cost, before, inside, after)):
+    mask = motion.new_zeros(*motion.shape[:2], len(costs))
+    for group, cost in enumerate(costs):
+        own = motion[..., member[group] > 0.5].double().cpu()
+        for row, frames in enumerate(_cheapest(cost, *stretches(own, gap, ramp))):
             mask[row, frames, group] = 1.0
-    return mask.to(motion.device)
+    return mask
 
 
-def _stretches(x: Doubles, gap: int, ramp: int | None) -> tuple[Doubles, Doubles, Doubles]:
-    """Return the errors of one track x (T, c), infinite where a gap is too large.
+def stretches(x: Tensor, gap: int, ramp: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the errors of tracks x (N, T, c) in double precision, infinite where a gap is too large.
 
     Returns:
-        Held back from each frame to the start (T,); to each frame from the keyframe d frames before it, at column
-        gap - d (T, gap); held from each frame to the end (T,).
+        Held back from each frame to the start (N, T); to each frame from the keyframe d frames before it, at column d
+        (N, T, gap + 1); held from each frame to the end (N, T).
     """
-    t = len(x)
-    x = x - x.mean(axis=0)  # keeps the sums small
-    frame = np.arange(t)
-    norm = (x**2).sum(axis=1)
-    s0, p0, p1 = norm.cumsum(), x.cumsum(axis=0), (x * frame[:, None]).cumsum(axis=0)
-    own = -s0 + 2 * (x * p0).sum(axis=1)  # terms of keyframe i alone
-    inside = np.full((t, gap), np.inf)
+    t = x.shape[1]
+    x = x.double() - x.double().mean(1, keepdim=True)  # keeps the sums small
+    frame = torch.arange(t, device=x.device)
+    norm = x.square().sum(-1)
+    s0, p0, p1 = norm.cumsum(1), x.cumsum(1), (x * frame[:, None]).cumsum(1)
+    own = 2 * (x * p0).sum(-1) - s0  # terms of keyframe i alone
+    inside = x.new_full((*x.shape[:2], gap + 1), torch.inf)
     for d in range(1, min(gap, t - 1) + 1):
         r = d if ramp is None else min(ramp, d)
         if d == r:  # from d = ramp on the ramp is the same
-            u = np.arange(1, r + 1) / r
-            ww, mixed, vv = (u**2).sum(), (u * (1 - u)).sum(), ((1 - u) ** 2).sum()
-            begin = np.maximum(frame - r, 0)
-            rising = (p1 - p1[begin] - begin[:, None] * (p0 - p0[begin])) / r  # sum of u x_s
+            u = torch.arange(1, r + 1) / torch.tensor(r, dtype=x.dtype)
+            ww, mixed, vv = (float(each.sum()) for each in (u**2, u * (1 - u), (1 - u) ** 2))
+            begin = (frame - r).clamp(min=0)
+            rising = (p1 - p1[:, begin] - begin[:, None] * (p0 - p0[:, begin])) / r  # sum of u x_s
             y = p0 - rising - mixed * x
-            ends = s0 - 2 * (x * rising).sum(axis=1) + ww * norm  # terms of keyframe j alone
+            ends = s0 - 2 * (x * rising).sum(-1) + ww * norm  # terms of keyframe j alone
         i, j = slice(0, t - d), slice(d, t)
-        inside[j, gap - d] = ends[j] + own[i] + (d - r + vv) * norm[i] - 2 * np.einsum("tc,tc->t", x[i], y[j])
-    before = s0 - 2 * (x * p0).sum(axis=1) + (frame + 1) * norm
-    after = s0[-1] - s0 - 2 * (x * (p0[-1] - p0)).sum(axis=1) + (t - 1 - frame) * norm
-    before[frame > gap] = np.inf
-    after[t - 1 - frame > gap] = np.inf
-    return np.maximum(before, 0), np.maximum(inside, 0), np.maximum(after, 0)
+        inside[:, j, d] = ends[:, j] + own[:, i] + (d - r + vv) * norm[:, i] - 2 * (x[:, i] * y[:, j]).sum(-1)
+    before = s0 - 2 * (x * p0).sum(-1) + (frame + 1) * norm
+    after = s0[:, -1:] - s0 - 2 * (x * (p0[:, -1:] - p0)).sum(-1) + (t - 1 - frame) * norm
+    before = before.masked_fill(frame > gap, torch.inf)
+    after = after.masked_fill(t - 1 - frame > gap, torch.inf)
+    return before.clamp(min=0), inside.clamp(min=0), after.clamp(min=0)
 
 
-def _cheapest(cost: Doubles, before: Doubles, inside: Doubles, after: Doubles) -> list[list[int]]:
-    """Return the keyframes of every group, last to first, from `cost` (G,) and `_stretches` of each group."""
-    groups, t, gap = inside.shape
-    best = before + cost[:, None]
-    parent = np.full((groups, t), -1)
-    every = np.arange(groups)
+def _cheapest(cost: float, before: Tensor, inside: Tensor, after: Tensor) -> list[list[int]]:
+    """Return the keyframes of every track, last to first, from the `cost` of one and `stretches`."""
+    best, band, ends = before.numpy() + cost, inside.numpy(), after.numpy()
+    tracks, t = best.shape
+    # parent: the keyframe before in the cheapest mask that has one at j; -1: j is the first.
+    parent, every = np.full((tracks, t), -1), np.arange(tracks)
     for j in range(1, t):
-        first = max(0, j - gap)
-        options = best[:, first:j] + inside[:, j, gap - (j - first) :]
+        first = max(0, j - band.shape[2] + 1)
+        options = best[:, first:j] + band[:, j, j - first : 0 : -1]
         i = options.argmin(axis=1)
         total = options[every, i] + cost
         better = total < best[:, j]
         best[better, j], parent[better, j] = total[better], first + i[better]
     chosen: list[list[int]] = []
-    for group, at in enumerate((best + after).argmin(axis=1).tolist()):
+    for track, at in enumerate((best + ends).argmin(axis=1).tolist()):
         chosen.append([])
         while at >= 0:
             chosen[-1].append(at)
-            at = int(parent[group, at])
+            at = int(parent[track, at])
     return chosen

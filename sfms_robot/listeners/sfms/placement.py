@@ -27,6 +27,7 @@ from sfms_robot.listeners.sfms.piecewise_linear import (
     Segments,
     best_frames,
     mask_cost,
+    nearest_keys,
     place_penalised,
     segments,
 )
@@ -96,7 +97,7 @@ def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
         own = centred[..., row > 0.5]  # (B, T, c)
         own = own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None]
         curves.append(_principal(own, most))
-        cost = segments(own.double() @ own.double().transpose(1, 2))
+        cost = segments(own)
         costs.append((cost.inside.float(), cost.before.float(), cost.after.float()))
     parts = [torch.stack(part, 1).flatten(0, 1) for part in zip(*costs, strict=True)]
     return Tracks(torch.stack(curves, 1).flatten(0, 1), Segments(*parts))
@@ -156,10 +157,8 @@ def stretch_errors(cost: Segments, chosen: Tensor) -> tuple[Tensor, Tensor]:
     The first is infinite where no frame is chosen yet.
     """
     t = chosen.shape[1]
-    frame = torch.arange(t, device=chosen.device).expand(chosen.shape)
-    key = chosen > 0.5
-    last = F.pad(torch.where(key, frame, -1).cummax(1).values[:, :-1], (1, 0), value=-1)  # strictly before
-    following = torch.where(key, frame, t).flip(1).cummin(1).values.flip(1)
+    last, following = nearest_keys(chosen)
+    last = F.pad(last[:, :-1], (1, 0), value=-1)  # strictly before
     following = F.pad(following[:, 1:], (0, 1), value=t)  # strictly after
     i, j = last.clamp(min=0), following.clamp(max=t - 1)
     left = torch.where(last >= 0, cost.inside.gather(1, i[:, None])[:, 0], cost.before)
@@ -241,8 +240,7 @@ def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int |
     mask = motion.new_zeros(b, t, len(k))
     for group, count in enumerate(k):  # one at a time: the tables of one group fit the processor's cache
         _check(count, t, max_gap)
-        own = motion[..., member[group] > 0.5].double()  # errors are small differences
-        cost = segments(own @ own.transpose(1, 2))
+        cost = segments(motion[..., member[group] > 0.5])
         frames = best_frames(cost if max_gap is None else cost.bounded(max_gap), count)
         mask[:, :, group] = mask[:, :, group].scatter(1, frames, 1.0)
     return mask

@@ -15,8 +15,6 @@ Shapes: B batch, P past frames, H future frames, G channel groups, D digits of a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -25,37 +23,13 @@ from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, sinusoidal
 from sfms_robot.listeners.sfms import draw
-from sfms_robot.listeners.sfms.draw import LastKeyframes
-from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
+from sfms_robot.listeners.sfms.draw import Context, LastKeyframes
+from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 
 AGE_SCALE_FRAMES = 4.0
 KERNEL_ROWS = 5  # of the convolution over rows of sound
-
-
-@dataclass(frozen=True, kw_only=True)
-class Context:
-    """Inputs of the predictor.
-
-    Attributes:
-        face: (B, P, C) speaker's standardised motion; arbitrary where not `face_known`.
-        face_known: (B, P) bool.
-        voice: (B, P, W) sound as `SpeakerEncoder.listen` returns it; arbitrary where not `heard`.
-        heard: (B, P) bool.
-        phase: (B, P, F) the speaker's place in a phrase; arbitrary where not `heard`; F = 0 without.
-        tokens: (B', P + H, G) the listener's own: past, the part of the future that is drawn already, UNDECIDED.
-            B' = B, or any number when B = 1: many answers to one speaker.
-        control: (B', P + H, K) events in each of those frames; K = 0 without.
-    """
-
-    face: Tensor
-    face_known: Tensor
-    voice: Tensor
-    heard: Tensor
-    phase: Tensor
-    tokens: Tensor
-    control: Tensor
 
 
 def last_keyframes(tokens: Tensor) -> LastKeyframes[Tensor]:
@@ -118,7 +92,7 @@ class SpeakerEncoder(nn.Module):
         y = F.linear(near.flatten(2), self.conv.weight.flatten(1), self.conv.bias)
         return F.gelu(y.view(y.shape[0], -1, self.rows, y.shape[-1]).amax(2))
 
-    def forward(self, c: Context) -> Tensor:
+    def forward(self, c: Context[Tensor]) -> Tensor:
         """Return (B, 2P, W): first the frames of the face, then those of the voice."""
         x = torch.where(c.face_known[..., None], self.face_in(c.face), self.no_face)
         voice = c.voice if self.phase_in is None else c.voice + self.phase_in(c.phase)
@@ -142,28 +116,22 @@ class Predictor(nn.Module):
         super().__init__()
         speaker = SpeakerEncoder(settings)  # first, as seeded weights were drawn so far
         width, heads, layers = settings.predictor_width, settings.heads, settings.predictor_layers
-        grid = as_levels([group.levels for group in settings.groups.values()])
-        sizes = grid.prod(-1).long()
-        groups, most = len(sizes), int(sizes.max())
-        every = torch.arange(most)[:, None] % sizes  # (V - 1, G)
-        table = torch.cat([torch.zeros(1, *grid.shape), indices_to_codes(every, grid)])
-        table = table.transpose(0, 1).contiguous()  # (G, V, D), 0 for none
+        grid = Grid([group.levels for group in settings.groups.values()])
+        self.classes = [1 + group.codes for group in settings.groups.values()]
+        groups, most = len(self.classes), max(self.classes)
+        table = F.pad(grid.table.view(groups, most - 1, grid.dims), (0, 0, 1, 0))  # (G, V, D), 0 for none
         if settings.quantizer == "fsq":
             self.codes = nn.Buffer(table, persistent=False)
         else:  # no grid says which codes are alike: that is learned
             self.codes = nn.Parameter(torch.randn_like(table) * 0.5)
-        # Row of `classify` for every class of every group, (G * V,); classes that a group lacks: the row behind all.
-        classes = sizes + 1
-        place = (classes.cumsum(0) - classes)[:, None] + torch.arange(most + 1)
-        place = torch.where(torch.arange(most + 1) < classes[:, None], place, int(classes.sum()))
-        self.place = nn.Buffer(place.flatten(), persistent=False)
-        self.first = nn.Buffer(torch.arange(groups)[:, None] * (most + 1), persistent=False)  # row of `codes`, (G, 1)
-        self.groups, self.future = groups, settings.future_frames
-        described = groups * (2 * grid.shape[1] + 2)
+        self.first = nn.Buffer(torch.arange(groups)[:, None] * most, persistent=False)  # row of `codes`, (G, 1)
+        self.future = settings.future_frames
+        described = groups * (2 * grid.dims + 2)
         self.speaker = speaker
         self.token_in = nn.Linear(described + groups, width)
         self.undecided = nn.Parameter(torch.randn(width) * 0.02)
         self.own = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        # Queries of the H future frames: the paper's parallel prediction of 8 frames (V-C).
         self.slots = nn.Parameter(torch.randn(self.future, width) * 0.02)
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)  # face, voice, own tokens
         self.phase_in = nn.Linear(FEATURES, width) if settings.phase else None
@@ -172,24 +140,26 @@ class Predictor(nn.Module):
         self.trail_in = nn.Linear(described, width) if settings.sequential else None
         self.chain = NormFeedForward(width) if settings.sequential else None
         self.norm = nn.LayerNorm(width)
-        self.classify = nn.Linear(width, int(classes.sum()))
+        self.classify = nn.Linear(width, sum(self.classes))
         self.control_in = (
             nn.Sequential(nn.Linear(len(COLUMNS), width), nn.GELU(), nn.Linear(width, width))
             if settings.events
             else None
         )
 
-    def forward(self, context: Context, recent: LastKeyframes[Tensor] | None = None) -> Tensor:
+    def forward(self, context: Context[Tensor], recent: LastKeyframes[Tensor] | None = None) -> Tensor:
         """Return (B, H, W): every future frame without knowledge of the keyframes drawn before it.
 
         `recent`: `last_keyframes` of the context's tokens, for a caller that has them.
         """
         c = context
+        # IV-C2: encoders of the speaker and of the listener, and one decoder that future frames query.
         speaker = self.speaker(c)
         own = self._own(c.tokens, last_keyframes(c.tokens) if recent is None else recent, c.control)
         # The place in the phrase at the newest frame also goes to every future frame directly.
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
         speaker = speaker.expand(own.shape[0], -1, -1)
+        # Ours: learned roles tell the decoder which modality a memory slot is of.
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
         memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B, 2P + P + H, W)
         x = self.slots + own[:, -self.future :]  # (B, H, W): queries of the future frames
@@ -201,6 +171,7 @@ class Predictor(nn.Module):
 
     def _own(self, tokens: Tensor, recent: LastKeyframes[Tensor], control: Tensor) -> Tensor:
         """Return (B, P + H, W) of tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K)."""
+        # A token is described by the last two keyframes of each group, not embedded alone: most frames are transitions.
         features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
         # Frames that are not drawn yet are one learned vector; their control rows tell them apart.
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
@@ -211,38 +182,38 @@ class Predictor(nn.Module):
             x = block(x)
         return x
 
-    def describe(self, recent: LastKeyframes[Tensor], frame: Tensor | int) -> Tensor:
+    def describe(self, recent: LastKeyframes[Tensor], frame: Tensor) -> Tensor:
         """Return (..., G * (2D + 2)): the codes of last keyframes (..., G, 2) and their ages at `frame`."""
         codes = F.embedding(recent.tokens + self.first, self.codes.flatten(0, 1))  # (..., G, 2, D)
         # Near keyframes differ by single frames, old ones hardly: ages on a logarithmic axis.
         ages = torch.log1p((frame - recent.at) / AGE_SCALE_FRAMES)
         return torch.cat([codes.flatten(-2), ages], dim=-1).flatten(-2)
 
-    def flat_logits(
-        self, slots: Tensor, recent: LastKeyframes[Tensor] | None = None, frame: Tensor | int = 0
-    ) -> Tensor:
+    def flat_logits(self, slots: Tensor, recent: LastKeyframes[Tensor], frame: Tensor) -> Tensor:
         """Return logits (..., all classes of all groups) of slots (..., W).
 
         `recent`: for a sequential predictor, last keyframes (..., G, 2) up to the frame before, which is `frame`.
         """
-        if self.trail_in is not None and self.chain is not None and recent is not None:
+        if self.trail_in is not None and self.chain is not None:
             slots = slots + self.trail_in(self.describe(recent, frame))
             slots = slots + self.chain(slots)
         out: Tensor = self.classify(self.norm(slots))
         return out
 
-    def teacher_forced(self, context: Context, target: Tensor) -> Tensor:
+    def teacher_forced(self, context: Context[Tensor], target: Tensor) -> Tensor:
         """Return logits (B, H, G, V) of all future frames; a sequential predictor sees the true ones before each.
 
         `target`: the true tokens (B, H, G). V are the most classes of a group, -inf for those that a group lacks.
         """
         tokens = torch.cat([context.tokens[:, : -self.future], target], dim=1)
-        # The last keyframes up to the frame before each future frame: frames P - 1 to P + H - 2.
+        # Ours, `sequential`: the last keyframes up to the frame before each future one, frames P - 1 to P + H - 2. It
+        # makes (11) autoregressive within the window too; the transformers still run once.
         before = slice(-self.future - 1, -1)
         recent = LastKeyframes(*(part[:, before] for part in last_keyframes(tokens)))
         slots = self(context)
-        logits = F.pad(self.flat_logits(slots, recent, _frames(tokens)[:, before]), (0, 1), value=-torch.inf)
-        return logits.index_select(-1, self.place).view(*slots.shape[:-1], self.groups, -1)
+        parts = torch.split(self.flat_logits(slots, recent, _frames(tokens)[:, before]), self.classes, dim=-1)
+        most = max(self.classes)
+        return torch.stack([F.pad(part, (0, most - part.shape[-1]), value=-torch.inf) for part in parts], dim=-2)
 
 
 def _frames(tokens: Tensor) -> Tensor:

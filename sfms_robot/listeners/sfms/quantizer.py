@@ -30,6 +30,7 @@ def as_levels(levels: Sequence[Sequence[int]]) -> Tensor:
 
 def quantize(latent: Tensor, levels: Tensor) -> Tensor:
     """Return the nearest grid point of tanh(latent), (..., G, D) in -1..1; the gradient skips the rounding."""
+    # FSQ, section 3.1: bound, then round. Ours: tanh straight to -1..1, and an even number of levels needs no offset.
     bounded = torch.tanh(latent)  # -1..1
     position = (bounded + 1) / 2 * (levels - 1)  # 0..L - 1
     code = torch.round(position) / (levels - 1) * 2 - 1
@@ -115,6 +116,7 @@ class Codebook(nn.Module):
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
         """Return ||sg[z_q] - E(z)||^2 of equation (13) at keyframes; `learn` minimises ||sg[E(z)] - z_q||^2."""
+        # sg stops gradients: only the encoder moves toward its vectors here.
         away = (latent - self.codes(self.indices(latent)).detach()).square().mean(-1)
         return (away * mask).sum() / mask.sum().clamp(min=1.0)
 
@@ -127,6 +129,7 @@ class Codebook(nn.Module):
             mask: (B, T, G); only keyframes are learned from (IV-B4).
             generator: draws, on the CPU, the keyframes at which idle vectors start again.
         """
+        # The term ||sg[E(z)] - z_q||^2 of equation (13), minimised exactly: each vector is a running mean.
         groups, most = self.counts.shape
         key = (mask > 0.5).flatten(0, 1)  # (N, G)
         flat = latent.float().flatten(0, 1)
@@ -203,6 +206,7 @@ class Quantizer(nn.Module):
 
     def latent(self, motion: Tensor) -> Tensor:
         """Return (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""
+        # E of equation (3), of every frame: which of them are keyframes is decided apart.
         out: Tensor = self.encoder(motion[..., self.slots] * self.filled)
         return out
 
@@ -217,11 +221,3 @@ class Quantizer(nn.Module):
     def by_channel(self, slots: Tensor) -> Tensor:
         """Return the output of `decoder`, (..., G, slots of a group), in the order of channels (..., C)."""
         return slots.flatten(-2).index_select(-1, self.place) * self.drawn
-
-    def indices(self, codes: Tensor) -> Tensor:
-        """Return the indices (..., G), from 0, of codes (..., G, D)."""
-        return self.codebook.indices(codes)
-
-    def codes(self, indices: Tensor) -> Tensor:
-        """Return the codes (..., G, D) of indices (..., G)."""
-        return self.codebook.codes(indices)

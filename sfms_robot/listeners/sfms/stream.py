@@ -11,9 +11,9 @@ Between plans nothing is computed: frames are kept, and become features with the
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -32,17 +32,16 @@ from sfms_robot.frames import (
     changed,
 )
 from sfms_robot.listeners.audio_frontend import AudioFrontend, AudioState, check_length
-from sfms_robot.listeners.engine import Engine, Examples, RunsOnEngine, stacked
+from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HEAD, HeadSway
 from sfms_robot.listeners.sfms.draw import (
     UNDECIDED,
     CodeReach,
+    Context,
     EventCourse,
-    PlanInputs,
     Sampler,
     Tokens,
     around,
-    last_keyframes,
     later,
     neutral_mask,
     passed,
@@ -62,7 +61,7 @@ class SpeakerState:
         sounds, faces: of every frame since: its samples, and its motion (58,), NaN where no face is known.
         audio: state of unfinished features.
         rows: (R, bins) sound of the newest of the P frames, standardised.
-        voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.PlanInputs`.
+        voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.Context`.
     """
 
     sounds: tuple[Floats, ...] = ()
@@ -102,30 +101,45 @@ class SfmsMemory:
 class SfmsListener(RunsOnEngine):
     """SFMS as a stream; its engine runs `model.networks`."""
 
-    def __init__(
-        self,
-        settings: config.Sfms,
-        engine: Engine,
-        space: MotionSpace | None = None,
-        frontend: AudioFrontend | None = None,
-    ) -> None:
+    def __init__(self, settings: config.Sfms, engine: Engine, folder: Path | None = None) -> None:
+        """Take what the settings name (a matrix, a model of sound) from the listener's `folder`.
+
+        Raises ConfigError or ModelError.
+        """
         self.settings = settings
         self.engine = engine
-        self.space = space or MotionSpace.of(settings)
-        self.frontend = frontend or AudioFrontend.of(settings)
+        self.space = MotionSpace.of(settings, folder)
+        self.frontend = AudioFrontend.of(settings, folder)
         self._scales = engine.tensors
         self.sway = HeadSway(settings, engine.tensors)
+        # Smoothing is of the head alone: its codes are coarse, and corners of its path make servos audible.
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self._columns = len(COLUMNS) if settings.events else 0
+        self.hop, self.horizon = settings.hop_frames, settings.future_frames
+        self.hops = range(1, self.horizon + 1) if settings.hop == "auto" else (self.hop,)
+        if settings.events:
+            self.control_frames = (settings.past_frames, self.horizon)
         # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
+        # A stream begins with a still, neutral face: the paper trains with a neutral sequence before each clip (IV-C).
         mask = neutral_mask(settings.past_frames, len(settings.groups))
         neutral, (codes,) = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
         self._neutral = neutral[0]
         groups = settings.groups.values()
         own = [[settings.channels.index(name) for name in group.channels] for group in groups]
+        # Ours: each group of channels has its own codebook; the paper has one code per frame.
         sizes, bounded = [group.codes for group in groups], settings.sampling.reach
+        p = settings.past_frames
+        self._unheard = SpeakerState(
+            audio=self.frontend.start(),
+            rows=np.zeros(self.frontend.shape, np.float32),
+            voice=np.zeros((p, settings.predictor_width), np.float32),
+            heard=np.zeros(p, np.bool_),
+            phase=np.zeros((p, self.frontend.phase_features), np.float32),
+            face=np.zeros((p, self.space.dim), np.float32),
+            face_known=np.zeros(p, np.bool_),
+        )
         reach = CodeReach(codes, own, sizes, self._scales["motion_speed"], bounded)
         self.sampler = Sampler(settings, engine, reach, self._courses(codes))
 
@@ -148,88 +162,46 @@ class SfmsListener(RunsOnEngine):
             courses.append(EventCourse(how, list(self.settings.groups).index(group), values))
         return courses
 
-    @property
-    def hop(self) -> int:
-        """Return the frames from one plan to the next."""
-        return self.settings.hop_frames
-
-    @property
-    def hops(self) -> Sequence[int]:
-        """Return the hops that `at_hop` takes."""
-        return range(1, self.horizon + 1) if self.settings.hop == "auto" else (self.hop,)
-
-    def at_hop(self, hop: int) -> SfmsListener:
-        """Return a listener of the same weights that plans every `hop` frames."""
-        other = copy.copy(self)
-        other.settings = self.settings.model_copy(update={"hop": hop})
-        return other
-
-    @property
-    def horizon(self) -> int:
-        """Return the frames of a plan."""
-        return self.settings.future_frames
-
-    @property
-    def control_frames(self) -> tuple[int, int]:
-        """Return how many control rows `step` takes, up to the newest frame and after it; (0, 0) without events."""
-        return (self.settings.past_frames, self.horizon) if self._columns else (0, 0)
-
     def start(self, seed: int) -> SfmsMemory:
         """Return the memory of a stream without sound so far and with a neutral face."""
-        p = self.settings.past_frames
-        speaker = SpeakerState(
-            audio=self.frontend.start(),
-            rows=np.zeros(self.frontend.shape, np.float32),
-            voice=np.zeros((p, self.settings.predictor_width), np.float32),
-            heard=np.zeros(p, np.bool_),
-            phase=np.zeros((p, self.frontend.phase_features), np.float32),
-            face=np.zeros((p, self.space.dim), np.float32),
-            face_known=np.zeros(p, np.bool_),
-        )
         tokens, path = self.at_rest()
         control = np.zeros((len(tokens), self._columns), np.float32)
-        sway = self.sway.start(seed)
-        return SfmsMemory(seed=seed, frames=0, speaker=speaker, tokens=tokens, control=control, path=path, sway=sway)
+        return SfmsMemory(
+            seed=seed,
+            frames=0,
+            speaker=self._unheard,
+            tokens=tokens,
+            control=control,
+            path=path,
+            sway=self.sway.start(seed),
+        )
 
     def at_rest(self) -> tuple[Tokens, Floats]:
         """Return tokens (P + H, G) and path (2 + H, C) of a neutral face that has no plan yet."""
         undecided = np.full((self.horizon, self._neutral.shape[1]), UNDECIDED)
         return np.concatenate([self._neutral, undecided]), self._still(2 + self.horizon)
 
-    def examples(self, streams: int) -> Examples:
-        """Return inputs of every network for this many streams, as at their beginning."""
-        p, start = self.settings.past_frames, [self.start(seed) for seed in range(streams)]
-        tokens, control = (np.stack([getattr(memory, name) for memory in start]) for name in ("tokens", "control"))
-        parts = ("face", "face_known", "voice", "heard", "phase")
-        speaker = {name: np.stack([getattr(memory.speaker, name) for memory in start]) for name in parts}
-        recent = last_keyframes(tokens)
-        last, at = recent.tokens, recent.at
-        now = {"last": last[:, p - 1], "at": at[:, p - 1], "frame": np.full(streams, p - 1)}
-        return {
-            "rest": {"still": self._still(p)[None], "mask": neutral_mask(p, tokens.shape[2])[None]},
-            "hear": {"rows": np.stack([np.tile(memory.speaker.rows, (2, 1)) for memory in start])},
-            "ahead": speaker | {"tokens": tokens, "control": control, "last": last, "at": at},
-            "next": {"slots": speaker["voice"][:, 0], **now},
-            "decode": dict(
-                zip(("tokens", "before", "after", "rows", "seen", "places"), (tokens, *around(tokens)), strict=True)
-            ),
-        }
-
     def is_due(self, memory: SfmsMemory) -> bool:
         """Return whether the next frame brings a plan."""
         return memory.frames % self.hop == 0
 
-    def _stepped(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[SfmsMemory], controls: Sequence[Floats | None] | None
+    def step_each(
+        self,
+        speakers: Sequence[SpeakerFrame],
+        memories: Sequence[SfmsMemory],
+        controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together."""
-        heard = [_listened(speaker, memory.speaker) for speaker, memory in zip(speakers, memories, strict=False)]
-        if len(speakers) < len(memories):
-            speakers, heard = [*speakers] * len(memories), heard * len(memories)
-        found: list[tuple[Plan | None, SfmsMemory]] = [
-            (None, changed(memory, frames=memory.frames + 1, speaker=speaker))
-            for memory, speaker in zip(memories, heard, strict=True)
-        ]
+        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together.
+
+        Streams that began together with the same speaker share its state, so its features are computed once.
+        """
+        heard: dict[tuple[int, int], SpeakerState] = {}
+        found: list[tuple[Plan | None, SfmsMemory]] = []
+        for speaker, memory in zip(speakers, memories, strict=True):
+            same = id(speaker), id(memory.speaker)
+            if same not in heard:
+                heard[same] = _listened(speaker, memory.speaker)
+            found.append((None, changed(memory, frames=memory.frames + 1, speaker=heard[same])))
         due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
             control = self.told([None if controls is None else controls[row] for row in due])
@@ -258,8 +230,8 @@ class SfmsListener(RunsOnEngine):
         speakers, seen = self._taken_in([memory.speaker for memory in memories])
         newest = [memory.frames - 1 for memory in memories]
         # 4. Undecided tokens are drawn and decoded.
-        inputs = PlanInputs(**seen, tokens=tokens, control=control, settled=settled)
-        tokens, path = self.plan(inputs, way, [memory.seed for memory in memories], newest)
+        inputs = Context(**seen, tokens=tokens, control=control)
+        tokens, path = self.plan(inputs, settled, way, [memory.seed for memory in memories], newest)
         # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
         sway = stacked([memory.sway for memory in memories])
         motion, jaw_rad = self.space.decode(
@@ -312,17 +284,18 @@ class SfmsListener(RunsOnEngine):
         return np.asarray(own + self._smoothing * ((before + after) / 2 - own))
 
     def plan(
-        self, seen: PlanInputs, path: Floats, seeds: Sequence[int], newest: Sequence[int]
+        self, seen: Context[Any], settled: Tokens, path: Floats, seeds: Sequence[int], newest: Sequence[int]
     ) -> tuple[Tokens, Floats]:
         """Return the tokens (B, P + H, G) and path (B, 2 + H, C) of a new plan of B streams.
 
         Args:
-            seen: inputs of the plan.
+            seen, settled: as of `Sampler.draw`.
             path: (B, 2 + H, C) the old plan, as played so far.
             seeds: of each stream.
             newest: number of the newest frame of each stream, from 0 at its beginning.
         """
-        tokens = self.sampler.draw(seen, seeds, [frame + self.horizon for frame in newest])
+        # Equation (11): the tokens of the undecided frames; then equations (9) and (10): tokens become motion.
+        tokens = self.sampler.draw(seen, settled, seeds, [frame + self.horizon for frame in newest])
         (decoded,) = self.engine.run("decode", tokens, *around(tokens))
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
@@ -339,7 +312,7 @@ class SfmsListener(RunsOnEngine):
         return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
 
     def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, Any]]:
-        """Return states whose frames since the last plan are among their P, and the speaker's part of `PlanInputs`.
+        """Return states whose frames since the last plan are among their P, and the speaker's part of `Context`.
 
         Where all streams have the same speaker, that part is of one stream.
         """
@@ -351,6 +324,7 @@ class SfmsListener(RunsOnEngine):
         rows, phase, audio = self.frontend.step_each(
             [state.sounds for state in states], [state.audio for state in states]
         )
+        # Features of all new frames of all streams, one stream behind the other.
         heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
         # A frame without sound is 0, the mean of the data, not silence.
         rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
@@ -365,8 +339,15 @@ class SfmsListener(RunsOnEngine):
             "heard": heard,
             "phase": phase,
         }
+        # Each queue of P frames loses its oldest and gains the new ones.
         found: dict[str, Any] = {
-            name: _pushed([getattr(state, name) for state in states], part, counts) for name, part in new.items()
+            name: np.stack(
+                [
+                    np.concatenate([queue := getattr(state, name), own])[-len(queue) :]
+                    for state, own in zip(states, np.split(part, ends[:-1]), strict=True)
+                ]
+            )
+            for name, part in new.items()
         }
         after = [
             SpeakerState(audio=sound, rows=rows[end - 1], **{name: part[row] for name, part in found.items()})
@@ -378,6 +359,7 @@ class SfmsListener(RunsOnEngine):
         """Return standardised motion (N, C) and which faces are known, of motion (58,) of N frames, NaN where not."""
         rows = stacked(motion)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(rows).all(axis=1))
+        # A face that is not known is 0, the mean of the data; `face_known` marks it for the encoder.
         faces = np.zeros((len(rows), self.space.dim), np.float32)
         if known.any():
             faces[known] = self.standardise(self.space.encode(rows[known]))
@@ -388,21 +370,9 @@ def _listened(speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
     """Return the state with a new frame. Raises ValueError for another number of samples than a frame has, or none."""
     check_length(speaker.audio)
     face = _NO_FACE if speaker.face is None else speaker.face.motion
+    # Nothing is computed until the next plan (see the module).
     sound = np.array(speaker.audio, np.float32)  # a copy: the caller may use the array again
     return changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
-
-
-def _pushed(queues: Sequence[NDArray[Any]], new: NDArray[Any], counts: Sequence[int]) -> NDArray[Any]:
-    """Return N queues (P, ...) as (N, P, ...), each without its oldest and with its `counts` rows of `new`."""
-    longest = len(queues[0])
-    out = np.empty((len(queues), *queues[0].shape), queues[0].dtype)
-    end = 0
-    for row, (queue, count) in enumerate(zip(queues, counts, strict=True)):
-        end += count
-        kept = max(longest - count, 0)  # more frames than P: only the newest P of them
-        out[row, :kept] = queue[longest - kept :]
-        out[row, kept:] = new[end - (longest - kept) : end]
-    return out
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
@@ -417,6 +387,7 @@ def join(tail: Floats, decoded: Floats, seam: int) -> Floats:
         (..., 2 + H, C): `tail`, then `decoded` plus a cubic that begins with the difference in place and speed and
         ends flat: with u = frame / seam, offset (1 - u)^2 (1 + 2u) + speed seam u (1 - u)^2.
     """
+    # Ours: the paper's windows end where the next begin; here each plan corrects the one before.
     gap = tail - decoded[..., :2, :]
     before, offset = gap[..., :1, :], gap[..., 1:, :]
     speed = offset - before

@@ -23,10 +23,10 @@ LISTENERS = data_dir("configs") / "listeners"
 def test_a_listener_with_graphs_runs_on_both_engines(tmp_path):
     folder = LISTENERS / "sfms-small"
     assert engines_of(folder, tmp_path) == {
-        "eager": (folder, "torch"), "torch": (folder, "torch"), "onnx": (folder, "onnx"),
+        "eager": (folder, "torch"), "onnx": (folder, "onnx"),
     }  # fmt: skip
     bare = shutil.copytree(folder, tmp_path / "bare", ignore=shutil.ignore_patterns("onnx"))
-    assert [*engines_of(bare, tmp_path)] == ["eager", "torch"]
+    assert [*engines_of(bare, tmp_path)] == ["eager"]
 
 
 def test_another_precision_is_another_folder_with_the_same_weights(tmp_path):
@@ -60,4 +60,4 @@ def test_a_listener_process_says_when_it_plans_and_what_memory_it_takes():
 
 
 def _both():
-    return {engine: load_listener("sfms-small", graphs=False, engine=engine) for engine in ("onnx", "torch")}
+    return {engine: load_listener("sfms-small", engine=engine) for engine in ("onnx", "torch")}

@@ -112,7 +112,7 @@ def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
 def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
     when = EventModel.load()
     _, heard = sensed(speaker[:6000])
-    memory, every = when.start(7).decided, []
+    memory, every = when.start(7), []
     for index, row in enumerate(heard):
         ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
@@ -124,7 +124,7 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
 def test_the_same_at_other_rates(speaker, asked):
     when = EventModel.load()
     _, heard = sensed(speaker[:4000], asked)
-    memory, every = when.start(3, asked).decided, []
+    memory, every = when.start(3, asked), []
     for index, row in enumerate(heard):
         ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events

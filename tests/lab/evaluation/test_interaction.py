@@ -10,9 +10,9 @@ from sfms_robot.lab.evaluation import arig_tables as tables
 from sfms_robot.lab.evaluation import interaction as scores
 from sfms_robot.lab.evaluation.metrics import centres_of
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout
-from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.listeners.torch_engine import torch_engine
 
 JAW = CHANNEL_INDEX["jawOpen"]
 
@@ -129,7 +129,7 @@ def test_the_agents_sound_comes_one_frame_early():
 def test_what_is_played_has_a_frame_and_a_state_for_every_frame():
     listener = settings().listener
     one = dyad("a", "interaction", 0)
-    played = rollout(ArigListener(listener, torch_engine(listener, ArigModel(listener))), frames_of_dyad(one), [1])
+    played = rollout(ArigListener(listener, torch_engine(ArigModel(listener))), frames_of_dyad(one), [1])
     assert played.motion[0].shape == one.listener.shape and np.isfinite(played.motion).all()
     assert played.states[0, 0] == -1 and (played.states[0, 1:] >= 0).all()
 

@@ -13,9 +13,9 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, keyframe_scores
-from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.torch_engine import torch_engine
 
 OFF = {"steps": 1, "batch": 1, "learning_rate": 1, "neutral_prefix": 0, "drop_audio": 0, "drop_face": 0}
 
@@ -32,7 +32,7 @@ def listener(**changes) -> SfmsListener:
     settings = config.parse(config.Sfms, raw | changes, "tiny")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
+        return SfmsListener(settings, torch_engine(SfmsModel(settings)))
 
 
 def dyad(frames: int = 60) -> Dyad:

@@ -15,9 +15,9 @@ from sfms_robot.lab.evaluation.listener_evaluation import collect, shared_space,
 from sfms_robot.lab.evaluation.listener_tables import Clips, heuristics, table
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
-from sfms_robot.listeners.sfms import torch_engine
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.torch_engine import torch_engine
 
 COLUMNS = {
     1: ("L2", "FD", "Var", "SI", "P-FD", "RPCC"),
@@ -42,7 +42,7 @@ def listener(space: str = "arkit58", **changes) -> SfmsListener:
     settings = config.parse(config.Sfms, raw | changes, "tiny")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SfmsListener(settings, torch_engine(settings, SfmsModel(settings)))
+        return SfmsListener(settings, torch_engine(SfmsModel(settings)))
 
 
 def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> Dyad:

@@ -322,9 +322,8 @@ class Metronome:
 class Choir(Metronome):
     """The same, all streams at once."""
 
-    def step_many(self, speaker, memories):
-        steps = [self.step(speaker, memory) for memory in memories]
-        return [plan for plan, _ in steps if plan is not None], [memory for _, memory in steps]
+    def step_each(self, speakers, memories):
+        return [self.step(*each) for each in zip(speakers, memories, strict=True)]
 
 
 def test_streams_one_by_one_and_side_by_side_are_rolled_out_alike():

@@ -75,7 +75,7 @@ def test_a_scene_without_a_microphone_hears_with_its_eyes(speaker):
 def test_hazards_are_those_asked_frame_by_frame(rows, history, calmness):
     model = EventModel.load()
     found = hazards_in(model, np.stack([one.heard for one in rows]), history, calmness)
-    memory = model.start(0, calmness).decided
+    memory = model.start(0, calmness)
     for index, one in enumerate(rows):
         ((decision, memory),) = model.decide_each([one], [memory], [history])
         for kind, hazard_hz in decision.hazards_hz.items():
@@ -101,4 +101,4 @@ def test_nothing_is_asked_of_nothing():
         found = hazards_in(model, np.full((frames, len(HEARD)), np.nan), [], Calmness())
         assert {len(values) for values in found.values()} == {frames}
         blind = Sensed(0, np.full(len(HEARD), np.nan))
-        assert not model.decide_each([blind], [model.start(0).decided])[0][0].events
+        assert not model.decide_each([blind], [model.start(0)])[0][0].events

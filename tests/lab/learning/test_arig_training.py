@@ -34,11 +34,12 @@ from sfms_robot.lab.learning.arig.losses import (
 )
 from sfms_robot.lab.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.lab.learning.job import Run
-from sfms_robot.listeners import arig, audio_frontend, checkpoint
+from sfms_robot.listeners import audio_frontend, checkpoint
 from sfms_robot.listeners.arig.event_curves import features
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import FIRST, NODDING
 from sfms_robot.listeners.audio_frontend import MEL_WIDTH, hear_each
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB
 
@@ -79,7 +80,7 @@ def quiet(**changes) -> config.ArigPhase:
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
     figures = train_arig(settings(listener=changes, steps=4), data, tmp_path)
     assert figures["steps"] == 4 and np.isfinite(figures["held_out_noise"])
-    listener = arig.load(tmp_path)
+    listener = load_folder(tmp_path)
     silence = np.zeros(FRAME_SAMPLES, np.float32)
     plan, _ = listener.step(SpeakerFrame(0.04, silence, None, silence), listener.start(1))
     assert plan.frames.shape == (1, 58) and np.isfinite(plan.frames).all()

@@ -27,7 +27,7 @@ from sfms_robot.lab.learning.sfms.features import (
 )
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, starts_with_events
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import batches
-from sfms_robot.listeners import sfms
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS, control_track
@@ -223,7 +223,7 @@ def test_both_phases_learn_to_nod_when_they_are_told(tmp_path):
     predictor_trainer.train_listener(chosen, tmp_path / "data", tmp_path / "out")
     calibrate(chosen, tmp_path / "data", tmp_path / "out")
     unseen = dyad("c", seed=2)
-    listener = sfms.load(tmp_path / "out")
+    listener = load_folder(tmp_path / "out")
     (told,) = rollouts(listener, [unseen], seed=1)
     (quiet,) = rollouts(listener, [replace(unseen, events=())], seed=1)
     people = unseen.listener[:, 1]

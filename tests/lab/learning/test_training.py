@@ -21,8 +21,9 @@ from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather, place_all
-from sfms_robot.listeners import checkpoint, sfms
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.draw import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
@@ -79,7 +80,7 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     assert (first["steps"], second["steps"]) == (30, 20)
     calibrate(chosen, data, tmp_path)
     unseen = dyad("c", 160, seed=2)
-    (one,) = rollouts(sfms.load(tmp_path), [unseen], seed=1)
+    (one,) = rollouts(load_folder(tmp_path), [unseen], seed=1)
     assert one.motion.shape == (1, 160, 58) and np.isfinite(one.motion).all()
     own, people = behaviour([one.motion[0]], [unseen]), behaviour([unseen.listener], [unseen])
     assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0

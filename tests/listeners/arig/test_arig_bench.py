@@ -7,8 +7,6 @@ from sfms_robot.lab.bench import listener_bench as bench
 from sfms_robot.lab.bench.listener_bench import TURN_HOPS, WAYS, Stream, in_run, samplers, take_turns
 from sfms_robot.listeners import checkpoint
 
-MIDDLE = {"width": 256, "feedforward": 512, "heads": 4, "context_chunks": 8}
-
 
 def test_every_way_of_sampling_is_judged():
     lost = samplers(arig_listener(diffusion={"width": 10, "train_steps": 60}), talk(4))
@@ -17,9 +15,9 @@ def test_every_way_of_sampling_is_judged():
     assert samplers(arig_listener(discrete=True), talk(4)) == {}
 
 
-def test_the_fast_path_is_compared_frame_by_frame():
-    one = arig_listener(**MIDDLE, precision="fp32")
-    other = arig_listener(**MIDDLE, precision="int8")
+def test_listeners_are_compared_frame_by_frame():
+    one, other = arig_listener(), arig_listener()
+    other.model.bfloat16().float()
     for listener in (one, other):
         listener.model.motion_mean.fill_(0.5)
         listener.model.motion_std.fill_(0.02)

@@ -7,8 +7,8 @@ from sfms_robot.config.listener import parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.arig import load
 from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.registry import load_folder
 
 LISTENERS = data_dir("configs") / "listeners"
 
@@ -51,16 +51,6 @@ def test_the_small_one_fits_in_12_megabytes(tmp_path):
     assert (tmp_path / "model.safetensors").stat().st_size < 12e6
 
 
-def test_a_folder_is_loaded_again_as_it_was_saved(tmp_path):
-    settings = config.parse(config.Arig, RAW, "x")
-    checkpoint.save_config(tmp_path, settings)
-    model = ArigModel(settings)
-    checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, model)
-    loaded = load(tmp_path)
-    assert loaded.settings == settings
-    assert all((loaded.model.state_dict()[name] == value).all() for name, value in model.state_dict().items())
-
-
 @pytest.mark.parametrize(("bits", "most"), [(16, 0.01), (8, 0.05)])
 def test_weights_in_fewer_bits_make_a_frame_that_differs_by_little_of_its_spread(bits, most, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "LARGE", 64)  # this one's matrices are small
@@ -69,7 +59,7 @@ def test_weights_in_fewer_bits_make_a_frame_that_differs_by_little_of_its_spread
     exact.model.motion_std.fill_(0.02)
     checkpoint.save_config(tmp_path, exact.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, exact.model, bits)
-    shorter, memory, frames = load(tmp_path), exact.start(1), []
+    shorter, memory, frames = load_folder(tmp_path), exact.start(1), []
     for frame in talk(40):
         other, _ = shorter.step(frame, memory)
         plan, memory = exact.step(frame, memory)

@@ -120,21 +120,6 @@ def test_the_answer_of_a_stream_is_its_own_previous_state(tiny):
     torch.testing.assert_close(told.z, rolled.z)
 
 
-@pytest.mark.parametrize(
-    ("field", "shape"),
-    [("user_sound", (2, 14, 5)), ("agent_motion", (2, 14, 56)), ("voiced", (2, 14)), ("user_seen", (2, 13))],
-)
-def test_shapes_that_do_not_fit_are_refused_by_name(tiny, field: str, shape):
-    dyad = dataclasses.replace(random_dyad(tiny), **{field: torch.zeros(shape)})
-    with pytest.raises(ValueError, match=field if field != "agent_motion" else "user_motion|agent_motion"):
-        tiny.condition(dyad)
-
-
-def test_one_frame_is_no_dyad(tiny):
-    with pytest.raises(ValueError, match="two frames or more, got 1"):
-        tiny.condition(random_dyad(tiny, frames=1))
-
-
 def test_without_phase_it_hears_the_sound_alone():
     model = arig_model(phase=False)
     sound, heard, absent = torch.randn(3, model.sound_width), torch.ones(3, dtype=torch.bool), torch.zeros(16)

@@ -3,19 +3,16 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from tiny_arig import arig_listener, arig_model, dyad_of, generate, noise_of, streamed, talk
+from tiny_arig import arig_listener, arig_model, dyad_of, generate, noise_of, soft, streamed, talk
 
 from sfms_robot import config
-from sfms_robot.config.listener import STATES
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
-from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import ArigListener
+from sfms_robot.listeners.torch_engine import torch_engine
 
 ABLATIONS = [
     {},
@@ -31,14 +28,6 @@ ABLATIONS = [
 @pytest.fixture(scope="module")
 def tiny() -> ArigListener:
     return arig_listener()
-
-
-def soft(listener: ArigListener) -> ArigListener:
-    """Whose motion is small: what it shows is what it made, nothing is clipped to a blendshape's 0..1."""
-    with torch.no_grad():
-        listener.model.motion_std.fill_(0.02)
-        listener.model.motion_mean.fill_(0.5)
-    return listener
 
 
 def assert_stream_is_offline(listener: ArigListener, frames: int, atol: float) -> None:
@@ -61,7 +50,7 @@ def shipped(name: str, **changes) -> ArigListener:
     settings = settings.model_copy(update={"events": False, "draws": "motion", **changes})
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return ArigListener(settings, torch_engine(settings, ArigModel(settings)))
+        return ArigListener(settings, torch_engine(ArigModel(settings)))
 
 
 SHIPPED = ["arig-small", pytest.param("arig-paper", marks=pytest.mark.slow)]
@@ -78,11 +67,6 @@ def assert_causal(listener: ArigListener, changed_from: int, frames: int = 26) -
     before, after = streamed(listener, speaker), streamed(listener, other)
     np.testing.assert_array_equal(before[:changed_from], after[:changed_from])
     assert not np.array_equal(before[changed_from:], after[changed_from:])
-
-
-@pytest.mark.parametrize("changed_from", [1, 8, 22])
-def test_later_frames_never_change_earlier_plans(tiny, changed_from: int):
-    assert_causal(tiny, changed_from)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -108,64 +92,10 @@ def test_memory_takes_the_same_room_at_every_step(tiny):
     assert room[0] > 0 and set(room.values()) == {room[0]}
 
 
-def test_memory_is_not_changed(tiny):
-    speaker = talk(13)
-    memory = tiny.start(1)
-    for frame in speaker[:12]:
-        _, memory = tiny.step(frame, memory)
-    arrays = {n: v for n, v in vars(memory).items() if isinstance(v, np.ndarray)}
-    copies = {name: value.copy() for name, value in arrays.items()}
-    first, _ = tiny.step(speaker[12], memory)
-    second, _ = tiny.step(speaker[12], memory)
-    np.testing.assert_array_equal(first.frames, second.frames)
-    assert all(np.array_equal(arrays[name], copy) for name, copy in copies.items())
-
-
-def test_a_plan_is_one_frame_ahead_in_our_units(tiny):
-    memory = tiny.start(1)
-    for frame in talk(8):
-        plan, memory = tiny.step(frame, memory)
-        assert plan.frames.shape == (1, 58) and plan.frames.dtype == np.float32
-        assert plan.made_at_s == frame.time_s
-        np.testing.assert_allclose(plan.times_s, [frame.time_s + FRAME_S])
-        assert 0 <= plan.frames[:, 6:].min() and plan.frames[:, 6:].max() <= 1
-    assert (tiny.hop, tiny.horizon) == (1, 1)
-    assert 0 <= memory.state < len(STATES)
-
-
-def test_one_seed_repeats_and_two_differ(tiny):
-    speaker = talk(12)
-    one, again, other = (streamed(tiny, speaker, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, again)
-    assert not np.array_equal(one, other)
-
-
-def test_two_streams_of_one_listener_do_not_meet(tiny):
-    a, b = talk(12), talk(12, seed=5)
-    memory_a, memory_b, woven = tiny.start(1), tiny.start(2), []
-    for of_a, of_b in zip(a, b, strict=True):
-        plan, memory_a = tiny.step(of_a, memory_a)
-        _, memory_b = tiny.step(of_b, memory_b)
-        woven.append(plan.frames[0])
-    np.testing.assert_array_equal(woven, streamed(tiny, a, 1))
-
-
 @pytest.mark.parametrize("space", ["faceverse58", "deca56"])
 def test_every_motion_space_is_streamed(space: str):
     out = streamed(arig_listener(motion_space=space), talk(8))
     assert out.shape == (8, 58) and np.isfinite(out).all()
-
-
-@given(has=st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=12))
-def test_any_mix_of_missing_modalities_is_normal(tiny, has):
-    speaker = []
-    for index, (face, audio, agent) in enumerate(has):
-        whole = talk(index + 1)[-1]
-        sound = whole.audio if audio else whole.audio[:0]
-        speaker.append(
-            SpeakerFrame(whole.time_s, sound, whole.face if face else None, whole.agent_audio if agent else None)
-        )
-    assert np.isfinite(streamed(tiny, speaker)).all()
 
 
 @pytest.mark.parametrize("part", ["face", "audio", "agent_audio"])
@@ -197,11 +127,6 @@ def test_what_is_beyond_all_faces_is_not_seen_and_loudness_without_measure_is_li
         assert np.isfinite(streamed(tiny, loud[:3] + speaker)).all()
 
 
-def test_frames_of_another_length_are_refused(tiny):
-    with pytest.raises(ValueError, match="640 samples or none, got 100"):
-        tiny.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), tiny.start(1))
-
-
 def test_silence_leaves_the_face_where_it_may_be():
     """Whatever the weights say: standardised motion stays inside the range that was set."""
     listener = arig_listener()
@@ -222,4 +147,4 @@ def test_silence_leaves_the_face_where_it_may_be():
 def test_features_that_nothing_here_computes_cannot_be_run():
     model = arig_model(sound="wav2vec2")
     with pytest.raises(ModelError, match="'wav2vec2': such a model can be trained and evaluated, not run"):
-        ArigListener(model.settings, torch_engine(model.settings, model))
+        ArigListener(model.settings, torch_engine(model))

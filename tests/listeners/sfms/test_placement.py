@@ -1,3 +1,5 @@
+"""Placements: as many keyframes as asked, the best of all masks, and keyframes that pay for themselves."""
+
 import itertools
 from functools import cache
 from typing import get_args
@@ -16,6 +18,7 @@ from sfms_robot.listeners.sfms.placement import (
     place,
     place_exact,
     place_learned,
+    place_penalised,
     place_static,
     stretch_errors,
     sweep,
@@ -25,22 +28,22 @@ from sfms_robot.listeners.sfms.placement import (
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def interpolation_error(motion: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """(B, G) squared error of linear interpolation, by the inpainter's own interpolation."""
+def errors(motion: torch.Tensor, mask: torch.Tensor, ramp: int | None = None) -> torch.Tensor:
+    """(B, G) squared error of interpolation, by the inpainter's own interpolation."""
     values = motion[:, :, None] * MEMBER
-    return ((Neighbours.in_mask(mask).interpolate(values) - values) ** 2).sum((1, 3))
+    return ((Neighbours.in_mask(mask, ramp).interpolate(values * mask[..., None]) - values) ** 2).sum((1, 3))
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 10_000))
 def test_exact_placement_beats_every_other_mask(first: int, second: int, seed: int):
     motion = torch.randn(2, 9, 3, generator=torch.Generator().manual_seed(seed)).cumsum(1)
-    error = interpolation_error(motion, place_exact(motion, [first, second], MEMBER))
+    error = errors(motion, place_exact(motion, [first, second], MEMBER))
     for group, count in enumerate((first, second)):
         others = []
         for frames in itertools.combinations(range(9), count):
             mask = torch.zeros(2, 9, 2)
             mask[:, list(frames)] = 1.0
-            others.append(interpolation_error(motion, mask)[:, group])
+            others.append(errors(motion, mask)[:, group])
         torch.testing.assert_close(error[:, group], torch.stack(others).min(0).values, rtol=1e-4, atol=1e-4)
 
 
@@ -102,12 +105,12 @@ def test_impossible_counts_are_refused(k, gap, text):
 
 
 def walk(seed: int, tracks_: int = 4, frames: int = 9) -> torch.Tensor:
-    """(N, 1, T) gram-ready random walks."""
+    """Random walks (N, T, 1)."""
     return torch.randn(tracks_, frames, 1, generator=torch.Generator().manual_seed(seed)).cumsum(1).double()
 
 
 def cost_of(motion: torch.Tensor):
-    return segments(motion @ motion.transpose(1, 2))
+    return segments(motion)
 
 
 def every_mask(frames: int, count: int) -> torch.Tensor:
@@ -192,3 +195,101 @@ def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed
 def test_a_learned_placement_without_its_own_scores_is_refused(strategy, wrong):
     with pytest.raises(ValueError, match="score network"):
         place(torch.zeros(1, 9, 3), [2, 2], strategy, member=MEMBER, score=scores(wrong) if wrong else None)
+
+
+def test_curves_of_few_channels_hold_all_of_their_motion():
+    motion = torch.randn(4, 20, 3)
+    found = tracks(motion, torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 2)
+    centred = motion - motion.mean(1, keepdim=True)
+    for group, channels in enumerate(([0, 1], [2])):
+        own = centred[..., channels]
+        own = own / own.square().sum(-1).mean(1).sqrt()[:, None, None]
+        curves = found.curves.view(4, 2, 20, 2)[:, group]
+        torch.testing.assert_close(curves @ curves.transpose(1, 2), own @ own.transpose(1, 2), rtol=1e-4, atol=1e-4)
+
+
+def test_scores_know_how_many_keyframes_are_to_come():
+    score = ConditionalScore(1, 8, 2, 1)
+    track = tracks(torch.randn(1, 12, 1).cumsum(1), torch.ones(1, 1), 1)
+    told = [score(track, torch.zeros(1, 12), torch.tensor([k])) for k in (0, 1, 5)]
+    assert not torch.allclose(told[0], told[1]) and not torch.allclose(told[1], told[2])
+
+
+# --- As many as pay for themselves ---
+
+COST = st.floats(0.02, 20)
+
+
+def walk3(seed: int, frames: int, batch: int = 1) -> torch.Tensor:
+    return torch.randn(batch, frames, 3, generator=torch.Generator().manual_seed(seed)).cumsum(1)
+
+
+@given(COST, COST, st.sampled_from([None, 1, 2, 4]), st.integers(0, 10_000))
+def test_no_other_mask_costs_less(one: float, other: float, ramp, seed: int):
+    motion, cost = walk3(seed, 8), torch.tensor([one, other])
+    mask = place_penalised(motion, [one, other], MEMBER, ramp=ramp)
+    found = errors(motion, mask, ramp)[0] + cost * mask.sum(1)[0]
+    every = torch.tensor(list(itertools.product([0.0, 1.0], repeat=8)))[1:]
+    masks = every[..., None].expand(-1, -1, 2)
+    totals = errors(motion.expand(len(masks), -1, -1), masks, ramp) + cost * masks.sum(1)
+    torch.testing.assert_close(found, totals.min(0).values, rtol=1e-4, atol=1e-4)
+
+
+@given(COST, st.integers(0, 10_000))
+def test_with_straight_lines_it_is_the_exact_mask_of_as_many_keyframes(cost: float, seed: int):
+    motion = walk3(seed, 40)
+    mask = place_penalised(motion, [cost, cost], MEMBER)
+    exact = place_exact(motion, mask[0].sum(0).int().tolist(), MEMBER)
+    torch.testing.assert_close(errors(motion, mask, None), errors(motion, exact, None), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("ramp", [None, 5])
+def test_stillness_has_one_keyframe_or_what_the_largest_gap_asks_for(ramp):
+    still = torch.full((1, 200, 3), 0.7)
+    assert place_penalised(still, [0.1, 0.1], MEMBER, ramp=ramp).sum(1).tolist() == [[1, 1]]
+    assert place_penalised(still, [0.1, 0.1], MEMBER, 50, ramp).sum(1).tolist() == [[3, 3]]
+
+
+@pytest.mark.parametrize("ramp", [None, 5])
+def test_a_movement_takes_no_keyframe_out_of_the_stillness_around_it(ramp):
+    motion = torch.zeros(1, 300, 3)
+    motion[0, 100:125] = torch.sin(torch.linspace(0, 4 * torch.pi, 25))[:, None] * 3
+    at = place_penalised(motion, [0.5, 0.5], MEMBER, ramp=ramp)[0, :, 0].nonzero()[:, 0]
+    assert len(at) >= 6 and at.min() >= 90 and at.max() <= 130
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 10_000), st.integers(0, 10_000))
+def test_before_a_keyframe_that_two_motions_share_only_what_is_there_decides(seed: int, other_seed: int):
+    """So what is far ahead reaches no further back than to the first keyframe that stands either way."""
+    motion, changed = walk3(seed, 160), walk3(seed, 160)
+    changed[:, 80:] = walk3(other_seed, 80) * 3
+    masks = [place_penalised(one, [0.5, 0.5], MEMBER, 30, 5)[0] for one in (motion, changed)]
+    for group in range(2):
+        a, b = (mask[:, group] for mask in masks)
+        shared = ((a * b)[:80]).nonzero()[:, 0]
+        assert len(shared) and shared.max() >= 60  # well within a second
+        assert torch.equal(a[: shared.max()], b[: shared.max()])
+
+
+def test_a_dyads_keyframes_do_not_depend_on_the_rest_of_the_batch():
+    motion = walk3(3, 50, 3)
+    together = place_penalised(motion, [0.5, 0.5], MEMBER, 30, 5)
+    for row in range(3):
+        assert torch.equal(place_penalised(motion[row : row + 1], [0.5, 0.5], MEMBER, 30, 5)[0], together[row])
+
+
+def test_a_keyframe_that_costs_nothing_is_refused():
+    with pytest.raises(ValueError, match="not all above 0"):
+        place_penalised(torch.zeros(1, 9, 3), [1.0, 0.0], MEMBER)
+
+
+def test_a_ramp_holds_the_keyframe_before_and_then_goes_straight():
+    mask = torch.zeros(1, 12, 1)
+    mask[0, [1, 9]] = 1.0
+    values = torch.zeros(1, 12, 1, 1)
+    values[0, 9] = 1.0
+    drawn = Neighbours.in_mask(mask, 4).interpolate(values)[0, :, 0, 0]
+    assert drawn.tolist() == [0, 0, 0, 0, 0, 0, 0.25, 0.5, 0.75, 1, 1, 1]
+    near = Neighbours.in_mask(mask, 40).interpolate(values)
+    torch.testing.assert_close(near, Neighbours.in_mask(mask).interpolate(values))

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -7,8 +5,8 @@ from tiny_sfms import tiny_listener, tiny_settings
 
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.sfms import draw
-from sfms_robot.listeners.sfms.draw import UNDECIDED
-from sfms_robot.listeners.sfms.predictor import Context, SpeakerEncoder
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
+from sfms_robot.listeners.sfms.predictor import SpeakerEncoder
 
 HEARD = torch.ones(1, 40, dtype=torch.bool)
 
@@ -17,18 +15,9 @@ def context(drawn_frames: int = 0, **changes) -> Context:
     drawn = torch.Generator().manual_seed(2)
     tokens = torch.randint(0, 7, (1, 48, 2), generator=drawn)
     tokens[:, 40 + drawn_frames :] = UNDECIDED
-    return replace(
-        Context(
-            face=torch.randn(1, 40, 58, generator=drawn),
-            face_known=HEARD,
-            voice=torch.randn(1, 40, 16, generator=drawn),
-            heard=HEARD,
-            phase=torch.rand(1, 40, 21, generator=drawn),
-            tokens=tokens,
-            control=torch.zeros(1, 48, 0),
-        ),
-        **changes,
-    )
+    face, voice = torch.randn(1, 40, 58, generator=drawn), torch.randn(1, 40, 16, generator=drawn)
+    phase = torch.rand(1, 40, 21, generator=drawn)
+    return Context(face, HEARD, voice, HEARD, phase, tokens, torch.zeros(1, 48, 0))._replace(**changes)
 
 
 @torch.no_grad()
@@ -69,7 +58,7 @@ def test_what_is_marked_missing_does_not_matter(modality: str, sequential: bool)
     gone = torch.zeros_like(HEARD)
     if modality == "voice":
         one = context(heard=gone)
-        other = replace(one, voice=torch.full((1, 40, 16), torch.nan), phase=torch.full((1, 40, 21), torch.nan))
+        other = one._replace(voice=torch.full((1, 40, 16), torch.nan), phase=torch.full((1, 40, 21), torch.nan))
     else:
         one, other = context(face_known=gone), context(face_known=gone, face=torch.full((1, 40, 58), torch.nan))
     assert torch.equal(logits(predictor, one), logits(predictor, other))
@@ -82,13 +71,13 @@ def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
     both = {name: getattr(one, name).expand(2, *[-1] * (getattr(one, name).ndim - 1)) for name in names}
     copies = Context(**both, tokens=own, control=one.control.expand(2, -1, -1))
     with torch.no_grad():
-        torch.testing.assert_close(tiny.model.predictor(replace(one, tokens=own)), tiny.model.predictor(copies))
+        torch.testing.assert_close(tiny.model.predictor(one._replace(tokens=own)), tiny.model.predictor(copies))
 
 
 def test_every_weight_has_a_gradient(tiny):
     predictor = tiny_listener().model.predictor
     seen = context(voice=predictor.speaker.listen(torch.randn(1, 41 * 4, 128)), face_known=torch.rand(1, 40) > 0.5)
-    seen = replace(seen, heard=torch.rand(1, 40) > 0.5, tokens=context(3).tokens)
+    seen = seen._replace(heard=torch.rand(1, 40) > 0.5, tokens=context(3).tokens)
     out = predictor.teacher_forced(seen, torch.randint(0, 7, (1, 8, 2)))
     out[out.isfinite()].square().sum().backward()
     assert [name for name, weight in predictor.named_parameters() if weight.grad is None] == []

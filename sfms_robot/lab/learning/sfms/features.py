@@ -29,9 +29,9 @@ from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
 from sfms_robot.lab.learning.staged_frames import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
-from sfms_robot.listeners.sfms.draw import UNDECIDED
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
-from sfms_robot.listeners.sfms.predictor import Context, last_keyframes
+from sfms_robot.listeners.sfms.predictor import last_keyframes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
@@ -186,7 +186,7 @@ def context(
     future: int,
     louder: Tensor | None = None,
     held: Tensor | None = None,
-) -> Context:
+) -> Context[Tensor]:
     """Return the predictor's inputs at the seam of each window; `tokens` (N, G), those of the future undecided.
 
     `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
@@ -259,7 +259,7 @@ def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
     """Return the tokens (N, G) of each frame of standardised motion (N, C) as a keyframe."""
     quantizer = model.tokenizer.quantizer
-    return torch.cat([quantizer.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
+    return torch.cat([quantizer.codebook.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,9 +33,8 @@ from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
-from sfms_robot.listeners.sfms.draw import UNDECIDED
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
-from sfms_robot.listeners.sfms.predictor import Context
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
@@ -168,7 +167,7 @@ def corrected(settings: config.Training) -> config.Sfms:
 
 def _loss(
     model: SfmsModel,
-    seen: Context,
+    seen: Context[Tensor],
     target: Tensor,
     settings: config.Training,
     generator: torch.Generator,
@@ -186,9 +185,9 @@ def _loss(
     drawn = torch.arange(h, device=target.device) < count  # (B, H)
     past = seen.tokens[:, :-h]
     meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])
-    seen, target = replace(seen, tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
+    seen, target = seen._replace(tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
     future = torch.where(drawn[..., None], target, UNDECIDED)
-    seen = replace(seen, tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
+    seen = seen._replace(tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
     logits = model.predictor.teacher_forced(seen, target)
     weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
     loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
@@ -201,12 +200,12 @@ def _loss(
 
 
 def augment(
-    seen: Context,
+    seen: Context[Tensor],
     levels: Tensor | None,
     neutral: Tensor,
     training: config.PredictorTraining,
     generator: torch.Generator | None = None,
-) -> Context:
+) -> Context[Tensor]:
     """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
     b, p = seen.heard.shape
     device = seen.tokens.device
@@ -227,7 +226,7 @@ def augment(
     tokens = torch.cat([past, seen.tokens[:, p:]], dim=1)
     nothing_yet = torch.cat([before, before.new_zeros(b, tokens.shape[1] - p)], dim=1)
     control = seen.control.masked_fill(nothing_yet[..., None], 0.0)
-    return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
+    return seen._replace(heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
 def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
@@ -264,7 +263,7 @@ def held_out_loss(
 
 def some_windows(
     model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
-) -> Iterator[tuple[Context, Tensor]]:
+) -> Iterator[tuple[Context[Tensor], Tensor]]:
     """Batches of contexts and the tokens (B, H, G) that came next."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames

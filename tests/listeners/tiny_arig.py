@@ -7,10 +7,10 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
 from sfms_robot.listeners import audio_frontend
-from sfms_robot.listeners.arig import torch_engine
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.stream import FIRST, ArigListener
 from sfms_robot.listeners.stream_rng import Use, normals
+from sfms_robot.listeners.torch_engine import torch_engine
 
 RAW = {
     "kind": "arig",
@@ -33,7 +33,20 @@ def arig_model(**changes) -> ArigModel:
 
 def arig_listener(**changes) -> ArigListener:
     model = arig_model(**changes)
-    return ArigListener(model.settings, torch_engine(model.settings, model))
+    return ArigListener(model.settings, torch_engine(model))
+
+
+def soft(listener: ArigListener) -> ArigListener:
+    """Whose motion is small and inside 0..1, where nothing is clipped, and whose states last some frames."""
+    model = listener.model
+    with torch.no_grad():
+        model.motion_std.fill_(0.02)
+        model.motion_mean.copy_(0.5 * model.is_drawn)
+        if model.settings.draws == "innovation":
+            model.rho.fill_(0.9)
+        if model.states is not None and model.settings.events:
+            model.states.durations.copy_(torch.linspace(1, 6, 33).expand(7, -1))
+    return listener
 
 
 def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agent: bool = True) -> list[SpeakerFrame]:

@@ -51,16 +51,6 @@ def test_ddim_keeps_the_noise_it_found():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
-def test_one_sample_is_drawn_as_it_is_among_many(sampler: str):
-    """A single condition takes a shorter way: LayerNorm itself applies the modulation."""
-    model = denoiser(sampler=sampler)
-    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    alone = torch.cat([model.sample(z[i : i + 1], noise[i : i + 1]) for i in range(4)])
-    torch.testing.assert_close(alone, model.sample(z, noise), rtol=1e-4, atol=1e-4)
-
-
-@torch.no_grad()
 @pytest.mark.parametrize("changes", [{"sampler": "ddim"}, {"temperature": 0.0}])
 def test_without_added_noise_the_start_decides(changes):
     model = denoiser(**changes)
