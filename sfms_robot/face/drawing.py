@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, optional
-from sfms_robot.face.human import HumanHead, collar, load_human
+from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.face.urdf import Visual
 from sfms_robot.frames import Doubles, Floats
@@ -22,7 +22,6 @@ PLACE_M: Final = (0.6, 0.0, 0.0)  # of the virtual webcam's person: arm's length
 ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
 SIZE_PX: Final = (640, 480)
 _EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
-_COLLAR: Final = (0.23, 0.29, 0.36)
 _ROUND: Final = 48  # corners of a circle
 _DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
 _ANGLE_DEG: Final = 24.0
@@ -73,17 +72,13 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 
 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
-    """Add the head at one instant, its collar and three lights."""
+    """Add the head at one instant, and three lights."""
     skin = _mesh_actor(vtk, head.vertices(motion), head.triangles)
     colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
     skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
     skin.GetProperty().SetSpecular(0.12)
     skin.GetProperty().SetSpecularPower(18)
     renderer.AddActor(skin)
-    worn = collar()
-    neck = _mesh_actor(vtk, worn.vertices, worn.triangles)
-    neck.GetProperty().SetColor(*_COLLAR)
-    renderer.AddActor(neck)
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
         add_light(vtk, renderer, place, (0, 0, 0), strength)
 

@@ -32,6 +32,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from sfms_robot.data import data_dir
 from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import PacketError
+from sfms_robot.face.human import FOLDER as HUMAN
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.viewer.page_messages import VERSION, Shown, frame_json, message_json, parse_command
@@ -236,20 +237,24 @@ class PageServer:
         self._recording: Path | None = None
         self._over: Mapping[str, Any] | None = None  # the report
         self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # (packed picture or not, message)
-        self._files = CompressedFiles()
-        self.prepare = self._files.prepare  # what takes a second, in threads; a page waits for it
+        self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
             [
                 Route("/", self._index),
                 Route("/runs/last", self._last_run),
                 Route("/recording", self._download),
-                Route("/human/head.bin", self._files.human_mesh),
                 Route("/robot/{file:path}", self._robot),
                 Route("/face_landmarker.task", self._face_model),
                 WebSocketRoute("/ws", self._visit),
                 Mount("/static", self._files),
+                Mount("/human", self._human),
             ]
         )
+
+    def prepare(self) -> None:
+        """Begin to compress what every page loads, in threads; a page waits for it."""
+        self._human.prepare("*.xz")
+        self._files.prepare()
 
     # --- from the run ---
 

@@ -34,7 +34,7 @@ from sfms_robot.face.drawing import (
     open_window,
     save,
 )
-from sfms_robot.face.human import HumanHead, load_human, with_hair
+from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 
@@ -450,7 +450,7 @@ def render_sheet(
     widths, cell_high = _ALONE_PX if robot is None else _BESIDE_PX
     wide, high = sum(widths) + _GAP_PX, cell_high + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
-    window, head = open_window(vtk, size), with_hair(load_human())
+    window, head = open_window(vtk, size), load_human(hair=True)
     paper = add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     add_text(vtk, paper, title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
     for index, instant in enumerate(instants):
