@@ -22,11 +22,16 @@ PLACE_M: Final = (0.6, 0.0, 0.0)  # of the virtual webcam's person: arm's length
 ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
 SIZE_PX: Final = (640, 480)
 _EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
-_ROUND: Final = 48  # corners of a circle
 _DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
 _ANGLE_DEG: Final = 24.0
 _ROOM: Final = 1.12  # of a picture, by what it shows
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
+# Each shape of a URDF: vtk's name of it and of its sizes, and its number of corners.
+_SHAPES: Final[Mapping[str, tuple[str, tuple[str, ...], Mapping[str, int]]]] = {
+    "box": ("Cube", ("XLength", "YLength", "ZLength"), {}),
+    "sphere": ("Sphere", ("Radius",), {"ThetaResolution": 48, "PhiResolution": 24}),
+    "cylinder": ("Cylinder", ("Radius", "Height"), {"Resolution": 48}),
+}
 _READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
 
 Point = Sequence[float] | Doubles  # x, y, z
@@ -289,22 +294,11 @@ def _source(visual: Visual, meshes: Mapping[str, Path]) -> Any:
 
     if visual.shape == "mesh":
         return _mesh(meshes[visual.mesh])
-    if visual.shape == "box":
-        box = sources.vtkCubeSource()
-        for axis, length in zip("XYZ", visual.size, strict=True):
-            getattr(box, f"Set{axis}Length")(length)
-        return box
-    if visual.shape == "sphere":
-        ball = sources.vtkSphereSource()
-        ball.SetRadius(visual.size[0])
-        ball.SetThetaResolution(_ROUND)
-        ball.SetPhiResolution(_ROUND // 2)
-        return ball
-    rod = sources.vtkCylinderSource()
-    rod.SetRadius(visual.size[0])
-    rod.SetHeight(visual.size[1])
-    rod.SetResolution(_ROUND)
-    return rod
+    name, sizes, more = _SHAPES[visual.shape]
+    source = getattr(sources, f"vtk{name}Source")()
+    for key, value in (*zip(sizes, visual.size, strict=True), *more.items()):
+        getattr(source, f"Set{key}")(value)
+    return source
 
 
 def _mesh(file: Path) -> Any:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
-from sfms_robot.frames import POSE, SHAPES, Floats
+from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.rotations import rotation
 
 FOLDER: Final[Path] = data_dir("sim") / "heads" / "human"
@@ -49,10 +49,11 @@ class HumanHead:
 
     def vertices(self, motion: Floats) -> Floats:
         """Return the vertices (V, 3) of motion (58,), metres, robot axes."""
-        shaped = self.rest + np.tensordot(motion[SHAPES], self.deltas, axes=1)
-        share, turn, move = self.share[:, None], motion[POSE][:3], motion[POSE][3:]
-        turned = np.einsum("vij,vj->vi", rotation(share * turn), shaped - _PIVOT_M) + _PIVOT_M
-        return (turned + share * move).astype(np.float32)
+        shaped: Floats = self.rest + np.tensordot(motion[SHAPES], self.deltas, axes=1)
+        pose: Doubles = np.outer(self.share, motion[POSE]).astype(np.float64)
+        turned = (rotation(pose[:, :3]) @ (shaped - _PIVOT_M)[..., None])[..., 0] + _PIVOT_M
+        vertices: Floats = (turned + pose[:, 3:]).astype(np.float32)
+        return vertices
 
 
 def load_human(hair: bool = False) -> HumanHead:

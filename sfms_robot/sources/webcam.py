@@ -10,7 +10,6 @@ cannot be kept up with is left out. Without a face in the picture nothing new is
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
 from sfms_robot.signals.quantiles import Quantiles
+from sfms_robot.signals.spaces import angles_of
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.worker import SourceWorker
 
@@ -39,6 +39,8 @@ _ALIVE_S: Final = 0.02
 # Between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133, 362 and
 # 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
 _EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
+
+_TO_ROBOT_AXES: Final = [2, 0, 1]  # their z (forward), x (own left), y (up)
 
 NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
 TAKE_OVER_S: Final = 1.0  # for so long, without a break
@@ -253,11 +255,8 @@ def _why_not(number: int) -> str:
 
 def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
     """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
-    roll = math.atan2(matrix[1, 0], matrix[1, 1])
-    pitch = math.asin(min(1.0, max(-1.0, -float(matrix[1, 2]))))
-    yaw = math.atan2(matrix[0, 2], matrix[2, 2])
-    right_m, up_m, near_m = matrix[:3, 3] / 100.0
-    pose = (roll, pitch, yaw, near_m, right_m, up_m)
+    turn = matrix[np.ix_(_TO_ROBOT_AXES, _TO_ROBOT_AXES)].astype(np.float64)
+    pose = (*angles_of(turn[None])[0], *matrix[_TO_ROBOT_AXES, 3] / 100.0)
     eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
     return SeenFace(
         np.array([*pose, *(shapes.get(name, 0.0) for name in BLENDSHAPES)], dtype=np.float32),
