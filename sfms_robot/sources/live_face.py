@@ -109,7 +109,7 @@ class LiveFace:
 
     def __init__(self, signs: Floats) -> None:
         self._signs = signs
-        self._neutral: Neutral | None = None
+        self._rest = RestingFace()
         self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
         self._sighting: Sighting | None = None
         self._origin_s = 0.0
@@ -120,7 +120,7 @@ class LiveFace:
 
     def forget(self) -> None:
         """Forget what was learned of the person: another camera, or another person."""
-        self._neutral = None
+        self._rest = RestingFace()
 
     def put(self, time_s: float, motion: Floats, place_m: Floats | None = None) -> None:
         """Take a face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
@@ -137,8 +137,8 @@ class LiveFace:
             motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
             motion[POSE] *= self._signs
             # Learned in monotonic time: a start does not tear it apart.
-            motion, self._neutral = relative_to_rest(motion, seen_s, self._neutral)
-            self._sighting = Sighting(FaceFrame.of(seen_s - self._origin_s, motion), place_m=place_m)
+            face = FaceFrame.of(seen_s - self._origin_s, self._rest.relative(motion, seen_s))
+            self._sighting = Sighting(face, place_m=place_m)
         return self._sighting
 
 
@@ -157,45 +157,37 @@ class LiveFace:
 # - a face that was away for 10 s may come back as another person: learning begins again.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Neutral:
-    """A memory of one person. A value: `relative_to_rest` gives a new one.
+class RestingFace:
+    """The face of one person at rest, learned from all faces so far.
 
     Attributes:
-        time_s: of the last face.
-        sampled_s: of the last sample.
         samples: (n, 58) newest last, n <= 240.
-        estimate: (58,) rest, by the samples.
-        rest: (58,) what is taken off now.
     """
 
-    time_s: float
-    sampled_s: float
-    samples: Floats
-    estimate: Floats
-    rest: Floats
+    def __init__(self) -> None:
+        self.samples: Floats = np.zeros((0, MOTION_DIM), dtype=np.float32)
+        self._estimate: Floats = np.zeros(MOTION_DIM, dtype=np.float32)
+        self._rest = self._estimate  # follows it
+        self._seen_s = self._sampled_s = -math.inf
 
+    def relative(self, motion: Floats, time_s: float) -> Floats:
+        """Return what the person does (58,) in one face (58,) of `time_s`; faces come in order of time.
 
-def relative_to_rest(motion: Floats, time_s: float, state: Neutral | None) -> tuple[Floats, Neutral]:
-    """Return what the person does (58,) in one face (58,) of `time_s`, and the new memory; faces come in order of time.
-
-    `state` None: no person was seen yet. Shapes stay within 0..1.
-    """
-    state = _learned(np.asarray(motion, dtype=np.float32), time_s, state)
-    return _relative(motion, state.rest), state
-
-
-def _learned(motion: Floats, time_s: float, state: Neutral | None) -> Neutral:
-    if state is None or not 0 <= time_s - state.time_s <= AWAY_S:
-        rest = _rest(motion[None])
-        return Neutral(time_s=time_s, sampled_s=time_s, samples=motion[None], estimate=rest, rest=rest)
-    samples, sampled_s, estimate = state.samples, state.sampled_s, state.estimate
-    if time_s - sampled_s >= _SAMPLE_S:
-        samples = np.concatenate([samples[1 - _SAMPLES :], motion[None]])
-        sampled_s, estimate = time_s, _rest(samples)
-    follow = 1.0 - math.exp((state.time_s - time_s) / _EASE_S)
-    rest = state.rest + np.float32(follow) * (estimate - state.rest)
-    return Neutral(time_s=time_s, sampled_s=sampled_s, samples=samples, estimate=estimate, rest=rest)
+        Shapes stay within 0..1.
+        """
+        motion = np.asarray(motion, dtype=np.float32)
+        known = 0 <= time_s - self._seen_s <= AWAY_S
+        if not known or time_s - self._sampled_s >= _SAMPLE_S:
+            before = self.samples[1 - _SAMPLES :] if known else self.samples[:0]
+            self.samples, self._sampled_s = np.concatenate([before, motion[None]]), time_s
+            self._estimate = _rest(self.samples)
+        if known:
+            follow = 1.0 - math.exp((self._seen_s - time_s) / _EASE_S)
+            self._rest = self._rest + np.float32(follow) * (self._estimate - self._rest)
+        else:
+            self._rest = self._estimate
+        self._seen_s = time_s
+        return _relative(motion, self._rest)
 
 
 def _rest(samples: Floats) -> Floats:
