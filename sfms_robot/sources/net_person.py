@@ -291,14 +291,17 @@ class NetPerson:
 
 
 class _NetPart(SourcePart):
-    """A part of a person that another program feeds: it joins the server, which runs from its start to its close."""
+    """A part of a person that another program feeds: it joins the server, which runs from its start to its close.
+
+    argument: [HOST:]PORT, "" for the usual one; raises ConfigError, PortError. Or a server that runs already.
+    """
 
     feed: ClassVar[str]
 
-    def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)
-        self.outlet = outlet
-        outlet.join(self.feed, cast(Any, self))
+    def __init__(self, argument: str | NetPerson) -> None:
+        self.outlet = _person(FLAGS[self.feed], argument) if isinstance(argument, str) else argument
+        super().__init__(self.outlet.now)
+        self.outlet.join(self.feed, cast(Any, self))
 
     def start(self, origin_s: float) -> None:
         self.outlet.start(origin_s)
@@ -312,36 +315,21 @@ class _NetPart(SourcePart):
 
 
 class NetVoice(_NetPart, PushedVoice):
-    """`ports.Voice` of a person whose sound another program has."""
+    """`ports.Voice` of a person whose sound another program has: `--audio push[:[HOST:]PORT]`."""
 
     feed = "voice"
 
 
 class NetSight(_NetPart, PushedSight):
-    """`ports.Sight` of a person that another program sees."""
+    """`ports.Sight` of a person that another program sees: `--face push[:[HOST:]PORT]`."""
 
     feed = "face"
 
 
 class NetSpeech(_NetPart, PushedSpeech):
-    """`ports.Voice` of a robot for which another program speaks."""
+    """`ports.Voice` of a robot for which another program speaks: `--agent-audio tcp[:[HOST:]PORT]`."""
 
     feed = "speech"
-
-
-def open_net_voice(argument: str) -> NetVoice:
-    """Open `--audio push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetVoice(_person("--audio push", argument))
-
-
-def open_net_sight(argument: str) -> NetSight:
-    """Open `--face push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetSight(_person("--face push", argument))
-
-
-def open_net_speech(argument: str) -> NetSpeech:
-    """Open `--agent-audio tcp[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetSpeech(_person("--agent-audio tcp", argument))
 
 
 def _person(flag: str, argument: str) -> NetPerson:

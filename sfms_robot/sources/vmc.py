@@ -143,7 +143,8 @@ def turn_of_unity(quaternion: Sequence[float]) -> Doubles:
     """Return the rotation (3, 3) in our axes of a quaternion x, y, z, w of unit length in Unity's."""
     x, y, z, w = quaternion
     cross = np.array([[0.0, y, x], [-y, 0.0, z], [-x, -z, 0.0]])  # of (-z, x, -y)
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    turn: Doubles = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    return turn
 
 
 class VmcDecoder:

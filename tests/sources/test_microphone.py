@@ -14,11 +14,10 @@ from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import OwnVoice, open_microphone
+from sfms_robot.sources.microphone import open_microphone
 from sfms_robot.sources.push import PushedSpeech
-from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.sound_devices import LOST_S, Capture, SoundDevice, captured_s, sound_devices, why_not_opened
+from sfms_robot.sources.sound_devices import Capture, SoundDevice, captured_s, sound_devices, why_not_opened
 
 pytestmark = pytest.mark.realtime
 
@@ -259,7 +258,7 @@ def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
 def test_a_device_that_gives_no_more_sound_went_away():
     capture = Capture(SoundDevice(name="array", number=3, channels=1, rate_hz=16_000.0), 16_000.0, 1)
     capture.pass_on(LiveVoice(), 0.0)
-    capture._heard_s -= 1.1 * LOST_S
+    capture._called_s -= 1.1 * capture.lost_s
     with pytest.raises(PortError, match="^array gives no more sound$"):
         capture.pass_on(LiveVoice(), 0.0)
 
@@ -273,16 +272,3 @@ def test_a_device_that_gives_no_more_sound_went_away():
 )
 def test_why_a_device_cannot_be_opened_is_told_in_words(text, why):
     assert why_not_opened(OSError(text)).startswith(why)
-
-
-def test_the_microphone_is_told_of_every_frame_that_the_robot_says():
-    said = np.arange(40 * FRAME_SAMPLES, dtype=np.float32) / 1e5
-    own = OwnVoice(RecordedVoice(said))
-    for index in range(30):
-        assert own.ask(index + 1)
-        assert not own.ask(index + 1)
-        first, samples = own.newest()
-        np.testing.assert_array_equal(own.take(index + 1), said[(index + 1) * FRAME_SAMPLES :][:FRAME_SAMPLES])
-        begin = max(first, 1)  # frame 0 is over before anybody can ask
-        expected = said[begin * FRAME_SAMPLES : (index + 2) * FRAME_SAMPLES]
-        np.testing.assert_array_equal(samples[(begin - first) * FRAME_SAMPLES :], expected)

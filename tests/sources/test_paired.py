@@ -55,7 +55,7 @@ def test_what_is_left_out_is_said_once_and_counted(caplog):
     for _ in range(4):
         source.read(0.0)
     assert source.statistics() == {"frames": 4, "left_out": {"voice": 4}} and len(caplog.records) == 1
-    assert "frame 0: voice left out: samples that are not finite" in caplog.text
+    assert "frame 0: voice left out: values that are not finite" in caplog.text
 
 
 def test_good_frames_go_through_as_they_are():

@@ -17,7 +17,7 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import OwnVoice
+from sfms_robot.sources.microphone import Microphone
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.playback import (
     EARLY_S,
@@ -33,7 +33,7 @@ from sfms_robot.sources.playback import (
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.sound_devices import SoundDevice
+from sfms_robot.sources.sound_devices import Capture, SoundDevice
 
 pytestmark = pytest.mark.realtime
 
@@ -308,10 +308,8 @@ def pause(played):
 
 def recorded(seconds, begin):
     """What `person.monitor` records meanwhile, on the grid that begins now, and what `begin(origin)` gave."""
-    from sfms_robot.sources.microphone import open_capture
-
     heard = LiveVoice()
-    with open_capture("person.monitor", "--audio mic") as capture:
+    with Capture.opened("person.monitor", "--audio mic") as capture:
         origin_s = time.monotonic()
         heard.start(origin_s)
         step = begin(origin_s)
@@ -440,7 +438,7 @@ def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
         while len(frames) < 150:
             assert time.monotonic() < origin_s + PATIENCE_S
             frames += one.read(time.monotonic() - origin_s)
-            pause(one._agent._inner)
+            pause(one._agent)
     settled = [frame for frame in frames[75:] if len(frame.audio) and frame.agent_audio.any()]
     heard, own = (
         [energy_db(part) for part in parts]
@@ -451,21 +449,33 @@ def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
     assert np.median(heard) < np.median(own) - 15.0
 
 
-def test_programs_behind_what_is_said_are_told_also_where_it_is_played_and_taken_out():
+def test_programs_behind_what_is_said_are_told_also_where_it_is_played():
     spoken = PushedSpeech()
     spoken.outlet = object()
     played = PlayedVoice(VirtualLoudspeaker(), spoken)
-    assert list(PairedSource(None, None, OwnVoice(played)).outlets) == [spoken.outlet]
+    assert list(PairedSource(None, None, played).outlets) == [spoken.outlet]
 
 
-def test_the_echo_canceller_is_told_a_little_early():
-    """And where it asks, the frame before the newest, it is told all of it."""
-    desk = Desk(RecordedVoice(noise(2.0)))
-    own = OwnVoice(desk.voice)
+class Sent(list):
+    """A microphone's worker that keeps what it is sent."""
+
+    tell = list.append
+
+    def messages(self, now_s):
+        return []
+
+
+def test_the_echo_canceller_is_told_every_frame_and_a_little_early():
+    """It asks, the frame before the newest too, before the microphone's frame is there."""
+    desk, sent = Desk(RecordedVoice(noise(2.0))), Sent()
+    source = PairedSource(Microphone(sent, EARLY_S), None, desk.voice)
+    source.start(desk.loudspeaker.now_s)
     for index in range(1, 26):
         desk.until(index * FRAME_S)
-        own.ask(index)
-    first, told = own.newest()
+        source.read(desk.loop_s)
+    ends = [each.first + len(each.said) // FRAME_SAMPLES for each in sent[1:]]
+    assert ends == list(range(2, 27))
+    first, told = sent[-1].first, sent[-1].said
     early = round(EARLY_S * AUDIO_HZ)
     assert early + ECHO_LATENCY_SAMPLES <= FRAME_SAMPLES
     np.testing.assert_allclose(

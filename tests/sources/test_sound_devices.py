@@ -14,8 +14,8 @@ BUILT_IN = SoundDevice(name="HDA Intel PCH: ALC257 Analog (hw:0,0)", number=0, c
 USB = SoundDevice(name="USB PnP Sound Device: Audio (hw:1,0)", number=4, channels=1, rate_hz=48_000.0)
 ARRAY = SoundDevice(name="ReSpeaker 4 Mic Array: USB Audio (hw:2,0)", number=5, channels=6, rate_hz=16_000.0)
 SERVER = SoundDevice(name="pulse", number=8, channels=32, rate_hz=44_100.0, default=True)
-SOURCE = SoundDevice(name="alsa_input.usb-PnP.mono", number=8, channels=32, rate_hz=44_100.0, server="source")
-MONITOR = SoundDevice(name="robot.monitor", number=8, channels=32, rate_hz=44_100.0, server="source")
+SOURCE = SoundDevice(name="alsa_input.usb-PnP.mono", number=8, channels=32, rate_hz=44_100.0, of_server=True)
+MONITOR = SoundDevice(name="robot.monitor", number=8, channels=32, rate_hz=44_100.0, of_server=True)
 ALL = [BUILT_IN, USB, ARRAY, SERVER, SOURCE, MONITOR]
 
 
