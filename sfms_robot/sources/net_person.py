@@ -25,7 +25,7 @@ import numpy as np
 
 from sfms_robot.endpoint import LOOPBACK, address_text, host_and_port, is_loopback, token_admits
 from sfms_robot.errors import ConfigError, PacketError, PortError
-from sfms_robot.frames import AUDIO_HZ, POSE_CHANNELS, Floats, Sighting
+from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.net_messages import (
@@ -419,14 +419,12 @@ class BrowserVoice(PushedVoice):
         return {**super().statistics(), **self._visitor.statistics()}
 
 
-class BrowserSight(SourcePart):
+class BrowserSight(LiveFace):
     """`ports.Sight` of a visitor. Their rest is learned while they are seen, as that of a person at a webcam."""
 
     def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
-        super().__init__(now)
+        super().__init__(now=now)
         self._visitor = visitor
-        self._lock = threading.Lock()
-        self._face = LiveFace(np.ones(len(POSE_CHANNELS), np.float32))
 
     def see(self, face: Floats | None, seen_s: float | None = None, attention: float | None = None) -> None:
         """Take their face (58,) at `seen_s` of `time.monotonic`, None: now; without one the last grows old and is lost.
@@ -434,21 +432,7 @@ class BrowserSight(SourcePart):
         Their attention is judged here, by head and eyes.
         """
         if face is not None:
-            with self._lock:
-                self._face.put(self._now() if seen_s is None else seen_s, face)
-
-    def forget(self) -> None:
-        """Expect another person."""
-        with self._lock:
-            self._face.forget()
-
-    def start(self, origin_s: float) -> None:
-        with self._lock:
-            self._face.start(origin_s)
-
-    def at(self, time_s: float) -> Sighting | None:
-        with self._lock:
-            return self._face.at(time_s)
+            self.put(self._now() if seen_s is None else seen_s, face)
 
     def statistics(self) -> Mapping[str, Any]:
         return self._visitor.statistics()

@@ -30,7 +30,7 @@ import numpy as np
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.spaces import angles_of
-from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
+from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
 
 PORT: Final = 39539  # what the protocol gives those who receive
 
@@ -240,9 +240,9 @@ def _is_number(value: object) -> bool:
 def open_vmc(argument: str) -> UdpSight:
     """Open `--face vmc[:PORT|HOST[:PORT]][,flip=...]`; without HOST only avatar software on this machine can send.
 
-    Raises as `open_udp_sight`.
+    Raises as `UdpSight`.
     """
-    return open_udp_sight("vmc", argument, PORT, VmcDecoder(), _hint)
+    return UdpSight("vmc", argument, PORT, VmcDecoder(), _hint)
 
 
 def _hint(host: str, port: int, wider: str) -> str:

@@ -315,37 +315,34 @@ def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
 # --- the run's side --------------------------------------------------------------------------------------------------
 
 
-class Webcam:
-    """`ports.Sight` of the worker `watch`. Only `close` blocks."""
+class Webcam(LiveFace):
+    """`ports.Sight` of the worker `watch`. Only `close` blocks.
 
-    def __init__(self, worker: SourceWorker, face: LiveFace, duration_s: float | None) -> None:
-        self._worker, self._face, self.duration_s = worker, face, duration_s
-        self._origin_s: float | None = None
+    Attributes:
+        lost: the camera is away, or its process.
+        latency_s: median from a picture taken to its face known; 0 before the first picture.
+    """
+
+    def __init__(self, worker: SourceWorker, signs: Floats | None, duration_s: float | None) -> None:
+        super().__init__(signs)
+        self._worker, self.duration_s = worker, duration_s
+        self._started = False
         self._counts = dict.fromkeys(("pictures", "without_face", "dark", "with_others"), 0)
         self._latency_ms = Quantiles()
 
-    @property
-    def lost(self) -> bool:
-        """The camera is away, or its process."""
-        return self._worker.lost
-
-    @property
-    def latency_s(self) -> float:
-        """Median from a picture taken to its face known; 0 before the first picture."""
-        return self._latency_ms.at(50) / 1e3 if len(self._latency_ms) else 0.0
-
     def start(self, origin_s: float) -> None:
-        self._origin_s = origin_s
-        self._face.start(origin_s)
+        super().start(origin_s)
+        self._started = True
         self._worker.tell(origin_s)
 
     def at(self, time_s: float) -> Sighting | None:
-        if self._origin_s is None:
+        if not self._started:
             return None
         for message in self._worker.messages(self._origin_s + time_s):
             if isinstance(message, SeenPicture):
                 self._take(message)
-        return self._face.at(time_s)
+        self.lost = self._worker.lost
+        return super().at(time_s)
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
@@ -359,15 +356,16 @@ class Webcam:
         self._worker.close()
 
     def _take(self, seen: SeenPicture) -> None:
-        if self._origin_s is None or seen.taken_s < self._origin_s:
+        if seen.taken_s < self._origin_s:
             return
         self._counts["pictures"] += 1
         self._counts["without_face"] += seen.face is None
         self._counts["dark"] += seen.dark
         self._counts["with_others"] += seen.others > 0
         self._latency_ms.add((seen.known_s - seen.taken_s) * 1e3)
+        self.latency_s = self._latency_ms.at(50) / 1e3
         if seen.face is not None:
-            self._face.put(seen.taken_s, seen.face.motion, seen.face.place_m)
+            self.put(seen.taken_s, seen.face.motion, seen.face.place_m)
 
 
 def open_webcam(argument: str) -> Webcam:
@@ -376,12 +374,11 @@ def open_webcam(argument: str) -> Webcam:
     Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for another
     file and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
     """
-    given = parse_face_argument("webcam", argument)
-    place = given.place
+    place, signs = parse_face_argument("webcam", argument)
     if not place.isdigit() and place and not Path(place).is_file():
         raise ConfigError(f"--face webcam:{place}: no such file, nor the number of a camera (0, 1, ...)")
     source = str(Path(place).absolute()) if place and not place.isdigit() else place or "0"
     worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
     opened = worker.messages(time.monotonic())[0]
-    return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, WebcamOpened) else None)
+    return Webcam(worker, signs, opened.duration_s if isinstance(opened, WebcamOpened) else None)
