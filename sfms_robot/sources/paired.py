@@ -2,16 +2,16 @@
 
 1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index yields exactly one frame, in order: a listener counts.
 2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
-   given without (an overrun: empty audio), and what comes of it after that is discarded. No frame waits for longer than
+   given without (an overrun: empty audio), and the rest of it is discarded. No frame waits for longer than
    `LONGEST_WAIT_S`, for a plan looks only a third of a second ahead.
 3. The face is the newest one, and none when that is older than `FACE_S` at the end of the frame. Of a recording it is
    no newer than that; of something live up to one frame newer, when the frame is given later: a face does not wait for
    the voice beside it, which comes some tens of milliseconds late.
-4. What the robot says is given one frame early, as a program that speaks knows it: frame i carries the samples of frame
-   i + 1, for which a listener plans its lips while it hears frame i.
+4. The robot's own voice is given one frame early, as a program that speaks knows it: frame i carries the samples of
+   frame i + 1, for which a listener plans its lips while it hears frame i.
 5. A sighting without the person's attention gets it from their face (`signals.attention`).
-6. What is not finite or not of the right shape is left out here, once for all: one NaN would stay in a listener for
-   good.
+6. Values that are not finite or not of the right shape are left out here, once for all: one NaN would stay in a
+   listener for good.
 """
 
 from __future__ import annotations

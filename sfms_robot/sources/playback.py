@@ -1,8 +1,8 @@
 """The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in another process (`play`).
 
-What is said at a time leaves the loudspeaker `delay_s` later, by the device's own time stamps (`Playout`), and so it is
-reported to everything beside it: the listener's lips, the state of the run and the echo canceller follow what leaves,
-not when it was handed over. What did not leave is silence for them too.
+Speech leaves the loudspeaker `delay_s` after its time, by the device's own time stamps (`Playout`), and is reported at
+that time to everything beside it: the listener's lips, the state of the run and the echo canceller follow the sound
+that leaves. Speech that did not leave is silence for them too.
 
 A device that takes nothing for half a second went away: the process ends, and the next one begins with a PortAudio
 that sees the devices of that moment, until the device is back.

@@ -63,17 +63,18 @@ def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     source.close()
 
 
-def test_a_face_that_is_named_goes_without_the_default_voice():
-    with closing(open_source("default", "push:0")) as source:
-        assert source.duration_s is None
-    assert open_source("default", "none").duration_s == pytest.approx(47.68)
-
-
-def test_a_recording_ends_a_run_also_beside_a_live_face_and_what_is_live_does_not():
-    with closing(open_source("katie", "push:0")) as source:
-        assert source.duration_s == pytest.approx(18.36)
-    with closing(open_source("push:0", "auto", agent_audio="katie")) as source:
-        assert source.duration_s is None
+@pytest.mark.parametrize(
+    ("audio", "face", "agent_audio", "duration_s"),
+    [
+        ("default", "push:0", "none", None),  # a face that is named goes without the default voice
+        ("default", "none", "none", 47.68),
+        ("katie", "push:0", "none", 18.36),  # a recording ends a run, also beside a live face
+        ("push:0", "auto", "katie", None),
+    ],
+)
+def test_a_run_lasts_as_long_as_its_recording(audio, face, agent_audio, duration_s):
+    with closing(open_source(audio, face, agent_audio=agent_audio)) as source:
+        assert source.duration_s == (duration_s and pytest.approx(duration_s))
 
 
 def test_a_whole_source_brings_its_own_face():
@@ -128,9 +129,11 @@ def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
         "sys.exit(bool({'numpy', 'soundfile', 'soxr'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-    with pytest.raises(ConfigError, match="--audio nothing-so: no such file .mic, push, browser, FILE.wav"):
-        check_source("nothing-so")
-    with pytest.raises(ConfigError, match="--face nothing-so: no such file .live-link, vmc, webcam, push"):
-        check_source(face="nothing-so")
-    with pytest.raises(ConfigError, match="--agent-audio nothing-so: no such file .device, tcp, FILE.wav"):
-        check_source(agent_audio="nothing-so")
+    for flag, choices in (
+        ("audio", "mic, push, browser, FILE.wav"),
+        ("face", "live-link, vmc, webcam, push"),
+        ("agent_audio", "device, tcp, FILE.wav"),
+    ):
+        said = f"--{flag.replace('_', '-')} nothing-so: no such file .{choices}"
+        with pytest.raises(ConfigError, match=said):
+            check_source(**{flag: "nothing-so"})
