@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import http.server
+import lzma
 import subprocess
 import sys
 import tempfile
@@ -19,7 +20,7 @@ from statistics import median
 
 from chromium import Page
 
-from sfms_robot.face.human import load_human, packed_human
+from sfms_robot.face.human import FOLDER
 
 HERE = Path(__file__).parent
 STATIC = HERE.parent / "sfms_robot" / "viewer" / "static"
@@ -40,7 +41,7 @@ def site(folder: Path) -> None:
     (folder / "static").symlink_to(STATIC)
     (folder / "index.html").write_bytes((STATIC / "index.html").read_bytes())
     (folder / "human").mkdir()
-    (folder / "human" / "head.bin").write_bytes(packed_human(load_human()))
+    (folder / "human" / "head.bin").write_bytes(lzma.decompress((FOLDER / "head.bin.xz").read_bytes()))
     build = [
         str(HERE / "node_modules/.bin/esbuild"),
         "--bundle",

@@ -74,11 +74,11 @@ def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, 
     return [
         {
             "name": device.name,
-            "number": None if device.server else str(device.number),
+            "number": None if device.of_server else str(device.number),
             "default": device.default,
             "channels": device.channels,
             "rate_hz": round(device.rate_hz),
             "description": f"{option(device.monitor)}{device.name}",
         }
-        for device in sound_devices.sound_devices(direction)
+        for device in sound_devices.sound_devices(direction == "playing")
     ]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, optional
-from sfms_robot.face.human import HumanHead, collar, load_human
+from sfms_robot.face.human import HumanHead, load_human
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.face.urdf import Visual
 from sfms_robot.frames import Doubles, Floats
@@ -22,12 +22,16 @@ PLACE_M: Final = (0.6, 0.0, 0.0)  # of the virtual webcam's person: arm's length
 ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
 SIZE_PX: Final = (640, 480)
 _EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
-_COLLAR: Final = (0.23, 0.29, 0.36)
-_ROUND: Final = 48  # corners of a circle
 _DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
 _ANGLE_DEG: Final = 24.0
 _ROOM: Final = 1.12  # of a picture, by what it shows
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
+# Each shape of a URDF: vtk's name of it and of its sizes, and its number of corners.
+_SHAPES: Final[Mapping[str, tuple[str, tuple[str, ...], Mapping[str, int]]]] = {
+    "box": ("Cube", ("XLength", "YLength", "ZLength"), {}),
+    "sphere": ("Sphere", ("Radius",), {"ThetaResolution": 48, "PhiResolution": 24}),
+    "cylinder": ("Cylinder", ("Radius", "Height"), {"Resolution": 48}),
+}
 _READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
 
 Point = Sequence[float] | Doubles  # x, y, z
@@ -73,17 +77,13 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 
 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
-    """Add the head at one instant, its collar and three lights."""
+    """Add the head at one instant, and three lights."""
     skin = _mesh_actor(vtk, head.vertices(motion), head.triangles)
     colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
     skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
     skin.GetProperty().SetSpecular(0.12)
     skin.GetProperty().SetSpecularPower(18)
     renderer.AddActor(skin)
-    worn = collar()
-    neck = _mesh_actor(vtk, worn.vertices, worn.triangles)
-    neck.GetProperty().SetColor(*_COLLAR)
-    renderer.AddActor(neck)
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
         add_light(vtk, renderer, place, (0, 0, 0), strength)
 
@@ -294,22 +294,11 @@ def _source(visual: Visual, meshes: Mapping[str, Path]) -> Any:
 
     if visual.shape == "mesh":
         return _mesh(meshes[visual.mesh])
-    if visual.shape == "box":
-        box = sources.vtkCubeSource()
-        for axis, length in zip("XYZ", visual.size, strict=True):
-            getattr(box, f"Set{axis}Length")(length)
-        return box
-    if visual.shape == "sphere":
-        ball = sources.vtkSphereSource()
-        ball.SetRadius(visual.size[0])
-        ball.SetThetaResolution(_ROUND)
-        ball.SetPhiResolution(_ROUND // 2)
-        return ball
-    rod = sources.vtkCylinderSource()
-    rod.SetRadius(visual.size[0])
-    rod.SetHeight(visual.size[1])
-    rod.SetResolution(_ROUND)
-    return rod
+    name, sizes, more = _SHAPES[visual.shape]
+    source = getattr(sources, f"vtk{name}Source")()
+    for key, value in (*zip(sizes, visual.size, strict=True), *more.items()):
+        getattr(source, f"Set{key}")(value)
+    return source
 
 
 def _mesh(file: Path) -> Any:

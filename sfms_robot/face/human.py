@@ -1,84 +1,32 @@
-"""The virtual human head: motion in, vertices out; its hair and collar; and the file of it that a browser draws.
+"""The virtual human head: motion in, vertices out.
 
-The mesh (`sim/heads/human`) is y up and faces +z; it is turned once, on load, to x forward, y left, z up. A face is
+The mesh (`sim/heads/human`) has x forward, y left, z up. A face is
 
     vertices = rest + sum over the 52 channels of weight * delta,
 
-then the head turns about a pivot in the neck: every vertex by its own share of the rotation, 1 from the jaw line up
-and 0 at the base of the neck, which stays where it is. Two brows, which the mesh lacks, are ribbons that hang on the
-skin: each of their points is a fixed mix of the three corners of the triangle under it, so they are ordinary vertices
-after loading.
+then the head turns about a pivot in the neck: each vertex by its own share of the rotation, 1 from the jaw line up
+and 0 at the base of the neck and in the collar, which stay in place.
 """
 
 from __future__ import annotations
 
 import json
+import lzma
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, POSE, SHAPES, Floats
+from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
+from sfms_robot.signals.rotations import rotation
 
-_TO_ROBOT_AXES: Final = (2, 0, 1)  # their z (forward), x (own left), y (up)
+FOLDER: Final[Path] = data_dir("sim") / "heads" / "human"
 _PIVOT_M: Final = np.array([-0.012, 0.0, -0.065])
-_SKIN: Final = (219, 173, 147)
-_BROW: Final = (74, 50, 38)
-_DARK_IRIS: Final = (71, 45, 25)
-_IRIS: Final = (122, 84, 48)
-_LASH: Final = (38, 25, 20)
-PARTS: Final = ("skin", "eye", "hair", "cloth", "teeth", "mouth", "lash")
-_PART_COLORS: Final = {
-    (242, 242, 242): "eye",
-    _IRIS: "eye",
-    (7, 7, 7): "eye",
-    _BROW: "hair",
-    (242, 239, 229): "teeth",
-    (204, 107, 107): "mouth",
-    _LASH: "lash",
-}
-_EYE_LINE_M: Final = 0.0325
-_LIP: Final = (190, 112, 100)
-_LIP_LINE_M, _LIP_HALF_WIDTH_M, _UPPER_LIP_M, _LOWER_LIP_M = -0.0345, 0.0255, 0.0095, 0.0135
-_LIP_SOFT_M, _LIP_DEPTH_M = 0.003, 0.09
-# Where the share of the rotation rises from 0 to 1: height plus half the distance forward, so that the border runs
-# from the nape, under the ears, to below the chin.
-_SHARE_FROM_M: Final = -0.088
-_SHARE_TO_M: Final = -0.032
-_BROW_POINTS: Final = 14
-_BROW_LIFT_M: Final = 0.0012
-
-FORMAT_VERSION: Final = 1
-_MOVED_M: Final = 2e-5
-_STEP_M: Final = 1e-5
-
-# Hair: a surface around the skull, seen from _CENTRE, whose rays lie on _RINGS rings about an axis that leans back.
-_CENTRE: Final = np.array([0.012, 0.0, 0.052])
-_AXIS: Final = np.array([-0.42, 0.0, 0.91])
-_RINGS, _SPOKES = 56, 96
-_EAR: Final = ((-0.02, 0.06), 0.071, (-0.03, 0.075))  # x from, to; |y| beyond; z from, to: left out of the skull
-_SUNK_M: Final = -0.007
-
-_COLLAR_RINGS: Final = (  # z, centre x, half depth, half width [m], power of the superellipse
-    (-0.0880, -0.0100, 0.0540, 0.0525, 2.4),
-    (-0.0860, -0.0100, 0.0565, 0.0555, 2.4),
-    (-0.0885, -0.0105, 0.0590, 0.0585, 2.4),
-    (-0.0990, -0.0115, 0.0612, 0.0625, 2.3),
-    (-0.1060, -0.0115, 0.0622, 0.0645, 2.3),
-    (-0.1110, -0.0110, 0.0640, 0.0750, 2.2),
-    (-0.1290, -0.0110, 0.0740, 0.1180, 2.3),
-    (-0.1540, -0.0150, 0.0870, 0.1700, 2.5),
-    (-0.2000, -0.0160, 0.0970, 0.2000, 2.5),
-    (-0.2700, -0.0140, 0.1040, 0.2080, 2.5),
-)
-_COLLAR_SPOKES: Final = 72
 _UNDER_SKIN: Final = round(0.3 * 255)  # of `open_sky`: hair that comes out again where the neck is thin is left out
-_HAIR: Final = (26, 18, 14), (66, 46, 34)  # at its roots, at its ends
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,317 +49,45 @@ class HumanHead:
 
     def vertices(self, motion: Floats) -> Floats:
         """Return the vertices (V, 3) of motion (58,), metres, robot axes."""
-        shaped = self.rest + np.tensordot(motion[SHAPES], self.deltas, axes=1)
-        turn, move = motion[POSE][:3], motion[POSE][3:]
-        turned = _rotated(shaped - _PIVOT_M, np.outer(self.share, turn)) + _PIVOT_M
-        out: Floats = (turned + self.share[:, None] * move).astype(np.float32)
-        return out
+        shaped: Floats = self.rest + np.tensordot(motion[SHAPES], self.deltas, axes=1)
+        pose: Doubles = np.outer(self.share, motion[POSE]).astype(np.float64)
+        turned = (rotation(pose[:, :3]) @ (shaped - _PIVOT_M)[..., None])[..., 0] + _PIVOT_M
+        vertices: Floats = (turned + pose[:, 3:]).astype(np.float32)
+        return vertices
 
-    def joined(
-        self, rest: Floats, deltas: Floats, share: Floats, triangles: NDArray[np.int64], colors: NDArray[np.uint8]
-    ) -> HumanHead:
-        """Return the head with more vertices; `triangles` count from the first of them."""
+
+def load_human(hair: bool = False) -> HumanHead:
+    """Load the shipped head with its brows and collar, with or without hair."""
+    facts, arrays = _read_arrays(lzma.decompress((FOLDER / "head.bin.xz").read_bytes()))
+    with np.load(FOLDER / "brows.npz", allow_pickle=False) as brows:
+        count, step_m = facts["vertices"], facts["step_m"]
+        rest = np.concatenate([arrays["rest"].reshape(-1, 3) * step_m, brows["rest"]]).astype(np.float32)
+        deltas = np.zeros((len(facts["morphs"]), *rest.shape), dtype=np.float32)
+        deltas[:, count:] = brows["deltas"]
+        first, moves = 0, arrays["moves"].reshape(-1, 3)
+        for delta, morph in zip(deltas, facts["morphs"], strict=True):
+            last = first + morph["count"]
+            delta[arrays["moved"][first:last]] = moves[first:last] * morph["step_m"]
+            first = last
+        triangles = arrays["triangles"].reshape(-1, 3).astype(np.int64)
+        is_hair = arrays["part"][triangles[:, 0]] == facts["parts"].index("hair")
+        grown = (arrays["open_sky"][triangles] > _UNDER_SKIN).any(axis=1) if hair else False
         return HumanHead(
-            rest=np.concatenate([self.rest, rest]).astype(np.float32),
-            deltas=np.concatenate([self.deltas, deltas], axis=1).astype(np.float32),
-            share=np.concatenate([self.share, share]),
-            triangles=np.concatenate([self.triangles, triangles + len(self.rest)]),
-            colors=np.concatenate([self.colors, colors]),
+            rest=rest,
+            deltas=deltas,
+            share=np.concatenate([arrays["share"] / np.float32(255), np.ones(len(brows["rest"]), np.float32)]),
+            triangles=np.concatenate([triangles[~is_hair | grown], brows["triangles"] + count]),
+            colors=brows["colors"],
         )
 
 
-def load_human(folder: Path | None = None) -> HumanHead:
-    """Load the shipped head, or the one in `folder`. Raises ConfigError when the file is not such a mesh."""
-    file = (folder or data_dir("sim") / "heads" / "human") / "head_arkit52.npz"
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            rest = arrays["vertices"][:, _TO_ROBOT_AXES].astype(np.float32)
-            names = [str(name) for name in arrays["names"]]
-            order = [names.index(name) for name in BLENDSHAPES]
-            deltas = arrays["deltas"][order][:, :, _TO_ROBOT_AXES].astype(np.float32)
-            triangles, colors = arrays["triangles"].astype(np.int64), arrays["colors"].astype(np.uint8)
-    except (OSError, KeyError, ValueError, IndexError) as error:
-        raise ConfigError(f"{file}: not a head with the 52 ARKit morphs: {error}") from error
-    shown = triangles[~_lower_lashes(rest, colors)[triangles].any(axis=1)]
-    head = HumanHead(
-        rest=rest, deltas=deltas, share=share_of_rotation(rest), triangles=shown, colors=_painted(rest, colors)
-    )
-    for side in (1.0, -1.0):
-        head = _with_ribbon(head, *_brow_outline(side))
-    return head
-
-
-def parts_of(colors: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return the part of each vertex (V,), as an index into `PARTS`, by the colors (V, 3) of a loaded head."""
-    out = np.zeros(len(colors), dtype=np.int64)
-    for color, name in _PART_COLORS.items():
-        out[(colors == color).all(axis=1)] = PARTS.index(name)
-    return out
-
-
-def share_of_rotation(rest: Floats) -> Floats:
-    """Return the share (V,) of vertices (V, 3), see `HumanHead.share`."""
-    along = (rest[:, 2] + 0.5 * rest[:, 0] - _SHARE_FROM_M) / (_SHARE_TO_M - _SHARE_FROM_M)
-    t = np.clip(along, 0.0, 1.0)
-    out: Floats = (t * t * (3 - 2 * t)).astype(np.float32)
-    return out
-
-
-def _painted(rest: Floats, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the file's colours with red lips and a lighter iris, which can be seen from a distance."""
-    out = colors.astype(np.float64)
-    out[(colors == _DARK_IRIS).all(axis=1)] = _IRIS
-    across = np.abs(rest[:, 1]) / _LIP_HALF_WIDTH_M
-    above = rest[:, 2] - _LIP_LINE_M
-    reach = np.where(above > 0, _UPPER_LIP_M * (1 - across**1.5), _LOWER_LIP_M * (1 - across**2))
-    red = np.clip((reach - np.abs(above)) / _LIP_SOFT_M, 0.0, 1.0)
-    red *= (across < 1) & (rest[:, 0] > _LIP_DEPTH_M) & (colors == _SKIN).all(axis=1)
-    out += red[:, None] * (np.array(_LIP) - out)
-    return np.round(out).astype(np.uint8)
-
-
-def _lower_lashes(rest: Floats, colors: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return (V,) the lower lashes, which are left out: they look like a dark ring under the eye."""
-    below: NDArray[np.bool_] = (colors == _LASH).all(axis=1) & (rest[:, 2] < _EYE_LINE_M)
-    return below
-
-
-def _rotated(points: NDArray[np.floating], turns: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Rotate each point (V, 3) by its own roll, pitch, yaw (V, 3): R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    x, y, z = points.T
-    (sr, sp, sy), (cr, cp, cy) = np.sin(turns.T), np.cos(turns.T)
-    y, z = cr * y - sr * z, sr * y + cr * z
-    x, z = cp * x + sp * z, -sp * x + cp * z
-    x, y = cy * x - sy * y, sy * x + cy * y
-    return np.stack([x, y, z], axis=1)
-
-
-def grid_triangles(rings: int, spokes: int) -> NDArray[np.int64]:
-    """Return triangles that face outward: rings from the top down, spokes counterclockwise seen from above."""
-    ring, spoke = np.meshgrid(np.arange(rings - 1), np.arange(spokes), indexing="ij")
-    a, b = ring * spokes + spoke, ring * spokes + (spoke + 1) % spokes
-    c, d = a + spokes, b + spokes
-    return np.concatenate([np.stack([a, c, d], axis=-1).reshape(-1, 3), np.stack([a, d, b], axis=-1).reshape(-1, 3)])
-
-
-# --- brows ------------------------------------------------------------------------------------------------------
-
-
-def _brow_outline(side: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return lower and upper edge (n, 2), y and z: from beside the nose outward, thick inside, thin at the tail."""
-    t = np.linspace(0.0, 1.0, _BROW_POINTS)
-    y = 0.0115 + 0.040 * t
-    z = 0.0485 + 0.0075 * np.sin(np.pi * (0.12 + 0.70 * t)) - 0.0045 * t**2
-    thick = 0.0036 * np.minimum(1.0, 0.55 + 3 * t) * (1 - 0.75 * t**1.6)
-    return np.stack([side * y, z - thick], axis=1), np.stack([side * y, z + thick], axis=1)
-
-
-def _with_ribbon(head: HumanHead, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> HumanHead:
-    count = len(lower)
-    corners, weights = _on_skin(head, np.concatenate([lower, upper]))
-    rest = np.einsum("pc,pcd->pd", weights, head.rest[corners])
-    rest[:, 0] += _BROW_LIFT_M
-    deltas = np.einsum("pc,kpcd->kpd", weights, head.deltas[:, corners])
-    near, far = np.arange(count - 1), np.arange(1, count)
-    strips = np.concatenate(
-        [np.stack([near, far, far + count], axis=1), np.stack([near, far + count, near + count], axis=1)]
-    )
-    share, colors = np.ones(2 * count, np.float32), np.full((2 * count, 3), _BROW, np.uint8)
-    return head.joined(rest, deltas, share, strips, colors)
-
-
-def _on_skin(head: HumanHead, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return corners (P, 3) and weights (P, 3) of the foremost skin triangle at each point (P, 2) of the face plane."""
-    skin = (head.colors == _SKIN).all(axis=1)
-    triangles = head.triangles[skin[head.triangles].all(axis=1)]
-    a, b, c = (head.rest[triangles[:, k], 1:].astype(np.float64) for k in range(3))
-    area = _cross(b - a, c - a)
-    area = np.where(np.abs(area) < 1e-12, np.inf, area)
-    corners, weights = [], []
-    for point in points:
-        inner = np.stack([_cross(c - b, point - b), _cross(a - c, point - c), _cross(b - a, point - a)], axis=1)
-        inner /= area[:, None]
-        depth = (inner * head.rest[triangles, 0]).sum(axis=1)
-        best = int(np.argmax(np.where((inner >= -1e-9).all(axis=1) & np.isfinite(area), depth, -np.inf)))
-        corners.append(triangles[best])
-        weights.append(inner[best])
-    return np.array(corners), np.array(weights)
-
-
-def _cross(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    out: NDArray[np.float64] = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return out
-
-
-# --- the file that a browser draws ------------------------------------------------------------------------------------
-
-
-def packed_human(head: HumanHead) -> bytes:
-    """Return the file for `head`. Raises ConfigError where the vertices' light in open_sky.npy does not fit the mesh.
-
-    Little-endian: uint32 length of the JSON, the JSON, then arrays, each at a multiple of 4 bytes, in the order of
-    `arrays` ([name, type, count]). Lengths are int16 steps of `step_m`; a morph's are int16 steps of its own `step_m`,
-    only for the vertices that it moves. Axes are the robot's. The first `skinned` vertices are those of the mesh,
-    before the brows, which the browser paints; hair and collar follow, and no morph moves them.
-    """
-    file = data_dir("sim") / "heads" / "human" / "open_sky.npy"
-    try:
-        open_sky: NDArray[np.uint8] = np.load(file, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{file}: {error}") from error
-    count = len(open_sky)
-    if count > len(head.rest):
-        raise ConfigError(f"open_sky.npy is of {count} vertices, the head has {len(head.rest)}")
-    skin = head.triangles[(head.triangles < count).all(axis=1)]
-    parts = parts_of(head.colors[:count])
-    grown, worn = hair(head.rest[:count][parts == 0]), collar()
-    rest = np.concatenate([head.rest[:count], grown.vertices, worn.vertices])
-    last = count + len(grown.vertices)
-    share = np.concatenate(
-        [head.share[:count], share_of_rotation(grown.vertices.astype(np.float32)), 0 * worn.open_sky]
-    )
-    part = np.concatenate([parts, np.full(len(grown.vertices), 2), np.full(len(worn.vertices), 3)])
-    scalp = np.zeros(len(rest))
-    scalp[:count] = np.clip(above_hairline(rest[:count])[1] / 0.014 + 0.75, 0, 1) * (np.abs(rest[:count, 1]) < 0.0755)
-    arrays: list[tuple[str, NDArray[np.generic]]] = [
-        ("rest", np.round(rest / _STEP_M).astype("<i2")),
-        ("share", np.round(share * 255).astype("u1")),
-        ("part", part.astype("u1")),
-        ("open_sky", np.concatenate([open_sky, grown.open_sky, worn.open_sky])),
-        ("scalp", np.round(scalp * 255).astype("u1")),
-        ("triangles", np.concatenate([skin, grown.triangles + count, worn.triangles + last]).astype("<u2")),
-    ]
-    morphs, moved = _morphs(head, count)
-    facts = {"version": FORMAT_VERSION, "vertices": len(rest), "skinned": count, "step_m": _STEP_M, "parts": PARTS}
-    return _packed(facts | {"morphs": morphs}, arrays + moved)
-
-
-def _packed(facts: dict[str, object], arrays: list[tuple[str, NDArray[np.generic]]]) -> bytes:
-    listed = [[name, array.dtype.name, array.size] for name, array in arrays]
-    text = json.dumps(facts | {"arrays": listed}, separators=(",", ":")).encode()
-    out = bytearray(struct.pack("<I", len(text)) + text)
-    for _, array in arrays:
-        out += bytes(-len(out) % 4) + array.tobytes()
-    return bytes(out)
-
-
-def _morphs(head: HumanHead, count: int) -> tuple[list[dict[str, object]], list[tuple[str, NDArray[np.generic]]]]:
-    """Return the facts of each morph, and two arrays: the vertices that each moves, and by how much."""
-    facts: list[dict[str, object]] = []
-    vertices, steps = [], []
-    for name, delta in zip(BLENDSHAPES, head.deltas[:, :count], strict=True):
-        moved = np.flatnonzero(np.abs(delta).max(axis=1) > _MOVED_M)
-        step_m = float(np.abs(delta).max()) / 32767
-        facts.append({"name": name, "count": len(moved), "step_m": step_m})
-        vertices.append(moved.astype("<u2"))
-        steps.append(np.round(delta[moved] / step_m).astype("<i2").ravel())
-    return facts, [("moved", np.concatenate(vertices)), ("moves", np.concatenate(steps))]
-
-
-# --- short hair, and a collar over the cut edge of the neck ----------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Vertices (V, 3) metres, triangles (T, 3), 0..255 how much of the sky each vertex sees."""
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    open_sky: NDArray[np.uint8]
-
-
-def with_hair(head: HumanHead) -> HumanHead:
-    """Return the head of `load_human` with hair, which turns with the skull and which no morph moves."""
-    grown = hair(head.rest[parts_of(head.colors) == PARTS.index("skin")])
-    shown = grown.triangles[(grown.open_sky[grown.triangles] > _UNDER_SKIN).any(axis=1)]
-    vertices, light = grown.vertices.astype(np.float32), grown.open_sky[:, None] / 255
-    colors = (1 - light) * np.array(_HAIR[0]) + light * np.array(_HAIR[1])
-    deltas = np.zeros((len(BLENDSHAPES), len(vertices), 3), np.float32)
-    painted = np.round(colors).astype(np.uint8)
-    return head.joined(vertices, deltas, share_of_rotation(vertices), shown, painted)
-
-
-def hair(skin: Floats) -> Surface:
-    """Return short hair: the skull, smoothed, plus `_hair_depth`; beyond the hairline it is below the skin."""
-    (x0, x1), y, (z0, z1) = _EAR
-    ear = (skin[:, 0] > x0) & (skin[:, 0] < x1) & (np.abs(skin[:, 1]) > y) & (skin[:, 2] > z0) & (skin[:, 2] < z1)
-    away = skin[~ear] - _CENTRE
-    radius = np.linalg.norm(away, axis=1)
-    rays = _rays()
-    from scipy.spatial import cKDTree  # a run loads no scipy
-
-    distance, nearest = cKDTree(away / radius[:, None]).query(rays.reshape(-1, 3), k=8)
-    weight = 1 / (distance + 0.02) ** 3
-    skull = ((weight * radius[nearest]).sum(axis=1) / weight.sum(axis=1)).reshape(rays.shape[:2])
-    for _ in range(3):
-        skull = _smoothed(skull)
-    on_skull = _CENTRE + rays * skull[..., None]
-    depth = _hair_depth(on_skull)
-    for _ in range(2):
-        depth = _smoothed(depth)
-    grid = _CENTRE + rays * (skull + depth)[..., None]
-    open_sky = np.clip(0.3 + depth / 0.016 * 0.7, 0.0, 1)
-    return Surface(grid.reshape(-1, 3), grid_triangles(_RINGS, _SPOKES), np.round(open_sky * 255).astype("u1").ravel())
-
-
-def _rays() -> NDArray[np.float64]:
-    """Return (rings, spokes, 3) directions about the crown's axis, from it down to 160 degrees."""
-    axis = _AXIS / np.linalg.norm(_AXIS)
-    side = np.array([0.0, 1.0, 0.0])
-    front = np.cross(side, axis)
-    angle = np.linspace(0.0, np.radians(160), _RINGS)[:, None, None]
-    around = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)[None, :, None]
-    out: NDArray[np.float64] = np.cos(angle) * axis + np.sin(angle) * (np.cos(around) * front + np.sin(around) * side)
-    return out
-
-
-def above_hairline(at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the direction of points (..., 3) about the vertical [deg], and metres above the hairline there."""
-    azimuth = np.degrees(np.arctan2(at[..., 1], at[..., 0] - 0.01))
-    line = np.interp(
-        np.abs(azimuth),
-        [0, 25, 42, 55, 66, 74, 84, 96, 108, 122, 150, 180],
-        [0.104, 0.107, 0.100, 0.083, 0.052, 0.024, 0.030, 0.046, 0.026, -0.020, -0.052, -0.058],
-    )
-    line = line - 0.004 * np.exp(-(((azimuth + 14) / 16) ** 2)) + 0.0022 * np.sin(np.radians(azimuth) * 13)
-    return azimuth, at[..., 2] - line
-
-
-def _hair_depth(at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return metres of hair above the skull at points (..., 3): full on top, swept to the side, thin at the nape."""
-    azimuth, above = above_hairline(at)
-    full = np.interp(at[..., 2], [-0.06, 0.02, 0.09, 0.13, 0.17], [0.003, 0.006, 0.010, 0.015, 0.017])
-    quiff = 0.006 * np.exp(-(((azimuth + 14) / 34) ** 2)) * np.exp(-(((at[..., 2] - 0.140) / 0.020) ** 2))
-    locks = 0.0011 * np.sin(np.radians(azimuth) * 17 + 60 * at[..., 2]) + 0.0008 * np.sin(np.radians(azimuth) * 31 + 2)
-    grown = np.clip(above / 0.034, -1, 1)
-    rise = 1 - (1 - np.maximum(grown, 0)) ** 2.4
-    depth = np.where(grown > 0, 0.0006 + rise * (full + quiff + locks), grown * -_SUNK_M * 3)
-    out: NDArray[np.float64] = np.maximum(depth, 2 * _SUNK_M)
-    return out
-
-
-def _smoothed(grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Average each value with its four neighbours; periodic along the spokes, held at the first and last ring."""
-    rings = np.concatenate([grid[:1], grid, grid[-1:]])
-    around = np.roll(grid, 1, axis=1) + np.roll(grid, -1, axis=1)
-    out: NDArray[np.float64] = (2 * grid + rings[:-2] + rings[2:] + around) / 6
-    out[0] = out[0].mean()
-    return out
-
-
-def collar() -> Surface:
-    """Return a collar that hides the cut edge of the neck."""
-    from scipy.interpolate import PchipInterpolator
-
-    angle = np.linspace(0, 2 * np.pi, _COLLAR_SPOKES, endpoint=False)
-    rows = []
-    knots = np.arange(len(_COLLAR_RINGS))
-    rings = PchipInterpolator(knots, np.array(_COLLAR_RINGS))(np.linspace(0, knots[-1], 3 * knots[-1] + 1))
-    for z, x, depth, width, power in rings:
-        c, s = np.cos(angle), np.sin(angle)
-        across, along = np.sign(s) * np.abs(s) ** (2 / power) * width, np.sign(c) * np.abs(c) ** (2 / power) * depth
-        lower = np.clip((z + 0.130) / 0.03, 0, 1) * -0.003 * np.clip(c, 0, 1) ** 2  # under the chin
-        rows.append(np.stack([x + along, across, z + lower], axis=1))
-    sky = np.full((len(rows), _COLLAR_SPOKES), 235.0)
-    sky[:5], sky[10:15] = 90, 150
-    return Surface(np.concatenate(rows), grid_triangles(len(rows), _COLLAR_SPOKES), sky.astype("u1").ravel())
+def _read_arrays(data: bytes) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return the facts and the arrays of a mesh file (see `sim/heads/human/README.md`)."""
+    (length,) = struct.unpack_from("<I", data)
+    facts, at = json.loads(data[4 : 4 + length]), 4 + length
+    arrays = {}
+    for name, kind, count in facts["arrays"]:
+        at += -at % 4
+        arrays[name] = np.frombuffer(data, np.dtype(kind).newbyteorder("<"), count, at)
+        at += arrays[name].nbytes
+    return facts, arrays

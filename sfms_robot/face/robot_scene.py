@@ -26,6 +26,7 @@ from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.urdf import MOVING, Urdf, read_urdf
 from sfms_robot.frames import POSE_CHANNELS, Doubles
+from sfms_robot.signals.rotations import rotation, seen_from
 
 URDF_FILE: Final = "robot.urdf"
 MESHES: Final = (".stl", ".obj", ".ply", ".dae")
@@ -76,8 +77,8 @@ class RobotScene:
         self._scale = np.array([each.scale for each in follows.values()])
         self._offset = np.array([each.offset for each in follows.values()])
         self.joints = tuple(self.follows.values())
-        self._pose = None if neck is None else _NeckPose.of(head, neck, self.robot, set(self.joints))
-        if neck is not None and self._pose is not None:
+        self._pose = None if neck is None else _NeckPose(head, neck, self.robot, self.joints)
+        if neck is not None and self._pose is not None and self._pose.joints:
             self.joints += self._pose.joints
             self.undriven = tuple(name for name in self.undriven if name not in neck.joints)
         if not self.joints:
@@ -167,63 +168,50 @@ def _following(head: Head, robot: Urdf, file: Path, description: RobotDescriptio
 
 
 class _NeckPose:
-    """The URDF joints of the head's pose by forward kinematics, and of the rods below it."""
+    """The URDF joints of the head's pose by forward kinematics, and of the rods of a platform below it."""
 
-    def __init__(self, head: Head, neck: ForwardNeck, joints: Sequence[str], rods: PlatformRods | None) -> None:
-        self.joints = tuple(joints)
-        self._neck, self._rods, self._pose = neck, rods, np.zeros(6)
-        self._columns = np.array([list(head.joints).index(name) for name in neck.joints], dtype=np.intp)
-        legs = neck.joints[-6:]
+    def __init__(self, head: Head, neck: ForwardNeck, robot: Urdf, taken: Sequence[str]) -> None:
+        self._platform = head.kinematics if isinstance(head.kinematics, StewartPlatform) else None
+        legs = () if self._platform is None else neck.joints[-6:]
         table = _POSE + tuple(f"{leg}_rod_{part}" for leg in legs for part in ("swing", "lean"))
-        self._order = np.array([table.index(name) for name in joints], dtype=np.intp)
-
-    @classmethod
-    def of(cls, head: Head, neck: ForwardNeck, robot: Urdf, taken: set[str]) -> _NeckPose | None:
-        """Return the joints that the URDF has; None where it has none of them."""
-        platform = head.kinematics if isinstance(head.kinematics, StewartPlatform) else None
-        legs = () if platform is None else neck.joints
-        rods = [f"{leg}_rod_{part}" for leg in legs for part in ("swing", "lean")]
-        joints = [name for name in _free(robot) if name in (*_POSE, *rods) and name not in taken]
-        if not joints:
-            return None
-        return cls(head, neck, joints, PlatformRods(platform) if platform else None)
+        self.joints = tuple(name for name in _free(robot) if name in table and name not in taken)
+        self._order = np.array([table.index(name) for name in self.joints], dtype=np.intp)
+        self._columns = np.array([list(head.joints).index(name) for name in neck.joints], dtype=np.intp)
+        self._neck, self._pose = neck, np.zeros(6)
 
     def values(self, read: Doubles) -> Doubles:
-        angles = read[self._columns]
-        pose = self._neck.forward(angles, self._home(angles))
-        if np.isfinite(pose).all():
-            self._pose = pose
-        table = self._pose if self._rods is None else np.concatenate([self._pose, self._rod_angles(angles)])
-        return np.asarray(table[self._order])
-
-    def _home(self, angles: Doubles) -> Doubles:
-        """Return the start of the search for the pose: home on the turned body, never the last pose.
+        """Return the values of `joints`. The search for the pose starts at home on the turned body.
 
         Several poses fit the legs of a platform. After a gap in what is read the last pose may lead to one that the
         head can only reach by falling through, and from there it would never come back.
         """
+        angles = read[self._columns]
         body = angles[0] if self._neck.turns_body else 0.0
-        return np.array([0.0, 0.0, body, 0.0, 0.0, 0.0])
-
-    def _rod_angles(self, angles: Doubles) -> Doubles:
-        """Return (12,) swing and lean of each leg."""
-        assert self._rods is not None
-        roll, pitch, yaw = self._pose[:3]
-        body = angles[0] if self._neck.turns_body else 0.0
-        rotation, place = _turn(roll, pitch, yaw - body), _turn(0.0, 0.0, -body) @ self._pose[3:]
-        return self._rods.angles(angles[-6:], rotation, place).ravel()
+        pose = self._neck.forward(angles, np.array([0.0, 0.0, body, 0.0, 0.0, 0.0]))
+        if np.isfinite(pose).all():
+            self._pose = pose
+        if self._platform is None:
+            return self._pose[self._order]
+        rods = rod_angles(self._platform, angles[-6:], seen_from(body, self._pose))
+        return np.concatenate([self._pose, rods.ravel()])[self._order]
 
 
-def _turn(roll: float, pitch: float, yaw: float) -> Doubles:
-    """R = Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+def rod_angles(platform: StewartPlatform, cranks_rad: Doubles, pose: Doubles) -> Doubles:
+    """Return swing and lean (6, 2) of the rods, for crank angles (6,) and the head's pose (6,) seen from the body.
+
+    In the frame of a leg's servo (x, y in the plane of the crank, z its axis; see `config.kinematics.Leg`) the crank's
+    tip is (c cos a, c sin a, 0), and the rod's head end is q = T H b with T = `servo_from_body`, H the head's pose,
+    and b = `rod_end_m`. Seen from the turned crank the rod points along d = Rz(-a) (q - tip) / l: it swings about z by
+    atan2(dy, dx) and leans out of the crank's plane, about -y, by asin(dz).
+    """
+    servo = np.array([leg.servo_from_body for leg in platform.legs])  # (6, 3, 4)
+    ends = np.array([leg.rod_end_m for leg in platform.legs]) @ rotation(pose[:3]).T  # (6, 3)
+    ends += pose[3:] + [0.0, 0.0, platform.home_height_m]
+    q = np.einsum("lij,lj->li", servo[..., :3], ends) + servo[..., 3]
+    cosine, sine = np.cos(cranks_rad), np.sin(cranks_rad)
+    x = cosine * q[:, 0] + sine * q[:, 1] - platform.crank_m
+    y = cosine * q[:, 1] - sine * q[:, 0]
+    return np.stack([np.arctan2(y, x), np.arctan2(q[:, 2], np.hypot(x, y))], axis=-1)
 
 
 def mesh_problem(file: Path, folders: Sequence[Path]) -> str | None:
@@ -246,27 +234,3 @@ def _mesh_file(name: str, folder: Path, own: Path, packages: Mapping[str, str]) 
         package, _, inside = name.removeprefix("package://").partition("/")
         return own / packages.get(package, folder / package) / inside
     return folder / name.removeprefix("file://")
-
-
-class PlatformRods:
-    """The geometry of the six rods of one platform: two angles each, for a picture of it.
-
-    In the frame of a leg's servo (x, y in the plane of the crank, z its axis; see `config.kinematics.Leg`) the crank's
-    tip is (c cos a, c sin a, 0), and the rod's head end is q = T H b with T = `servo_from_body`, H the head's pose seen
-    from the body, and b = `rod_end_m`. Seen from the turned crank the rod points along d = Rz(-a) (q - tip) / l: it
-    swings about z by atan2(dy, dx) and leans out of the crank's plane, about -y, by asin(dz).
-    """
-
-    def __init__(self, config: StewartPlatform) -> None:
-        self._servo = np.array([leg.servo_from_body for leg in config.legs])  # (6, 3, 4)
-        self._ends_m = np.array([leg.rod_end_m for leg in config.legs])  # (6, 3)
-        self._crank_m, self._height_m = config.crank_m, config.home_height_m
-
-    def angles(self, cranks_rad: Doubles, rotation: Doubles, place_m: Doubles) -> Doubles:
-        """Return swing and lean (6, 2) for crank angles (6,) and the pose seen from the body, R (3, 3), t (3,)."""
-        ends = self._ends_m @ rotation.T + place_m + [0.0, 0.0, self._height_m]
-        q = np.einsum("lij,lj->li", self._servo[..., :3], ends) + self._servo[..., 3]
-        cosine, sine = np.cos(cranks_rad), np.sin(cranks_rad)
-        x = cosine * q[:, 0] + sine * q[:, 1] - self._crank_m
-        y = cosine * q[:, 1] - sine * q[:, 0]
-        return np.stack([np.arctan2(y, x), np.arctan2(q[:, 2], np.hypot(x, y))], axis=-1)

@@ -18,6 +18,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
+from sfms_robot.signals.rotations import from_vector, rotation
 
 TURNING: Final = ("revolute", "continuous")
 MOVING: Final = (*TURNING, "prismatic")
@@ -74,7 +75,7 @@ class JointElement:
         """Return the transform (4, 4) from the child to the child at value 0."""
         out = np.eye(4)
         if self.kind in TURNING:
-            out[:3, :3] = _about(self.axis, value)
+            out[:3, :3] = from_vector(self.axis * value)
         elif self.kind == "prismatic":
             out[:3, 3] = self.axis * value
         return out
@@ -247,9 +248,7 @@ class _UrdfReader:
 
     def _origin(self, element: Element, where: str) -> Doubles:
         origin, out = element.find("origin"), np.eye(4)
-        roll, pitch, yaw = self._floats(origin, "rpy", where, 3, (0.0, 0.0, 0.0))
-        x, y, z = np.eye(3)
-        out[:3, :3] = _about(z, yaw) @ _about(y, pitch) @ _about(x, roll)
+        out[:3, :3] = rotation(np.array(self._floats(origin, "rpy", where, 3, (0.0, 0.0, 0.0))))
         out[:3, 3] = self._floats(origin, "xyz", where, 3, (0.0, 0.0, 0.0))
         return out
 
@@ -277,11 +276,3 @@ class _UrdfReader:
 
     def _wrong(self, kind: str, name: str, problem: str) -> ConfigError:
         return ConfigError(f"{self._file}: {kind} {name!r} {problem}")
-
-
-def _about(axis: Doubles, angle: float) -> Doubles:
-    """Return the rotation (3, 3) about an axis of unit length (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    out: Doubles = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
-    return out

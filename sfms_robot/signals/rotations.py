@@ -79,6 +79,18 @@ def twist(matrix: Doubles, axis: int) -> Doubles:
     return angle
 
 
+def from_vector(vector: Doubles) -> Doubles:
+    """Return R (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    half_sinc = np.sinc(angle / (2 * np.pi))
+    cross = np.zeros((*vector.shape[:-1], 3, 3))
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0] = x, y, z
+    cross[..., 1, 2], cross[..., 2, 0], cross[..., 0, 1] = -x, -y, -z
+    out: Doubles = np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half_sinc**2 * (cross @ cross)
+    return out
+
+
 def angle_between(one: Doubles, other: Doubles) -> Doubles:
     """Return the smallest turn [rad] (...) between two rotations; exact for small ones too."""
     chord = np.linalg.norm(one - other, axis=(-2, -1)) / np.sqrt(8.0)

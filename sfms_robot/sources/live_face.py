@@ -13,10 +13,10 @@ import re
 import socket
 import struct
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -37,6 +37,7 @@ from sfms_robot.frames import (
     Sighting,
 )
 from sfms_robot.signals.rotations import angles_of, rotation
+from sfms_robot.sources.live_voice import SourcePart
 
 logger = logging.getLogger(__name__)
 
@@ -67,78 +68,74 @@ _TIMESPEC: Final = struct.Struct("@ll")
 _OLDEST_S: Final = 5.0  # a datagram that seems older, or of the future: the wall clock was set meanwhile
 
 
-@dataclass(frozen=True)
-class FaceArgument:
-    """PLACE, "" where none is given, and the pose channels to flip."""
+def parse_face_argument(kind: str, argument: str) -> tuple[str, Floats]:
+    """Return PLACE, "" where none is given, and (6,): -1 for every pose channel to flip, 1 for the others.
 
-    place: str
-    flip: tuple[str, ...] = ()
-
-    @property
-    def signs(self) -> Floats:
-        """(6,) -1 for every pose channel that is flipped, 1 for the others."""
-        return np.array([-1.0 if name in self.flip else 1.0 for name in POSE_CHANNELS], dtype=np.float32)
-
-
-def parse_face_argument(kind: str, argument: str) -> FaceArgument:
-    """Return the parsed text behind `KIND:`. Raises ConfigError for another option, and for an unknown channel."""
-    place, flip = argument, ()
+    `argument`: the text behind `KIND:`. Raises ConfigError for another option, and for an unknown channel.
+    """
+    place, signs = argument, np.ones(len(POSE_CHANNELS), dtype=np.float32)
     while option := _OPTION.search(place):
         name, value = option.groups()
-        channels = tuple(value.split("+"))
         if name != "flip":
             raise ConfigError(f"--face {kind}: option {name!r} is not known (flip)")
-        for channel in channels:
+        for channel in value.split("+"):
             if channel not in POSE_CHANNELS:
                 raise ConfigError(
                     f"--face {kind}: flip = {channel!r}: expected a pose channel (valid: {', '.join(POSE_CHANNELS)})"
                 )
-        place, flip = place[: option.start()], (*channels, *flip)
-    return FaceArgument(place, flip)
+            signs[POSE_CHANNELS.index(channel)] = -1.0
+        place = place[: option.start()]
+    return place, signs
 
 
-class LiveFace:
-    """Takes motion (58,) with its `time.monotonic` time; gives sightings with the person's rest taken off.
+class LiveFace(SourcePart):
+    """`ports.Sight` of faces that are put: motion (58,) with its time; the person's rest is taken off.
 
     Several faces between two questions become one, the newest, with the strongest blink of all: none falls between
-    frames. Not thread-safe.
+    frames. All methods may be called from any thread.
 
-    signs: (6,) factors of the pose channels.
+    signs: (6,) factors of the pose channels; None: 1.
     """
 
-    def __init__(self, signs: Floats) -> None:
-        self._signs = signs
-        self._neutral: Neutral | None = None
+    def __init__(self, signs: Floats | None = None, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(now)
+        self._lock = threading.Lock()
+        self._signs: Floats = np.ones(len(POSE_CHANNELS), dtype=np.float32) if signs is None else signs
+        self._rest = RestingFace()
         self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
         self._sighting: Sighting | None = None
         self._origin_s = 0.0
 
     def start(self, origin_s: float) -> None:
-        """Set loop time 0 to `origin_s` of `time.monotonic`. What was learned of the person stays."""
-        self._origin_s, self._sighting = origin_s, None
+        """Set loop time 0 to `origin_s` of `time.monotonic`. The person's rest stays known."""
+        with self._lock:
+            self._origin_s, self._sighting = origin_s, None
 
     def forget(self) -> None:
-        """Forget what was learned of the person: another camera, or another person."""
-        self._neutral = None
+        """Forget the person's rest: another camera, or another person."""
+        with self._lock:
+            self._rest = RestingFace()
 
     def put(self, time_s: float, motion: Floats, place_m: Floats | None = None) -> None:
         """Take a face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
-        self._waiting.append((time_s, motion, place_m))
+        with self._lock:
+            self._waiting.append((time_s, motion, place_m))
 
     def at(self, time_s: float) -> Sighting | None:
         """Return as `ports.Sight.at`."""
-        seen = []
-        while self._waiting and self._waiting[0][0] - self._origin_s <= time_s:
-            seen.append(self._waiting.popleft())
-        if seen:
-            seen_s, newest, place_m = seen[-1]
-            motion = newest.copy()
-            motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
-            motion[POSE] *= self._signs
-            # Learned in monotonic time: a start does not tear it apart.
-            motion, self._neutral = relative_to_rest(motion, seen_s, self._neutral)
-            self._sighting = Sighting(FaceFrame.of(seen_s - self._origin_s, motion), place_m=place_m)
-        return self._sighting
+        with self._lock:
+            seen = []
+            while self._waiting and self._waiting[0][0] - self._origin_s <= time_s:
+                seen.append(self._waiting.popleft())
+            if seen:
+                seen_s, newest, place_m = seen[-1]
+                motion = newest.copy()
+                motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
+                motion[POSE] *= self._signs
+                # Learned in monotonic time: a start does not tear it apart.
+                face = FaceFrame.of(seen_s - self._origin_s, self._rest.relative(motion, seen_s))
+                self._sighting = Sighting(face, place_m=place_m)
+            return self._sighting
 
 
 # --- a person's face at rest, learned while they are seen ---------------------------------------------------------
@@ -156,45 +153,37 @@ class LiveFace:
 # - a face that was away for 10 s may come back as another person: learning begins again.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Neutral:
-    """A memory of one person. A value: `relative_to_rest` gives a new one.
+class RestingFace:
+    """The face of one person at rest, learned from all faces so far.
 
     Attributes:
-        time_s: of the last face.
-        sampled_s: of the last sample.
         samples: (n, 58) newest last, n <= 240.
-        estimate: (58,) rest, by the samples.
-        rest: (58,) what is taken off now.
     """
 
-    time_s: float
-    sampled_s: float
-    samples: Floats
-    estimate: Floats
-    rest: Floats
+    def __init__(self) -> None:
+        self.samples: Floats = np.zeros((0, MOTION_DIM), dtype=np.float32)
+        self._estimate: Floats = np.zeros(MOTION_DIM, dtype=np.float32)
+        self._rest = self._estimate  # follows it
+        self._seen_s = self._sampled_s = -math.inf
 
+    def relative(self, motion: Floats, time_s: float) -> Floats:
+        """Return what the person does (58,) in one face (58,) of `time_s`; faces come in order of time.
 
-def relative_to_rest(motion: Floats, time_s: float, state: Neutral | None) -> tuple[Floats, Neutral]:
-    """Return what the person does (58,) in one face (58,) of `time_s`, and the new memory; faces come in order of time.
-
-    `state` None: no person was seen yet. Shapes stay within 0..1.
-    """
-    state = _learned(np.asarray(motion, dtype=np.float32), time_s, state)
-    return _relative(motion, state.rest), state
-
-
-def _learned(motion: Floats, time_s: float, state: Neutral | None) -> Neutral:
-    if state is None or not 0 <= time_s - state.time_s <= AWAY_S:
-        rest = _rest(motion[None])
-        return Neutral(time_s=time_s, sampled_s=time_s, samples=motion[None], estimate=rest, rest=rest)
-    samples, sampled_s, estimate = state.samples, state.sampled_s, state.estimate
-    if time_s - sampled_s >= _SAMPLE_S:
-        samples = np.concatenate([samples[1 - _SAMPLES :], motion[None]])
-        sampled_s, estimate = time_s, _rest(samples)
-    follow = 1.0 - math.exp((state.time_s - time_s) / _EASE_S)
-    rest = state.rest + np.float32(follow) * (estimate - state.rest)
-    return Neutral(time_s=time_s, sampled_s=sampled_s, samples=samples, estimate=estimate, rest=rest)
+        Shapes stay within 0..1.
+        """
+        motion = np.asarray(motion, dtype=np.float32)
+        known = 0 <= time_s - self._seen_s <= AWAY_S
+        if not known or time_s - self._sampled_s >= _SAMPLE_S:
+            before = self.samples[1 - _SAMPLES :] if known else self.samples[:0]
+            self.samples, self._sampled_s = np.concatenate([before, motion[None]]), time_s
+            self._estimate = _rest(self.samples)
+        if known:
+            follow = 1.0 - math.exp((self._seen_s - time_s) / _EASE_S)
+            self._rest = self._rest + np.float32(follow) * (self._estimate - self._rest)
+        else:
+            self._rest = self._estimate
+        self._seen_s = time_s
+        return _relative(motion, self._rest)
 
 
 def _rest(samples: Floats) -> Floats:
@@ -236,57 +225,23 @@ class Datagram(NamedTuple):
     time_s: float
 
 
-class DatagramSocket:
-    """A UDP socket that is read without blocking. Raises PortError when it cannot be bound.
-
-    Attributes:
-        address: host and port it is bound to.
-        errors: times the system could not read, as when a network goes down.
-    """
-
-    def __init__(self, kind: str, host: str, port: int) -> None:
-        """`kind`: of `--face`, for the error's text."""
-        self.errors = 0
-        where = f"--face {kind}: UDP port {port} on {host}"
-        try:
-            family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        except (OSError, UnicodeError) as error:
-            raise PortError(f"{where}: {getattr(error, 'strerror', None) or error}") from error
-        try:
-            self._socket.bind(address)
-            self._socket.setblocking(False)
-            bound = self._socket.getsockname()
-            self.address: tuple[str, int] = (str(bound[0]), int(bound[1]))
-            self._stamped = sys.platform == "linux" and _ask_for_stamps(self._socket)
-        except OSError as error:
-            self._socket.close()
-            if error.errno == errno.EADDRINUSE:
-                raise PortError(f"{where} is used by another program ({kind}:PORT takes another)") from error
-            raise PortError(f"{where}: {error.strerror or error}") from error
-
-    def waiting(self) -> Iterator[Datagram]:
-        """Yield what has come in, oldest first, no more than a call may take. Never blocks, never raises."""
-        wall_s, now_s = time.time(), time.monotonic()
-        for _ in range(PACKETS_PER_CALL):
-            try:
-                if sys.platform == "win32":
-                    data, sender = self._socket.recvfrom(LONGEST_PACKET)
-                    age_s = 0.0
-                else:
-                    data, extra, _, sender = self._socket.recvmsg(LONGEST_PACKET, 64 if self._stamped else 0)
-                    age_s = _age_s(extra, wall_s)
-            except BlockingIOError:
-                return
-            except OSError:  # a network that went down: the next call tries again
-                self.errors += 1
-                return
-            yield Datagram(data, sender, now_s - age_s)
-            if time.monotonic() - now_s > LONGEST_CALL_S:
-                return
-
-    def close(self) -> None:
-        self._socket.close()
+def _bound(kind: str, host: str, port: int) -> socket.socket:
+    """Return a UDP socket that does not block. Raises PortError when it cannot be bound."""
+    where = f"--face {kind}: UDP port {port} on {host}"
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        bound = socket.socket(family, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise PortError(f"{where}: {getattr(error, 'strerror', None) or error}") from error
+    try:
+        bound.bind(address)
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRINUSE:
+            raise PortError(f"{where} is used by another program ({kind}:PORT takes another)") from error
+        raise PortError(f"{where}: {error.strerror or error}") from error
+    bound.setblocking(False)
+    return bound
 
 
 def _ask_for_stamps(of: socket.socket) -> bool:
@@ -318,49 +273,49 @@ class Decoder(Protocol):
     def statistics(self) -> Mapping[str, Any]: ...
 
 
-class UdpSight:
-    """`ports.Sight` of one person, seen by another device. The time from lens to wire is not known here.
+class UdpSight(LiveFace):
+    """`ports.Sight` of `--face KIND[:PORT|HOST[:PORT]][,flip=...]`: one person, seen by another device.
 
-    hint: what a person has to do when no packets come, in words.
+    The time from lens to wire is not known here.
+
+    Args:
+        hint: returns what a person has to do so that packets come, for the bound host and port, and for the flag that
+            would also take packets of other machines ("" where this one does).
 
     Attributes:
+        address: host and port that are bound.
         lost: the sender is silent.
+
+    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
     """
 
-    duration_s: float | None = None
-    latency_s = 0.0
-
-    def __init__(self, kind: str, opened: DatagramSocket, decoder: Decoder, face: LiveFace, hint: str) -> None:
-        self._kind = kind
-        self._socket = opened
-        self._decoder = decoder
-        self._face = face
-        self._hint: str | None = hint
+    def __init__(
+        self, kind: str, argument: str, usual_port: int, decoder: Decoder, hint: Callable[[str, int, str], str]
+    ) -> None:
+        place, signs = parse_face_argument(kind, argument)
+        super().__init__(signs)
+        self._kind, self._decoder = kind, decoder
+        self._socket = _bound(kind, *parse_endpoint(kind, place, usual_port))
+        self.address: tuple[str, int] = self._socket.getsockname()[:2]
+        self._stamped = sys.platform == "linux" and _ask_for_stamps(self._socket)
+        host, port = self.address
+        wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
+        self._hint: str | None = hint(host, port, wider if is_loopback(host) else "")
         self._sender: Address | None = None
-        self._heard_s, self._origin_s = -float("inf"), 0.0
-        self.lost = False
+        self._heard_s = -math.inf
         self._said: set[str] = set()
         self._refusal_said = False
-        self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused"), 0)
-        logger.warning("%s: %s", kind, hint)
-
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port that are bound."""
-        return self._socket.address
-
-    def start(self, origin_s: float) -> None:
-        self._origin_s = origin_s
-        self._face.start(origin_s)
+        self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused", "errors"), 0)
+        logger.warning("%s: %s", kind, self._hint)
 
     def at(self, time_s: float) -> Sighting | None:
-        for packet in self._socket.waiting():
+        for packet in self._packets():
             self.feed(packet)
         self.lost = self._sender is not None and self._origin_s + time_s - self._heard_s > LOST_S
         if self._hint is not None and time_s > UNHEARD_S:
             logger.warning("%s: no packets yet: %s", self._kind, self._hint)
             self._hint = None
-        return self._face.at(time_s)
+        return super().at(time_s)
 
     def feed(self, packet: Datagram) -> None:
         """Take one packet, of any sender. Never raises."""
@@ -382,20 +337,40 @@ class UdpSight:
         if self._sender is None:
             logger.info("%s: packets come from %s", self._kind, address_text(*packet.sender[:2]))
             self._refusal_said = False
-            self._face.forget()
+            self.forget()
         self._sender, self._heard_s, self._hint = packet.sender, time_s, None
         if motion is not None:
             self._counts["faces"] += 1
-            self._face.put(time_s, motion)
+            self.put(time_s, motion)
 
     def statistics(self) -> dict[str, Any]:
         """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
         sender = None if self._sender is None else address_text(*self._sender[:2])
-        return {**self._counts, "errors": self._socket.errors, "sender": sender, **self._decoder.statistics()}
+        return {**self._counts, "sender": sender, **self._decoder.statistics()}
 
     def close(self) -> None:
         """Give the port back. Idempotent."""
         self._socket.close()
+
+    def _packets(self) -> Iterator[Datagram]:
+        """Yield what has come in, oldest first, no more than a call may take. Never blocks, never raises."""
+        wall_s, now_s = time.time(), time.monotonic()
+        for _ in range(PACKETS_PER_CALL):
+            try:
+                if sys.platform == "win32":
+                    data, sender = self._socket.recvfrom(LONGEST_PACKET)
+                    age_s = 0.0
+                else:
+                    data, extra, _, sender = self._socket.recvmsg(LONGEST_PACKET, 64 if self._stamped else 0)
+                    age_s = _age_s(extra, wall_s)
+            except BlockingIOError:
+                return
+            except OSError:  # a network that went down: the next call tries again
+                self._counts["errors"] += 1
+                return
+            yield Datagram(data, sender, now_s - age_s)
+            if time.monotonic() - now_s > LONGEST_CALL_S:
+                return
 
     def _refuse(self, sender: Address) -> None:
         self._counts["refused"] += 1
@@ -432,23 +407,6 @@ def addresses_of_this_machine() -> list[str]:
                 continue
             addresses.append(socket.inet_ntoa(answer[20:24]))
     return [address for address in addresses if not address.startswith("127.")]
-
-
-def open_udp_sight(
-    kind: str, argument: str, usual_port: int, decoder: Decoder, hint: Callable[[str, int, str], str]
-) -> UdpSight:
-    """Open `--face KIND[:PORT|HOST[:PORT]][,flip=...]`.
-
-    `hint`: returns what a person has to do when no packets come, for the bound host and port, and for the flag that
-    would also take packets from other machines ("" where this one does).
-
-    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
-    """
-    given = parse_face_argument(kind, argument)
-    opened = DatagramSocket(kind, *parse_endpoint(kind, given.place, usual_port))
-    host, port = opened.address
-    wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
-    return UdpSight(kind, opened, decoder, LiveFace(given.signs), hint(host, port, wider if is_loopback(host) else ""))
 
 
 def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:

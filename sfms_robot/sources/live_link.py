@@ -23,7 +23,7 @@ import numpy as np
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
-from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
+from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
 
 PORT: Final = 11111  # what the app suggests
 VERSION: Final = 6
@@ -51,10 +51,8 @@ class LiveLinkPacket(NamedTuple):
         values: (61,) as the phone sent them, or None: no face is seen.
     """
 
-    device: str
     subject: str
     number: int
-    part: float
     rate_hz: float
     values: Floats | None
 
@@ -65,11 +63,11 @@ def parse_packet(data: bytes) -> LiveLinkPacket:
         raise PacketError("an empty packet")
     if data[0] != VERSION:
         raise PacketError(_other_version(data))
-    device, start = _name(data, 1)
+    _, start = _name(data, 1)  # the device's id
     subject, start = _name(data, start)
     if len(data) < start + _FRAME.size:
         raise PacketError("a packet that is cut off")
-    number, part, numerator, denominator, count = _FRAME.unpack_from(data, start)
+    number, _, numerator, denominator, count = _FRAME.unpack_from(data, start)
     if count not in (0, _COUNT):
         raise PacketError(f"a packet of another number of values than {_COUNT}")
     if len(data) != start + _FRAME.size + 4 * count:
@@ -77,7 +75,7 @@ def parse_packet(data: bytes) -> LiveLinkPacket:
     if numerator <= 0 or denominator <= 0:
         raise PacketError(f"frame rate: expected positive numbers, got {numerator}/{denominator}")
     values = None if count == 0 else _values(data, start + _FRAME.size)
-    return LiveLinkPacket(device, subject, number, part, numerator / denominator, values)
+    return LiveLinkPacket(subject, number, numerator / denominator, values)
 
 
 def _values(data: bytes, start: int) -> Floats:
@@ -189,9 +187,9 @@ def open_live_link(argument: str) -> UdpSight:
     """Open `--face live-link[:PORT|HOST[:PORT]][,flip=...]`; without HOST only this machine can send.
 
     The log says what to type for a phone, which is another machine, and the address for its app. Raises as
-    `open_udp_sight`.
+    `UdpSight`.
     """
-    return open_udp_sight("live-link", argument, PORT, LiveLinkDecoder(), _hint)
+    return UdpSight("live-link", argument, PORT, LiveLinkDecoder(), _hint)
 
 
 def _hint(host: str, port: int, wider: str) -> str:

@@ -1,8 +1,8 @@
 """The microphone: `--audio mic[:DEVICE]`, and what the robot says into it: `--agent-audio device:DEVICE`.
 
 PortAudio, resampling and echo cancellation are in a process of their own (`listen`), which sends frames of the loop. A
-device that gives nothing for `LOST_S` went away: the process ends, and the next one begins with a PortAudio that sees
-the devices of that moment, until the device is back.
+device that gives nothing for a fifth of a second went away: the process ends, and the next one begins with a PortAudio
+that sees the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from sfms_robot.ports import Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
 from sfms_robot.sources.live_voice import LiveVoice, window
-from sfms_robot.sources.sound_devices import BLOCK_S, device_name, open_capture
+from sfms_robot.sources.sound_devices import BLOCK_S, Capture, device_name
 from sfms_robot.sources.worker import SourceWorker
 
 logger = logging.getLogger(__name__)
@@ -106,10 +107,10 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
     device that cannot be opened, and when one goes away.
     """
     with ExitStack() as stack:
-        mic = stack.enter_context(open_capture(recording.device, recording.flag))
+        mic = stack.enter_context(Capture.opened(recording.device, recording.flag))
         said = None
         if recording.reference is not None:
-            said = stack.enter_context(open_capture(recording.reference, recording.reference_flag))
+            said = stack.enter_context(Capture.opened(recording.reference, recording.reference_flag))
         reference = SpeechFrames() if recording.spoken else None if said is None else LiveVoice()
         front_end = FrontEnd(reference)
         given = yield mic.device.name
@@ -244,17 +245,21 @@ class Microphone:
     """`ports.Voice` of the worker `listen`. Only `close` blocks.
 
     Args:
-        agent: what the robot says, of a program or a file: it is taken out of what is heard.
+        early_s: by how much the robot's own voice is to be known earlier; None: it does not come by calls.
 
     Attributes:
+        own_voice: takes what the robot says in frame i, in order from 1 on, (640,) or None; None where none comes.
         device: its name.
         latency_s: the longest time from the end of a frame to the moment that its worker sent it, lately.
     """
 
     duration_s: float | None = None
 
-    def __init__(self, worker: SourceWorker, agent: OwnVoice | None = None) -> None:
-        self._worker, self._agent = worker, agent
+    def __init__(self, worker: SourceWorker, early_s: float | None = None) -> None:
+        self._worker = worker
+        self.own_voice = None if early_s is None else self._take_own_voice
+        self._early = round((early_s or 0.0) * AUDIO_HZ)
+        self._own: deque[Floats] = deque([_SILENCE], maxlen=SAID_FRAMES)
         self._origin_s: float | None = None
         self._frames: dict[int, MicrophoneFrame] = {}
         self.device = ""
@@ -278,9 +283,7 @@ class Microphone:
         """Return as `ports.Voice`."""
         if self._origin_s is None:
             return None
-        if self._agent is not None and self._agent.ask(index + 1):
-            self._tell(self._origin_s, *self._agent.newest())
-        elif self._agent is None and abs(self._speed_rad_s - self._sent_speed_rad_s) > _NEW_SPEED_RAD_S:
+        if self.own_voice is None and abs(self._speed_rad_s - self._sent_speed_rad_s) > _NEW_SPEED_RAD_S:
             self._tell(self._origin_s)
         self._collect(self._origin_s + (index + 1) * FRAME_S, index)
         heard = self._frames.pop(index, None)
@@ -291,6 +294,16 @@ class Microphone:
     def moves(self, speed_rad_s: float) -> None:
         """Set how fast the joints of the head near it move, all together: their noise is judged by that."""
         self._speed_rad_s = speed_rad_s
+
+    def _take_own_voice(self, index: int, said: Floats | None) -> None:
+        """Send the worker what the robot says in a frame, with the frames before it.
+
+        A voice that is to be known early is so much sooner in what is sent, with silence at its end.
+        """
+        self._own.append(_SILENCE if said is None else said)
+        if self._origin_s is not None:
+            samples = np.concatenate([*self._own, _SILENCE[: self._early]])[self._early :]
+            self._tell(self._origin_s, index + 1 - len(self._own), samples)
 
     def _tell(self, origin_s: float, first: int = 0, said: Floats | None = None) -> None:
         self._sent_speed_rad_s = self._speed_rad_s
@@ -334,57 +347,6 @@ class Microphone:
             self._late_frames += 1
 
 
-class OwnVoice:
-    """`ports.Voice` around what the robot says: the microphone gets it as soon as the grid does.
-
-    Attributes:
-        outlet: the programs behind it.
-    """
-
-    def __init__(self, inner: Voice) -> None:
-        self._inner = inner
-        self.duration_s, self.latency_s = inner.duration_s, inner.latency_s
-        self.outlet = getattr(inner, "outlet", None)
-        self._early = round(getattr(inner, "early_s", 0.0) * AUDIO_HZ)
-        self._frames: dict[int, Floats | None] = {}
-        self._asked = 0  # frame
-
-    @property
-    def lost(self) -> bool:
-        return bool(getattr(self._inner, "lost", False))
-
-    def start(self, origin_s: float) -> None:
-        self._inner.start(origin_s)
-
-    def ask(self, index: int) -> bool:
-        """Fetch frame `index` and those before it that were not fetched yet; return whether there were any."""
-        before, self._asked = self._asked, max(index, self._asked)
-        for each in range(before + 1, self._asked + 1):
-            self._frames[each] = self._inner.take(each)
-            self._frames.pop(each - SAID_FRAMES, None)
-        return self._asked > before
-
-    def newest(self) -> tuple[int, Floats]:
-        """Return the first of the newest frames, and their samples; silence where nothing was said.
-
-        A voice that is to be known early (`early_s`) is so much sooner here, with silence at its end.
-        """
-        indices = range(max(0, self._asked + 1 - SAID_FRAMES), self._asked + 1)
-        frames = [self._frames.get(index) for index in indices]
-        samples = np.concatenate([_SILENCE if frame is None else frame for frame in frames])
-        return indices[0], np.concatenate([samples[self._early :], _SILENCE[: self._early]])
-
-    def take(self, index: int) -> Floats | None:
-        self.ask(index)
-        return self._frames.get(index)
-
-    def statistics(self) -> Mapping[str, Any]:
-        return self._inner.statistics()
-
-    def close(self) -> None:
-        self._inner.close()
-
-
 class Loudspeaker:
     """`ports.Voice` of what the robot says, where a device records it: late, as any recording.
 
@@ -417,19 +379,15 @@ class Loudspeaker:
         self._recorder.close()
 
 
-def open_microphone(argument: str) -> Microphone:
+def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
     """Open `--audio mic[:DEVICE]`: a number, a name or a part of one; "" is the default.
 
+    What `agent` says is taken out of what is heard; the microphone gets it by `own_voice`.
     Blocks until it records, a second. Raises ConfigError for a device that is not there and without PortAudio,
     PortError where there is no microphone or it cannot be opened.
     """
-    return _opened(_recording(argument))
-
-
-def open_microphone_beside(argument: str, agent: Voice) -> tuple[Microphone, OwnVoice]:
-    """Open as `open_microphone`, without what `agent` says; return also the voice to use instead of `agent`."""
-    own = OwnVoice(agent)
-    return _opened(_recording(argument, spoken=True), own), own
+    early_s = None if agent is None else getattr(agent, "early_s", 0.0)
+    return _opened(_recording(argument, spoken=agent is not None), early_s)
 
 
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
@@ -448,10 +406,10 @@ def _recording(argument: str, flag: str = MIC_FLAG, **more: Any) -> Recording:
     return Recording(device=device_name(argument, flag), flag=flag, **more)
 
 
-def _opened(recording: Recording, agent: OwnVoice | None = None) -> Microphone:
+def _opened(recording: Recording, early_s: float | None = None) -> Microphone:
     name = "microphone" if recording.flag == MIC_FLAG else "loudspeaker"
     worker = SourceWorker(name, listen, recording)
     worker.wait()
-    microphone = Microphone(worker, agent)
+    microphone = Microphone(worker, early_s)
     logger.warning("%s: %s", name, microphone.device)
     return microphone

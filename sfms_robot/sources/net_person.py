@@ -25,7 +25,7 @@ import numpy as np
 
 from sfms_robot.endpoint import LOOPBACK, address_text, host_and_port, is_loopback, token_admits
 from sfms_robot.errors import ConfigError, PacketError, PortError
-from sfms_robot.frames import AUDIO_HZ, POSE_CHANNELS, Floats, Sighting
+from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.net_messages import (
@@ -291,14 +291,17 @@ class NetPerson:
 
 
 class _NetPart(SourcePart):
-    """A part of a person that another program feeds: it joins the server, which runs from its start to its close."""
+    """A part of a person that another program feeds: it joins the server, which runs from its start to its close.
+
+    argument: [HOST:]PORT, "" for the usual one; raises ConfigError, PortError. Or a server that runs already.
+    """
 
     feed: ClassVar[str]
 
-    def __init__(self, outlet: NetPerson) -> None:
-        super().__init__(outlet.now)
-        self.outlet = outlet
-        outlet.join(self.feed, cast(Any, self))
+    def __init__(self, argument: str | NetPerson) -> None:
+        self.outlet = _person(FLAGS[self.feed], argument) if isinstance(argument, str) else argument
+        super().__init__(self.outlet.now)
+        self.outlet.join(self.feed, cast(Any, self))
 
     def start(self, origin_s: float) -> None:
         self.outlet.start(origin_s)
@@ -312,36 +315,21 @@ class _NetPart(SourcePart):
 
 
 class NetVoice(_NetPart, PushedVoice):
-    """`ports.Voice` of a person whose sound another program has."""
+    """`ports.Voice` of a person whose sound another program has: `--audio push[:[HOST:]PORT]`."""
 
     feed = "voice"
 
 
 class NetSight(_NetPart, PushedSight):
-    """`ports.Sight` of a person that another program sees."""
+    """`ports.Sight` of a person that another program sees: `--face push[:[HOST:]PORT]`."""
 
     feed = "face"
 
 
 class NetSpeech(_NetPart, PushedSpeech):
-    """`ports.Voice` of a robot for which another program speaks."""
+    """`ports.Voice` of a robot for which another program speaks: `--agent-audio tcp[:[HOST:]PORT]`."""
 
     feed = "speech"
-
-
-def open_net_voice(argument: str) -> NetVoice:
-    """Open `--audio push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetVoice(_person("--audio push", argument))
-
-
-def open_net_sight(argument: str) -> NetSight:
-    """Open `--face push[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetSight(_person("--face push", argument))
-
-
-def open_net_speech(argument: str) -> NetSpeech:
-    """Open `--agent-audio tcp[:[HOST:]PORT]`. Raises ConfigError, PortError."""
-    return NetSpeech(_person("--agent-audio tcp", argument))
 
 
 def _person(flag: str, argument: str) -> NetPerson:
@@ -431,14 +419,12 @@ class BrowserVoice(PushedVoice):
         return {**super().statistics(), **self._visitor.statistics()}
 
 
-class BrowserSight(SourcePart):
+class BrowserSight(LiveFace):
     """`ports.Sight` of a visitor. Their rest is learned while they are seen, as that of a person at a webcam."""
 
     def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
-        super().__init__(now)
+        super().__init__(now=now)
         self._visitor = visitor
-        self._lock = threading.Lock()
-        self._face = LiveFace(np.ones(len(POSE_CHANNELS), np.float32))
 
     def see(self, face: Floats | None, seen_s: float | None = None, attention: float | None = None) -> None:
         """Take their face (58,) at `seen_s` of `time.monotonic`, None: now; without one the last grows old and is lost.
@@ -446,21 +432,7 @@ class BrowserSight(SourcePart):
         Their attention is judged here, by head and eyes.
         """
         if face is not None:
-            with self._lock:
-                self._face.put(self._now() if seen_s is None else seen_s, face)
-
-    def forget(self) -> None:
-        """Expect another person."""
-        with self._lock:
-            self._face.forget()
-
-    def start(self, origin_s: float) -> None:
-        with self._lock:
-            self._face.start(origin_s)
-
-    def at(self, time_s: float) -> Sighting | None:
-        with self._lock:
-            return self._face.at(time_s)
+            self.put(self._now() if seen_s is None else seen_s, face)
 
     def statistics(self) -> Mapping[str, Any]:
         return self._visitor.statistics()

@@ -2,16 +2,16 @@
 
 1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index yields exactly one frame, in order: a listener counts.
 2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
-   given without (an overrun: empty audio), and what comes of it after that is discarded. No frame waits for longer than
+   given without (an overrun: empty audio), and the rest of it is discarded. No frame waits for longer than
    `LONGEST_WAIT_S`, for a plan looks only a third of a second ahead.
 3. The face is the newest one, and none when that is older than `FACE_S` at the end of the frame. Of a recording it is
    no newer than that; of something live up to one frame newer, when the frame is given later: a face does not wait for
    the voice beside it, which comes some tens of milliseconds late.
-4. What the robot says is given one frame early, as a program that speaks knows it: frame i carries the samples of frame
-   i + 1, for which a listener plans its lips while it hears frame i.
+4. The robot's own voice is given one frame early, as a program that speaks knows it: frame i carries the samples of
+   frame i + 1, for which a listener plans its lips while it hears frame i.
 5. A sighting without the person's attention gets it from their face (`signals.attention`).
-6. What is not finite or not of the right shape is left out here, once for all: one NaN would stay in a listener for
-   good.
+6. Values that are not finite or not of the right shape are left out here, once for all: one NaN would stay in a
+   listener for good.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
@@ -73,6 +74,7 @@ class PairedSource:
         self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
+        self._says: tuple[int, Floats | None] = (0, None)  # the newest frame of the robot's voice
         self._overruns = 0
         self._wait_ms = Quantiles()
         self._face_age_ms = Quantiles()
@@ -129,6 +131,9 @@ class PairedSource:
         waited_s = max(0.0, now_s - (index + 1) / FRAME_HZ)
         heard: Floats | None = _NONE
         if self._voice is not None:
+            own_voice = getattr(self._voice, "own_voice", None)
+            if own_voice is not None and self._says[0] <= index:
+                own_voice(index + 1, self._own_voice(index + 1))
             heard, self.latency_s = self._voice.take(index), self._voice.latency_s
             if heard is None and waited_s < min(self.latency_s + ALLOWANCE_S, LONGEST_WAIT_S) - _EPS_S:
                 return None
@@ -149,8 +154,13 @@ class PairedSource:
                 sighting = None
             else:
                 self._face_age_ms.add(max(0.0, age_s * 1e3))
-        says = None if self._agent is None else self._agent.take(index + 1)
-        return self._judge.frame(index, heard, sighting, says)
+        return self._judge.frame(index, heard, sighting, self._own_voice(index + 1))
+
+    def _own_voice(self, index: int) -> Floats | None:
+        """Return what the robot says in a frame, asked for once."""
+        if self._agent is not None and self._says[0] < index:
+            self._says = (index, self._agent.take(index))
+        return self._says[1]
 
 
 class JudgedSource:
@@ -215,57 +225,40 @@ class FrameJudge:
         face = None if seen is None else self._face(index, seen.face)
         if seen is None or face is None:
             return SpeakerFrame(time_s, audio, None, own_audio)
-        place_m = self._place(index, seen.place_m)
-        attention = self._attention(index, seen.attention)
-        if attention is None:
+        place_m = self._finite(index, "place", seen.place_m, (3,))
+        attention = seen.attention
+        if attention is None or self._finite(index, "attention", attention, ()) is None:
             attention, self._attending = attend(face, place_m, self._attending)
+        else:
+            attention = min(max(float(attention), 0.0), 1.0)
         return SpeakerFrame(time_s, audio, face, own_audio, attention, place_m)
 
     def _samples(self, index: int, what: str, given: Floats) -> Floats:
-        samples = np.asarray(given, dtype=np.float32)
-        if samples.shape == (0,):
-            return samples
-        if samples.shape != (FRAME_SAMPLES,):
-            self._leave_out(index, what, f"shape {samples.shape}, not ({FRAME_SAMPLES},)")
-            return _NONE
-        if not np.isfinite(samples).all():
-            self._leave_out(index, what, "samples that are not finite")
-            return _NONE
-        clipped: Floats = np.clip(samples, -1.0, 1.0)
-        return clipped
+        samples = _NONE if np.shape(given) == (0,) else self._finite(index, what, given, (FRAME_SAMPLES,))
+        return _NONE if samples is None else np.clip(samples, -1.0, 1.0)
 
     def _face(self, index: int, face: FaceFrame) -> FaceFrame | None:
-        pose, shapes = np.asarray(face.pose, dtype=np.float32), np.asarray(face.blendshapes, dtype=np.float32)
-        jaw = None if face.jaw_rad is None else np.asarray(face.jaw_rad, dtype=np.float32)
-        if pose.shape != (6,) or shapes.shape != (len(BLENDSHAPES),) or (jaw is not None and jaw.shape != (3,)):
-            self._leave_out(index, "face", f"pose {pose.shape} and blendshapes {shapes.shape}, not (6,) and (52,)")
-            return None
-        if not all(np.isfinite(part).all() for part in (pose, shapes, *(() if jaw is None else (jaw,)))):
-            self._leave_out(index, "face", "values that are not finite")
+        pose = self._finite(index, "face", face.pose, (6,))
+        shapes = None if pose is None else self._finite(index, "face", face.blendshapes, (len(BLENDSHAPES),))
+        jaw = None if shapes is None else self._finite(index, "face", face.jaw_rad, (3,))
+        if pose is None or shapes is None or (jaw is None) != (face.jaw_rad is None):
             return None
         end_s = (index + 1) / FRAME_HZ
         time_s = face.time_s if -FACE_S - _EPS_S <= face.time_s - end_s <= FRAME_S + _EPS_S else end_s
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
-    def _attention(self, index: int, attention: float | None) -> float | None:
-        if attention is None or math.isfinite(attention):
-            return None if attention is None else min(max(float(attention), 0.0), 1.0)
-        self._leave_out(index, "attention", "not finite")
-        return None
-
-    def _place(self, index: int, place_m: Floats | None) -> Floats | None:
-        if place_m is None:
+    def _finite(self, index: int, what: str, given: ArrayLike | None, shape: tuple[int, ...]) -> Floats | None:
+        """Return finite values of this shape; None for others, which count as left out, and where none are given."""
+        if given is None:
             return None
-        place = np.asarray(place_m, dtype=np.float32)
-        if place.shape == (3,) and np.isfinite(place).all():
-            return place
-        self._leave_out(index, "place", f"{place.tolist()} is not a point")
-        return None
-
-    def _leave_out(self, index: int, what: str, why: str) -> None:
+        values = np.asarray(given, dtype=np.float32)
+        if values.shape == shape and np.isfinite(values).all():
+            return values
+        got = "values that are not finite" if values.shape == shape else f"shape {values.shape}, not {shape}"
         if what not in self.left_out:
-            logger.warning("source: frame %d: %s left out: %s (said once)", index, what, why)
+            logger.warning("source: frame %d: %s left out: %s (said once)", index, what, got)
         self.left_out[what] = self.left_out.get(what, 0) + 1
+        return None
 
 
 def _length_s(voice: Voice | None, sight: Sight | None, agent: Voice | None) -> float | None:

@@ -1,11 +1,11 @@
 """The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in another process (`play`).
 
-What is said at a time leaves the loudspeaker `delay_s` later, by the device's own time stamps (`Playout`), and so it is
-reported to everything beside it: the listener's lips, the state of the run and the echo canceller follow what leaves,
-not when it was handed over. What did not leave is silence for them too.
+Speech leaves the loudspeaker `delay_s` after its time, by the device's own time stamps (`Playout`), and is reported at
+that time to everything beside it: the listener's lips, the state of the run and the echo canceller follow the sound
+that leaves. Speech that did not leave is silence for them too.
 
-A device that takes nothing for `LOST_S` went away: the process ends, and the next one begins with a PortAudio that sees
-the devices of that moment, until the device is back.
+A device that takes nothing for half a second went away: the process ends, and the next one begins with a PortAudio
+that sees the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
@@ -22,33 +22,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.errors import PortError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.signals.audio import at_positions
 from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, SampleClock, window
 from sfms_robot.sources.push import Spoken
-from sfms_robot.sources.sound_devices import (
-    DeviceStream,
-    SoundDevice,
-    choose_device,
-    device_name,
-    listed_devices,
-    portaudio,
-    started_stream,
-)
+from sfms_robot.sources.sound_devices import STEREO, DeviceStream, SoundDevice, device_name
 from sfms_robot.sources.worker import SourceWorker
 
 logger = logging.getLogger(__name__)
 
 FLAG: Final = "--play"
-LOST_S: Final = 0.5  # more than a busy computer takes
 STATISTICS_S: Final = 1.0
 TURN_S: Final = 0.02  # between two looks at messages of the parent
-_LATENCY_S: Final = 0.05  # requested from the device: what is on its way out cannot be hushed any more
-_START_LIMIT_S: Final = 1.0
 _MEASURED_BLOCKS: Final = 20  # from which the latency of the device is measured
 _LATEST_S: Final = 2.0  # a time stamp that is further away is of another clock
-_PLAYED: Final = 2  # channels that get the voice; those behind them are of a room
 JUMP_S: Final = 0.02
 _EXACT_S: Final = 0.0005  # where a stretch begins, and in silence
 _UNREPORTED: Final = 64  # silences that wait to be reported
@@ -100,7 +87,7 @@ def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
     Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing plays, for a device
     that cannot be opened, and when it goes away.
     """
-    with open_loudspeaker(wanted) as loudspeaker:
+    with PlaybackStream.opened(wanted, FLAG) as loudspeaker:
         playout = loudspeaker.playout
         told = yield PlaybackOpened(loudspeaker.device.name, loudspeaker.rate_hz, loudspeaker.latency_s())
         before: Speech | None = None
@@ -125,63 +112,38 @@ def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
 
 
 class PlaybackStream(DeviceStream):
-    """A device that plays what a `Playout` gives, by callbacks in a thread of PortAudio's."""
+    """A device that plays what a `Playout` gives; sound flows once its latency was measured."""
+
+    plays = True
+    wanted_latency_s = 0.05  # what is on its way out cannot be hushed any more
+    start_limit_s = 1.0
+    lost_s = 0.5  # more than a busy computer takes
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         super().__init__(device, rate_hz, channels)
         self.playout = Playout(rate_hz)
         self._latencies_s: list[float] = []
-        self._measured = threading.Event()
-        self._called_s = time.monotonic()
-
-    def start(self) -> bool:
-        """Open the stream; return whether it plays. Raises PortAudio's errors."""
-        import sounddevice
-
-        self._open(sounddevice.OutputStream, _LATENCY_S, self._called)
-        if not self._measured.wait(_START_LIMIT_S):
-            self.close()
-            return False
-        return True
 
     def latency_s(self) -> float:
         """Return the median of the newest blocks."""
-        return median(self._latencies_s[-_MEASURED_BLOCKS:])
-
-    def check(self) -> None:
-        """Raise PortError when it went away."""
-        if time.monotonic() - self._called_s > LOST_S:
-            raise PortError(f"{self.device.name} takes no more sound")
+        return median(self._latencies_s)
 
     def _called(self, out: Floats, n: int, stamp: Any, status: Any) -> None:
         now_s = self._called_s = time.monotonic()
         ahead_s = stamp.outputBufferDacTime - stamp.currentTime if stamp.outputBufferDacTime else None
-        latency_s = leaves_after_s(ahead_s, float(self._stream.latency) if self._stream is not None else _LATENCY_S)
+        usual_s = self.wanted_latency_s if self._stream is None else float(self._stream.latency)
+        latency_s = leaves_after_s(ahead_s, usual_s)
         self._latencies_s = [*self._latencies_s[1 - _MEASURED_BLOCKS :], latency_s]
         if len(self._latencies_s) == _MEASURED_BLOCKS:
-            self._measured.set()
+            self._flows.set()
         block = self.playout.block(n, now_s + latency_s, bool(status.output_underflow))
-        out[:, :_PLAYED] = np.clip(block, -1.0, 1.0)[:, None]
-        out[:, _PLAYED:] = 0.0
+        out[:, :STEREO] = np.clip(block, -1.0, 1.0)[:, None]
+        out[:, STEREO:] = 0.0  # those of a room
 
 
 def leaves_after_s(ahead_s: float | None, usual_s: float) -> float:
     """Return how long after the request a block leaves: what the device says, `ahead_s`, where that can be."""
     return ahead_s if ahead_s is not None and 0.0 <= ahead_s <= _LATEST_S else usual_s
-
-
-def open_loudspeaker(wanted: str) -> PlaybackStream:
-    """Open the device that is wanted, playing silence: at 16 kHz and mono where it takes that, else at its own rate.
-
-    Blocks until its latency is known, some tenths of a second. Raises ConfigError, PortError; see `play`.
-    """
-    sounddevice = portaudio(FLAG)
-    device = choose_device(listed_devices(FLAG, "sink"), wanted, FLAG, plays=True)
-    counts = (1, min(_PLAYED, device.channels), device.channels)
-    stream = started_stream(PlaybackStream, device, counts, sounddevice.check_output_settings, FLAG)
-    if stream is None:
-        raise PortError(f"{FLAG}: {device.name} is open, but takes no sound")
-    return stream
 
 
 # --- from what is said, in frames of the loop, to what the device is handed ---------------------------------------

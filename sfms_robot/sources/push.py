@@ -1,4 +1,4 @@
-"""A person handed over by calls, from any thread: sound, faces, and what the robot itself says.
+"""A person handed over by calls, from any thread: sound, faces, and the robot's own speech.
 
 A call brings no time of its own, so sound counts from the moment it arrives: a piece is played out from then on, and
 the next ones follow it. Where pieces are long, or arrive unevenly, that leaves room for the longest of them.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -19,14 +20,19 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.plugins import plug_in, plugins
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
-    from sfms_robot.ports import Source, Voice
+    from sfms_robot.ports import Source
     from sfms_robot.sources.net_person import PageVisitor
     from sfms_robot.sources.push import Spoken
 
 GROUP: Final = "sfms_robot.sources"
 DEFAULT_SPEAKER: Final = "facegood_1114_3_16"
 BROWSER: Final = "browser"  # the kind of a person in front of the page
-_METHODS: Final = {"voice": "take", "face": "at", "source": "read"}  # the method that only this one has
+# The method that a part has, and its name in errors.
+_PARTS: Final[Mapping[str, Mapping[str, str]]] = {
+    "--audio": {"take": "voice", "read": "source"},
+    "--face": {"at": "face"},
+    "--agent-audio": {"take": "voice"},
+}
 
 Kinds = Mapping[str, EntryPoint]
 
@@ -36,29 +42,27 @@ def _ours(**kinds: str) -> Kinds:
     return {name: EntryPoint(name, f"sfms_robot.sources.{place}", GROUP) for name, place in named.items()}
 
 
-VOICES: Final = _ours(
-    mic="microphone:open_microphone", push="net_person:open_net_voice", browser="net_person:open_browser_voice"
-)
-SIGHTS: Final = _ours(
-    live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
-    push="net_person:open_net_sight", browser="net_person:open_browser_sight",
-)  # fmt: skip
-AGENT_VOICES: Final = _ours(device="microphone:open_loudspeaker", tcp="net_person:open_net_speech")
+KINDS: Final[Mapping[str, Kinds]] = {
+    "--audio": _ours(
+        mic="microphone:open_microphone", push="net_person:NetVoice", browser="net_person:open_browser_voice"
+    ),
+    "--face": _ours(
+        live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
+        push="net_person:NetSight", browser="net_person:open_browser_sight",
+    ),
+    "--agent-audio": _ours(device="microphone:open_loudspeaker", tcp="net_person:NetSpeech"),
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class SourceKinds:
-    """Every kind of each flag by name, not yet imported; shipped kinds go before those of other packages."""
+def source_kinds(flag: str, others: Iterable[EntryPoint] | None = None) -> Kinds:
+    """Return every kind of a flag by name, not yet imported; shipped kinds go before those of other packages.
 
-    voices: Kinds
-    sights: Kinds
-    agent_voices: Kinds
-
-
-def source_kinds(others: Iterable[EntryPoint] | None = None) -> SourceKinds:
-    """Return every kind of source; `others`: those of other packages, None for the installed ones."""
+    `others`: those of other packages; None for the installed ones.
+    """
+    if flag == "--agent-audio":
+        return KINDS[flag]
     found = plugins(GROUP) if others is None else {each.name: each for each in others}
-    return SourceKinds({**found, **VOICES}, {**found, **SIGHTS}, AGENT_VOICES)
+    return {**found, **KINDS[flag]}
 
 
 def split_kind(value: str) -> tuple[str, str]:
@@ -100,18 +104,22 @@ def check_source(
     audio: str = "default",
     face: str = "auto",
     agent_audio: str = "none",
-    kinds: SourceKinds | None = None,
     play: str | None = None,
+    others: Iterable[EntryPoint] | None = None,
 ) -> None:
     """Check that there are such kinds, or such files, and something to play. Imports and opens nothing.
 
     Raises ConfigError with the choices.
     """
-    known = source_kinds() if kinds is None else kinds
     speakers = speaker_names()
-    _check("--audio", audio, known.voices, voice_file(audio), ["FILE.wav", "none", "default", *speakers])
-    _check("--face", face, known.sights, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"])
-    _check("--agent-audio", agent_audio, known.agent_voices, voice_file(agent_audio), ["FILE.wav", "none", *speakers])
+    for flag, value, file, files in (
+        ("--audio", audio, voice_file(audio), ["FILE.wav", "none", "default", *speakers]),
+        ("--face", face, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"]),
+        ("--agent-audio", agent_audio, voice_file(agent_audio), ["FILE.wav", "none", *speakers]),
+    ):
+        kinds = source_kinds(flag, others)
+        if split_kind(value)[0] not in kinds and value not in files and file is None:
+            raise ConfigError(f"{flag} {value}: no such file ({', '.join([*kinds, *files])})")
     if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
         choices = ", ".join(["FILE.wav", "tcp", *speakers])
         raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")
@@ -123,98 +131,77 @@ def open_source(
     duration_s: float | None = None,
     loop: bool = True,
     agent_audio: str = "none",
-    kinds: SourceKinds | None = None,
     agent: Spoken | None = None,
     play: str | None = None,
     visitor: PageVisitor | None = None,
+    others: Iterable[EntryPoint] | None = None,
 ) -> Source:
     """Open a person by the flags of a run.
 
     An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none.
+    own, else none. What the robot says is taken out of what a microphone hears.
 
     Args:
         loop: recordings start again when they end before `duration_s` does.
         agent: what the robot says, instead of `agent_audio`.
         play: the device that plays it; None: it is played elsewhere.
         visitor: the person in front of the page, where one is served.
+        others: see `source_kinds`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
     from sfms_robot.sources.paired import JudgedSource, PairedSource
 
-    known = source_kinds() if kinds is None else kinds
-    check_source(audio, face, agent_audio, known, play if agent is None else None)
+    check_source(audio, face, agent_audio, play if agent is None else None, others)
     if audio == "default":
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
+        opened = partial(_opened, failed, others)
+        voice: Any
         own: Any = agent
-        if play is not None:
-            from sfms_robot.sources.playback import open_playback
+        if own is None and split_kind(audio)[0] == "mic" and split_kind(agent_audio)[0] == "device":
+            from sfms_robot.sources.microphone import open_microphone_and_loudspeaker
 
-            own = open_playback(play, agent or _agent(agent_audio, known, failed))
-            failed.callback(own.close)
-        if split_kind(audio)[0] == "mic" and (own is not None or agent_audio != "none"):
-            voice, own = _conversation(audio, own or agent_audio, known, failed)
+            voice, own = open_microphone_and_loudspeaker(split_kind(audio)[1], split_kind(agent_audio)[1])
+            failed.callback(voice.close)
         else:
-            voice = _opened("--audio", audio, known.voices, ("voice", "source"), failed, visitor)
-        voice = voice or _recorded_voice(audio, again)
-        if voice is not None and hasattr(voice, _METHODS["source"]):
+            own = own or opened("--agent-audio", agent_audio) or _recorded_voice(agent_audio, False)
+            if play is not None:
+                from sfms_robot.sources.playback import open_playback
+
+                own = open_playback(play, own)
+                failed.callback(own.close)
+            voice = opened("--audio", audio, mic=own, browser=visitor) or _recorded_voice(audio, again)
+        if voice is not None and hasattr(voice, "read"):
             for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
                 if value not in (free, "none"):
                     raise ConfigError(f"{flag} {value}: --audio {audio} brings its own ({free})")
             source: Source = JudgedSource(voice)
         else:
-            sight = _opened("--face", face, known.sights, ("face",), failed, visitor)
+            sight = opened("--face", face, browser=visitor)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
-            source = PairedSource(voice, sight, own or _agent(agent_audio, known, failed), duration_s)
+            source = PairedSource(voice, sight, own, duration_s)
         failed.pop_all()
     return source
 
 
-def _check(flag: str, value: str, kinds: Kinds, file: Path | None, files: Iterable[str]) -> None:
-    (name, _), choices = split_kind(value), ", ".join([*kinds, *files])
-    if name not in kinds and value not in files and file is None:
-        raise ConfigError(f"{flag} {value}: no such file ({choices})")
+def _opened(failed: ExitStack, others: Iterable[EntryPoint] | None, flag: str, value: str, **more: Any) -> Any:
+    """Open a kind; None where `value` names none. `more`: by kind, what its callable takes besides its argument."""
+    name, argument = split_kind(value)
+    kind = source_kinds(flag, others).get(name)
+    if kind is None:
+        return None
+    part = plug_in(kind, argument, more[name]) if name in more else plug_in(kind, argument)
+    failed.callback(part.close)
+    if not any(hasattr(part, method) for method in _PARTS[flag]):
+        wanted = " or ".join(_PARTS[flag].values())
+        raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {wanted}")
+    return part
 
 
 def _existing(name: str) -> Path | None:
     return Path(name) if Path(name).exists() else None
-
-
-def _opened(
-    flag: str, value: str, kinds: Kinds, wanted: tuple[str, ...], failed: ExitStack, visitor: PageVisitor | None = None
-) -> Any:
-    """Open a kind; None where `value` names none."""
-    name, argument = split_kind(value)
-    if name not in kinds:
-        return None
-    kind = kinds[name]
-    part = plug_in(kind, argument, visitor) if name == BROWSER else plug_in(kind, argument)
-    failed.callback(part.close)
-    if not any(hasattr(part, _METHODS[each]) for each in wanted):
-        raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {' or '.join(wanted)}")
-    return part
-
-
-def _conversation(audio: str, agent: Voice | str, known: SourceKinds, failed: ExitStack) -> tuple[Any, Any]:
-    """Open a microphone, and what the robot says: its echo is taken out of what the microphone hears."""
-    from sfms_robot.sources.microphone import open_microphone_and_loudspeaker, open_microphone_beside
-
-    device = split_kind(audio)[1]
-    both: tuple[Any, Any]
-    if isinstance(agent, str) and split_kind(agent)[0] == "device":
-        both = open_microphone_and_loudspeaker(device, split_kind(agent)[1])
-    else:
-        both = open_microphone_beside(device, _agent(agent, known, failed) if isinstance(agent, str) else agent)
-    failed.callback(both[0].close)
-    return both
-
-
-def _agent(value: str, known: SourceKinds, failed: ExitStack) -> Any:
-    agent = _opened("--agent-audio", value, known.agent_voices, ("voice",), failed)
-    return agent or _recorded_voice(value, False)
 
 
 def _recorded_voice(name: str, loop: bool) -> Any:

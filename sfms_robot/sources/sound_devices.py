@@ -10,12 +10,13 @@ import os
 import queue
 import re
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, Final, Literal, Self, TypeVar
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 
@@ -29,14 +30,10 @@ _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
 _HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
 _PACTL_LIMIT_S: Final = 5.0
 BLOCK_S: Final = 0.01
-LOST_S: Final = 0.2  # a microphone that gives nothing for so long went away
-_LATENCY_S: Final = 0.06  # requested from a microphone; with less, a sound server's stream seldom starts
-_START_LIMIT_S: Final = 0.3
 _OLDEST_S: Final = 1.0  # a time stamp that is further away is of another clock
 _DENORMAL: Final = np.finfo(np.float32).tiny  # what is smaller costs four times the processor
-_MIXED: Final = 2  # channels; of more the first is taken, where arrays put what they made of the others
+STEREO: Final = 2
 _STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
-_VARIABLES: Final = {"source": "PULSE_SOURCE", "sink": "PULSE_SINK"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +46,8 @@ class SoundDevice:
         channels: at most.
         rate_hz: that it has without being asked for another.
         default: the one that is taken where none is named.
-        server: what it is of the sound server; None: a device of PortAudio's own.
+        plays: it plays; else it records.
+        of_server: a source or a sink of the sound server, not a device of PortAudio's own.
     """
 
     name: str
@@ -57,45 +55,82 @@ class SoundDevice:
     channels: int
     rate_hz: float
     default: bool = False
-    server: Literal["source", "sink"] | None = None
+    plays: bool = False
+    of_server: bool = False
 
     @property
     def label(self) -> str:
         """Text by which a person names it, number first where it has one."""
-        return self.name if self.server else f"{self.number} {self.name}"
+        return self.name if self.of_server else f"{self.number} {self.name}"
 
     @property
     def monitor(self) -> bool:
         """It records what a loudspeaker is given."""
-        return self.server == "source" and self.name.endswith(".monitor")
+        return self.of_server and not self.plays and self.name.endswith(".monitor")
 
     @contextmanager
     def selected(self) -> Iterator[None]:
         """Let what is opened inside by `number` be this device. Not for several threads."""
-        if self.server is None:
-            yield
-            return
-        variable = _VARIABLES[self.server]
+        variable = "PULSE_SINK" if self.plays else "PULSE_SOURCE"
         before = os.environ.get(variable)
-        os.environ[variable] = self.name
+        if self.of_server:
+            os.environ[variable] = self.name
         try:
             yield
         finally:
-            del os.environ[variable]
-            if before is not None:
-                os.environ[variable] = before
+            if self.of_server:
+                os.environ.pop(variable)
+                os.environ.update({} if before is None else {variable: before})
 
 
 class DeviceStream:
-    """A stream of PortAudio's on one device. Base of what records and of what plays; closed by its `with` block."""
+    """A stream of PortAudio's on one device. Base of what records and of what plays; closed by its `with` block.
+
+    Attributes:
+        plays: it plays; else it records.
+        wanted_latency_s: requested from the device.
+        start_limit_s: after so long without sound it counts as not started.
+        lost_s: after so long without a callback it went away.
+    """
+
+    plays: ClassVar[bool]
+    wanted_latency_s: ClassVar[float]
+    start_limit_s: ClassVar[float]
+    lost_s: ClassVar[float]
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         self.device, self.rate_hz, self.channels = device, rate_hz, channels
         self._stream: Any = None
+        self._flows = threading.Event()  # set by `_called`
+        self._called_s = time.monotonic()
 
-    def start(self) -> bool:
-        """Open the stream; return whether sound flows. Raises PortAudio's errors."""
-        raise NotImplementedError
+    @classmethod
+    def opened(cls, wanted: str, flag: str) -> Self:
+        """Open the device that is wanted: at 16 kHz and mono where it takes that, else at its own rate.
+
+        Blocks until sound flows, some tenths of a second. Raises ConfigError for a device that is not there and without
+        PortAudio; PortError where there is none, and for one that cannot be opened.
+        """
+        sounddevice = portaudio(flag)
+        devices = listed_devices(flag, cls.plays)
+        device = choose_device(devices, wanted, flag, cls.plays)
+        check = sounddevice.check_output_settings if cls.plays else sounddevice.check_input_settings
+        channels = (1, min(STEREO, device.channels), device.channels) if cls.plays else (1, device.channels)
+        try:
+            rate_hz, count = accepted_format(device, channels, check)
+            for _ in range(_STARTS):
+                stream = cls(device, rate_hz, count)
+                if stream._start(sounddevice.OutputStream if cls.plays else sounddevice.InputStream):
+                    return stream
+        except sounddevice.PortAudioError as error:
+            raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
+        others = ", ".join(each.label for each in devices if each is not device) or "there is no other"
+        raise PortError(f"{flag}: {device.name} is open, but {'takes' if cls.plays else 'gives'} no sound ({others})")
+
+    def check(self) -> None:
+        """Raise PortError when the device went away."""
+        if time.monotonic() - self._called_s > self.lost_s:
+            raise PortError(f"{self.device.name} {'takes' if self.plays else 'gives'} no more sound")
 
     def close(self) -> None:
         """Close the device. Idempotent."""
@@ -110,8 +145,8 @@ class DeviceStream:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, stream: Any, latency_s: float, callback: Any) -> None:
-        """Open and start one of sounddevice's streams."""
+    def _start(self, stream: Any) -> bool:
+        """Open one of sounddevice's streams; return whether sound flows. Raises PortAudio's errors."""
         with self.device.selected():
             self._stream = stream(
                 device=self.device.number,
@@ -119,58 +154,56 @@ class DeviceStream:
                 channels=self.channels,
                 dtype="float32",
                 blocksize=round(self.rate_hz * BLOCK_S),
-                latency=latency_s,
-                callback=callback,
+                latency=self.wanted_latency_s,
+                callback=self._called,
             )
             self._stream.start()
+        if not self._flows.wait(self.start_limit_s):
+            self.close()
+            return False
+        return True
+
+    def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
+        """Take or give a block (n, channels), in a thread of PortAudio's."""
+        raise NotImplementedError
 
 
 class Capture(DeviceStream):
-    """A device that records into a queue, by callbacks in a thread of PortAudio's.
+    """A device that records into a queue. Of more than two channels the first is taken.
 
     Attributes:
         overflows: times that PortAudio lost samples.
     """
 
+    plays = False
+    wanted_latency_s = 0.06  # with less, a sound server's stream seldom starts
+    start_limit_s = 0.3
+    lost_s = 0.2
+
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         super().__init__(device, rate_hz, channels)
         self.overflows = 0
         self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
-        self._heard_s = time.monotonic()
-
-    def start(self) -> bool:
-        """Open the stream; return whether it records. Raises PortAudio's errors."""
-        import sounddevice
-
-        self._open(sounddevice.InputStream, _LATENCY_S, self._called)
-        try:
-            self._pieces.get(timeout=_START_LIMIT_S)
-        except queue.Empty:
-            self.close()
-            return False
-        return True
 
     def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
         """Push all that was recorded to `voice`; wait so long for something. Raises PortError when it went away."""
-        try:
-            piece = self._pieces.get(timeout=wait_s) if wait_s else self._pieces.get_nowait()
+        with suppress(queue.Empty):
             while True:
-                samples, captured_s, overflow = piece
+                samples, captured_s, overflow = self._pieces.get(wait_s > 0.0, wait_s)
+                wait_s = 0.0
                 if overflow:
                     self.overflows += 1
                     voice.interrupt()
                 voice.push(samples, self.rate_hz, captured_s)
-                piece = self._pieces.get_nowait()
-        except queue.Empty:
-            if time.monotonic() - self._heard_s > LOST_S:
-                raise PortError(f"{self.device.name} gives no more sound") from None
+        self.check()
 
     def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
-        now_s = self._heard_s = time.monotonic()
+        now_s = self._called_s = time.monotonic()
         adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
-        used = samples[:, :1] if self.channels > _MIXED else samples
+        used = samples[:, :1] if self.channels > STEREO else samples  # arrays put there what they made of the others
         piece = np.where(np.abs(used) < _DENORMAL, np.float32(0), used)  # a copy: PortAudio writes there again
         self._pieces.put((piece, captured_s(now_s, adc_age_s, n / self.rate_hz), bool(status.input_overflow)))
+        self._flows.set()
 
 
 def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> float:
@@ -181,29 +214,6 @@ def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> floa
     if first_age_s is None or not -length_s <= first_age_s <= _OLDEST_S:
         return now_s
     return min(now_s, now_s - first_age_s + length_s)
-
-
-Stream = TypeVar("Stream", bound=DeviceStream)
-
-
-def started_stream(
-    kind: type[Stream], device: SoundDevice, channels: Sequence[int], check: Callable[..., None], flag: str
-) -> Stream | None:
-    """Return a stream on which sound flows; None where none does. Arguments as of `accepted_format`.
-
-    Raises PortError for a device that cannot be opened.
-    """
-    import sounddevice
-
-    try:
-        rate_hz, count = accepted_format(device, channels, check)
-        for _ in range(_STARTS):
-            stream = kind(device, rate_hz, count)
-            if stream.start():
-                return stream
-    except sounddevice.PortAudioError as error:
-        raise PortError(f"{flag}: {device.name} cannot be opened, {why_not_opened(error)}") from error
-    return None
 
 
 def portaudio(flag: str) -> ModuleType:
@@ -258,15 +268,14 @@ def why_not_opened(error: Exception) -> str:
     return "another program holds it, or it was unplugged" if busy else text
 
 
-def tell_devices(what: Literal["recording", "playing"]) -> Generator[list[SoundDevice], Any, None]:
+def tell_devices(plays: bool) -> Generator[list[SoundDevice], Any, None]:
     """Yield the devices of this moment; for a `SourceWorker`, since PortAudio prints what it likes."""
-    records = what == "recording"
-    yield listed_devices("a microphone" if records else "a loudspeaker", "source" if records else "sink")
+    yield listed_devices("a loudspeaker" if plays else "a microphone", plays)
 
 
-def sound_devices(what: Literal["recording", "playing"] = "recording") -> list[SoundDevice]:
+def sound_devices(plays: bool = False) -> list[SoundDevice]:
     """Return devices that record, or those that play. Blocks for a second. Raises ConfigError without PortAudio."""
-    worker = SourceWorker("sound devices", tell_devices, what)
+    worker = SourceWorker("sound devices", tell_devices, plays)
     try:
         worker.wait()
         return list(worker.messages(time.monotonic())[0])
@@ -276,53 +285,35 @@ def sound_devices(what: Literal["recording", "playing"] = "recording") -> list[S
 
 def device_name(wanted: str, flag: str, plays: bool = False) -> str:
     """Return the name of a device that is given by number: numbers change when something is plugged in."""
-    if not wanted.isdigit():
-        return wanted
-    return choose_device(sound_devices("playing" if plays else "recording"), wanted, flag, plays).name
+    return choose_device(sound_devices(plays), wanted, flag, plays).name if wanted.isdigit() else wanted
 
 
-def listed_devices(flag: str, of_server: Literal["source", "sink"]) -> list[SoundDevice]:
-    """Return the devices that record (source) or play (sink); blocks for some tenths of a second.
+def listed_devices(flag: str, plays: bool) -> list[SoundDevice]:
+    """Return the devices that play, or those that record; blocks for some tenths of a second.
 
     PortAudio sees the devices of the moment when it was loaded. Raises ConfigError without PortAudio.
     """
     sounddevice = portaudio(flag)
-    records = of_server == "source"
-    channels, default = "max_input_channels" if records else "max_output_channels", sounddevice.default.device
+    channels = "max_output_channels" if plays else "max_input_channels"
     found = [
         SoundDevice(
             name=each["name"], number=each["index"], channels=each[channels], rate_hz=each["default_samplerate"],
-            default=each["index"] == default[0 if records else 1],
+            default=each["index"] == sounddevice.default.device[plays], plays=plays,
         )
         for each in sounddevice.query_devices()
         if each[channels] > 0
     ]  # fmt: skip
     server = next((device for device in found if device.name == _SERVER), None)
     if server is not None:
-        found += [replace(server, name=name, default=False, server=of_server) for name in _names(f"{of_server}s")]
+        found += [replace(server, name=name, default=False, of_server=True) for name in _names_of_server(plays)]
     return found
-
-
-def open_capture(wanted: str, flag: str) -> Capture:
-    """Open the device that is wanted, recording: at 16 kHz and mono where it takes that, else at its own rate.
-
-    Blocks until sound comes, some tenths of a second. Raises ConfigError, PortError.
-    """
-    sounddevice = portaudio(flag)
-    devices = listed_devices(flag, "source")
-    device = choose_device(devices, wanted, flag)
-    capture = started_stream(Capture, device, (1, device.channels), sounddevice.check_input_settings, flag)
-    if capture is None:
-        others = ", ".join(each.label for each in devices if each is not device) or "there is no other"
-        raise PortError(f"{flag}: {device.name} is open, but gives no sound ({others})")
-    return capture
 
 
 def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
     if not wanted:
         return [device for device in devices if device.default] or list(devices[:1])
     if wanted.isdigit():
-        return [device for device in devices if not device.server and str(device.number) == wanted]
+        return [device for device in devices if not device.of_server and str(device.number) == wanted]
     looks = (
         lambda name: name == wanted,
         lambda name: _HARDWARE.sub("", name) == _HARDWARE.sub("", wanted),
@@ -334,11 +325,11 @@ def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
     return []
 
 
-def _names(of_server: str) -> list[str]:
-    """Return names of its sources, or its sinks; none where its own tool is not installed, or does not answer."""
-    words = ["pactl", "list", "short", of_server]
+def _names_of_server(plays: bool) -> list[str]:
+    """Return names of its sinks, or its sources; none where its own tool is not installed, or does not answer."""
+    words = ["pactl", "list", "short", "sinks" if plays else "sources"]
     try:
-        told = subprocess.run(words, capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True)
+        listed = subprocess.run(words, capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True)
     except (OSError, subprocess.SubprocessError):
         return []
-    return [line.split("\t")[1] for line in told.stdout.splitlines() if "\t" in line]
+    return [line.split("\t")[1] for line in listed.stdout.splitlines() if "\t" in line]

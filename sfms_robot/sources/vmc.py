@@ -12,23 +12,25 @@ shapes nearest to them. Unity's axes are left-handed, x right, y up, z forward a
 (x, y, z) there is one about (-z, x, -y) in ours. That follows from the two definitions; whether an avatar mirrors its
 person is a setting of its software, and not proved here: `flip=yaw+roll` undoes a mirror.
 
-A message of the usual types is read at fixed places, which takes a third of python-osc's time; others are read by its
-primitives. Bundles are walked here: python-osc 1.10 never comes back from one that gives a size of -4.
+Messages are read here, in a third of python-osc's time, and bundles too: python-osc 1.10 does not return from one that
+gives a size of -4.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
-from pythonosc.parsing import osc_types
 
 from sfms_robot.errors import PacketError
-from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Floats
-from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine, open_udp_sight
+from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.signals.spaces import angles_of
+from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
 
 PORT: Final = 39539  # what the protocol gives those who receive
 
@@ -64,23 +66,13 @@ _AS_ARKIT: Final = np.array(
 )
 
 _MOST_ELEMENTS: Final = 512  # of a packet
-_MOST_UNUSUAL: Final = 64  # messages of a packet that are not of the usual types
 _DEEPEST: Final = 4  # bundles in bundles
-_LONGEST_ODD: Final = 512  # bytes of an element of unusual types
 _MOST_UNKNOWN: Final = 64  # names that are counted apart
 _UNIT_RANGE: Final = (0.9, 1.1)  # length of a quaternion that is one
 
 _BUNDLE: Final = b"#bundle\0"
 _SIZE: Final = struct.Struct(">i")
-_FLOAT: Final = struct.Struct(">f")
-_BLEND: Final = b"/VMC/Ext/Blend/Val\0\0,sf\0"
-_APPLY: Final = b"/VMC/Ext/Blend/Apply\0"
-_BONE: Final = b"/VMC/Ext/Bone/Pos\0\0\0,sfffffff\0\0\0"
-_READ_FROM: Final = (b"/VMC/Ext/Blend/Val\0", b"/VMC/Ext/Bone/Pos\0", b"/VMC/Ext/OK\0")
-_QUATERNION: Final = struct.Struct(">4f")
-_OURS: Final = b"/VMC/"
-
-Quaternion = tuple[float, float, float, float]  # x, y, z, w
+_READ: Final = frozenset((b"/VMC/Ext/Blend/Val", b"/VMC/Ext/Blend/Apply", b"/VMC/Ext/Bone/Pos", b"/VMC/Ext/OK"))
 
 
 def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
@@ -108,61 +100,51 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
         start += size
 
 
-def parse_message(element: bytes) -> tuple[str, list[Any]]:
-    """Return address and arguments of one message of numbers and texts. Raises PacketError for other types."""
-    if len(element) > _LONGEST_ODD:
-        raise PacketError("an OSC message that is too long")
+def _text(element: bytes, at: int) -> tuple[bytes, int]:
+    """Return a text of a message, and where the next value begins: texts are filled up to 4 bytes with zeros."""
+    end = element.find(b"\0", at)
+    if end < 0:
+        raise PacketError("an OSC message that is cut off")
+    return element[at:end], end + 4 - end % 4
+
+
+def arguments(element: bytes, at: int) -> list[Any]:
+    """Return the numbers, texts and booleans of a message, whose types begin at `at`. Raises PacketError for others."""
     values: list[Any] = []
+    if at >= len(element):
+        return values
+    types, at = _text(element, at)
     try:
-        address, start = osc_types.get_string(element, 0)
-        if start >= len(element):
-            return address, values
-        types, start = osc_types.get_string(element, start)
-        if not types.startswith(","):
-            raise PacketError("an OSC message without types")
-        for kind in types[1:]:
-            if kind in "TF":
-                values.append(kind == "T")
-                continue
-            if kind not in _READ:
-                raise PacketError("an OSC message of types that are not read")
-            value, start = _READ[kind](element, start)
-            values.append(value)
-    except (osc_types.ParseError, UnicodeDecodeError) as error:
+        for kind in _layout(types):
+            if kind is None:
+                text, at = _text(element, at)
+                values.append(text)
+            elif isinstance(kind, bool):
+                values.append(kind)
+            else:
+                values += kind.unpack_from(element, at)
+                at += kind.size
+    except struct.error as error:
         raise PacketError("an OSC message that is cut off") from error
-    return address, values
+    return values
 
 
-_READ: Final[Mapping[str, Any]] = {
-    "i": osc_types.get_int,
-    "h": osc_types.get_int64,
-    "f": osc_types.get_float,
-    "d": osc_types.get_double,
-    "s": osc_types.get_string,
-}
+@lru_cache(maxsize=64)
+def _layout(types: bytes) -> list[struct.Struct | bool | None]:
+    """Return what follows the types of a message: runs of numbers, booleans (without bytes), texts (None)."""
+    if not re.fullmatch(rb",[sTFihfd]*", types):
+        raise PacketError("an OSC message of types that are not read")
+    alone = {"s": None, "T": True, "F": False}
+    runs = re.findall("[sTF]|[^sTF]+", types[1:].decode())
+    return [alone[run] if run in alone else struct.Struct(">" + run.replace("h", "q")) for run in runs]
 
 
-def angles_of_unity(quaternion: Quaternion) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw in our axes [rad], R = Rz(yaw) Ry(pitch) Rx(roll), of a rotation in Unity's axes."""
+def turn_of_unity(quaternion: Sequence[float]) -> Doubles:
+    """Return the rotation (3, 3) in our axes of a quaternion x, y, z, w of unit length in Unity's."""
     x, y, z, w = quaternion
-    x, y, z = -z, x, -y
-    sine = max(-1.0, min(1.0, 2.0 * (w * y - z * x)))
-    return (
-        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        math.asin(sine),
-        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-    )
-
-
-def _product(a: Quaternion, b: Quaternion) -> Quaternion:
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
+    cross = np.array([[0.0, y, x], [-y, 0.0, z], [-x, -z, 0.0]])  # of (-z, x, -y)
+    turn: Doubles = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    return turn
 
 
 class VmcDecoder:
@@ -177,20 +159,22 @@ class VmcDecoder:
         self._values = [0.0] * len(_PLACES)
         self._shapes: Floats = np.zeros(_ARKIT, dtype=np.float32)
         self._has_arkit = False
-        self._bones: dict[bytes, Quaternion] = {b"neck": (0.0, 0.0, 0.0, 1.0), b"head": (0.0, 0.0, 0.0, 1.0)}
+        self._bones = {b"neck": np.eye(3), b"head": np.eye(3)}
         self._tracking = True
         self._changed = False
-        self._unusual = 0  # messages of the packet at hand
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
-        ours, self._unusual = False, 0
+        ours = False
         for number, element in enumerate(elements(data)):
             if number == _MOST_ELEMENTS:
                 raise PacketError("an OSC bundle without end")
-            if element.startswith(_OURS):
+            if element.startswith(b"/VMC/"):
                 ours = True
                 self._counts["messages"] += 1
-                self._take(element)
+                try:
+                    self._take(element)
+                except PacketError:
+                    self._counts["wrong_messages"] += 1
         if not ours:
             raise PacketError("no packet of the VMC protocol")
         changed, self._changed = self._changed, False
@@ -201,56 +185,36 @@ class VmcDecoder:
         return {**self._counts, "unknown_names": len(self._unknown)}
 
     def _take(self, element: bytes) -> None:
-        if element.startswith(_BLEND) and len(element) >= len(_BLEND) + 8:
-            self._blend(element[len(_BLEND) : -4], _FLOAT.unpack_from(element, len(element) - 4)[0])
-        elif element.startswith(_BONE) and len(element) >= len(_BONE) + 32:
-            name = element[len(_BONE) : -28].rstrip(b"\0").lower()
-            if name in self._bones:
-                self._turn(name, _QUATERNION.unpack_from(element, len(element) - 16))
-        elif element.startswith(_APPLY):
-            self._apply()
-        elif element.startswith(_READ_FROM) and self._unusual < _MOST_UNUSUAL:
-            self._unusual += 1
-            self._take_unusual(element)
-
-    def _take_unusual(self, element: bytes) -> None:
-        """Take a message of other types than most senders write, or one that is not in every frame."""
-        try:
-            address, values = parse_message(element)
-        except PacketError:
-            self._counts["wrong_messages"] += 1
+        """Take one message. Raises PacketError for one whose values are not those of its address."""
+        address, at = _text(element, 0)
+        if address not in _READ:
             return
-        match address, values:
-            case "/VMC/Ext/Blend/Val", [str(name), value, *_] if _is_number(value):
-                self._blend(name.encode(), float(value))
-            case "/VMC/Ext/Bone/Pos", [str(name), *numbers] if len(numbers) >= 7 and all(map(_is_number, numbers)):
-                if (key := name.lower().encode()) in self._bones:
-                    x, y, z, w = map(float, numbers[3:7])
-                    self._turn(key, (x, y, z, w))
-            case "/VMC/Ext/OK", [loaded, *more]:
+        match address, arguments(element, at):
+            case b"/VMC/Ext/Blend/Val", [bytes(name), value, *_] if _is_number(value) and math.isfinite(value):
+                self._blend(name.lower(), min(max(float(value), 0.0), 1.0))
+            case b"/VMC/Ext/Blend/Apply", _:
+                self._apply()
+            case b"/VMC/Ext/Bone/Pos", [bytes(name), _, _, _, *quaternion]:
+                if name.lower() in self._bones:
+                    self._turn(name.lower(), quaternion[:4])
+            case b"/VMC/Ext/OK", [loaded, *more]:
                 self._track(loaded != 0 and (len(more) < 3 or more[2] != 0))
             case _:
-                self._counts["wrong_messages"] += 1
+                raise PacketError("values of other types")
 
     def _blend(self, name: bytes, value: float) -> None:
-        name = name.rstrip(b"\0").lower()
         place = _PLACES.get(name)
-        if place is None:
-            if len(self._unknown) < _MOST_UNKNOWN:
-                self._unknown.add(name)
-        elif math.isfinite(value):
-            self._values[place] = min(max(value, 0.0), 1.0)
+        if place is not None:
+            self._values[place] = value
             self._has_arkit = self._has_arkit or (place < _ARKIT and value > 0.0)
-        else:
-            self._counts["wrong_messages"] += 1
+        elif len(self._unknown) < _MOST_UNKNOWN:
+            self._unknown.add(name)
 
-    def _turn(self, bone: bytes, quaternion: Quaternion) -> None:
-        length = math.sqrt(sum(part * part for part in quaternion))
+    def _turn(self, bone: bytes, quaternion: Sequence[Any]) -> None:
+        length = math.hypot(*quaternion) if len(quaternion) == 4 and all(map(_is_number, quaternion)) else 0.0
         if not _UNIT_RANGE[0] <= length <= _UNIT_RANGE[1]:  # NaN is in no range
-            self._counts["wrong_messages"] += 1
-            return
-        x, y, z, w = quaternion
-        self._bones[bone] = (x / length, y / length, z / length, w / length)
+            raise PacketError("not a quaternion of unit length")
+        self._bones[bone] = turn_of_unity([part / length for part in quaternion])
         self._changed = True
 
     def _apply(self) -> None:
@@ -264,7 +228,7 @@ class VmcDecoder:
 
     def _motion(self) -> Floats:
         motion = np.zeros(MOTION_DIM, dtype=np.float32)
-        motion[POSE][:3] = angles_of_unity(_product(self._bones[b"neck"], self._bones[b"head"]))
+        motion[POSE][:3] = angles_of((self._bones[b"neck"] @ self._bones[b"head"])[None])[0]
         motion[SHAPES] = self._shapes
         return motion
 
@@ -276,9 +240,9 @@ def _is_number(value: object) -> bool:
 def open_vmc(argument: str) -> UdpSight:
     """Open `--face vmc[:PORT|HOST[:PORT]][,flip=...]`; without HOST only avatar software on this machine can send.
 
-    Raises as `open_udp_sight`.
+    Raises as `UdpSight`.
     """
-    return open_udp_sight("vmc", argument, PORT, VmcDecoder(), _hint)
+    return UdpSight("vmc", argument, PORT, VmcDecoder(), _hint)
 
 
 def _hint(host: str, port: int, wider: str) -> str:

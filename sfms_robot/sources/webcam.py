@@ -10,7 +10,6 @@ cannot be kept up with is left out. Without a face in the picture nothing new is
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
 from sfms_robot.signals.quantiles import Quantiles
+from sfms_robot.signals.spaces import angles_of
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.worker import SourceWorker
 
@@ -39,6 +39,8 @@ _ALIVE_S: Final = 0.02
 # Between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133, 362 and
 # 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
 _EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
+
+_TO_ROBOT_AXES: Final = [2, 0, 1]  # their z (forward), x (own left), y (up)
 
 NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
 TAKE_OVER_S: Final = 1.0  # for so long, without a break
@@ -253,11 +255,8 @@ def _why_not(number: int) -> str:
 
 def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
     """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
-    roll = math.atan2(matrix[1, 0], matrix[1, 1])
-    pitch = math.asin(min(1.0, max(-1.0, -float(matrix[1, 2]))))
-    yaw = math.atan2(matrix[0, 2], matrix[2, 2])
-    right_m, up_m, near_m = matrix[:3, 3] / 100.0
-    pose = (roll, pitch, yaw, near_m, right_m, up_m)
+    turn = matrix[np.ix_(_TO_ROBOT_AXES, _TO_ROBOT_AXES)].astype(np.float64)
+    pose = (*angles_of(turn[None])[0], *matrix[_TO_ROBOT_AXES, 3] / 100.0)
     eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
     return SeenFace(
         np.array([*pose, *(shapes.get(name, 0.0) for name in BLENDSHAPES)], dtype=np.float32),
@@ -316,37 +315,34 @@ def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
 # --- the run's side --------------------------------------------------------------------------------------------------
 
 
-class Webcam:
-    """`ports.Sight` of the worker `watch`. Only `close` blocks."""
+class Webcam(LiveFace):
+    """`ports.Sight` of the worker `watch`. Only `close` blocks.
 
-    def __init__(self, worker: SourceWorker, face: LiveFace, duration_s: float | None) -> None:
-        self._worker, self._face, self.duration_s = worker, face, duration_s
-        self._origin_s: float | None = None
+    Attributes:
+        lost: the camera is away, or its process.
+        latency_s: median from a picture taken to its face known; 0 before the first picture.
+    """
+
+    def __init__(self, worker: SourceWorker, signs: Floats | None, duration_s: float | None) -> None:
+        super().__init__(signs)
+        self._worker, self.duration_s = worker, duration_s
+        self._started = False
         self._counts = dict.fromkeys(("pictures", "without_face", "dark", "with_others"), 0)
         self._latency_ms = Quantiles()
 
-    @property
-    def lost(self) -> bool:
-        """The camera is away, or its process."""
-        return self._worker.lost
-
-    @property
-    def latency_s(self) -> float:
-        """Median from a picture taken to its face known; 0 before the first picture."""
-        return self._latency_ms.at(50) / 1e3 if len(self._latency_ms) else 0.0
-
     def start(self, origin_s: float) -> None:
-        self._origin_s = origin_s
-        self._face.start(origin_s)
+        super().start(origin_s)
+        self._started = True
         self._worker.tell(origin_s)
 
     def at(self, time_s: float) -> Sighting | None:
-        if self._origin_s is None:
+        if not self._started:
             return None
         for message in self._worker.messages(self._origin_s + time_s):
             if isinstance(message, SeenPicture):
                 self._take(message)
-        return self._face.at(time_s)
+        self.lost = self._worker.lost
+        return super().at(time_s)
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
@@ -360,15 +356,16 @@ class Webcam:
         self._worker.close()
 
     def _take(self, seen: SeenPicture) -> None:
-        if self._origin_s is None or seen.taken_s < self._origin_s:
+        if seen.taken_s < self._origin_s:
             return
         self._counts["pictures"] += 1
         self._counts["without_face"] += seen.face is None
         self._counts["dark"] += seen.dark
         self._counts["with_others"] += seen.others > 0
         self._latency_ms.add((seen.known_s - seen.taken_s) * 1e3)
+        self.latency_s = self._latency_ms.at(50) / 1e3
         if seen.face is not None:
-            self._face.put(seen.taken_s, seen.face.motion, seen.face.place_m)
+            self.put(seen.taken_s, seen.face.motion, seen.face.place_m)
 
 
 def open_webcam(argument: str) -> Webcam:
@@ -377,12 +374,11 @@ def open_webcam(argument: str) -> Webcam:
     Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for another
     file and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
     """
-    given = parse_face_argument("webcam", argument)
-    place = given.place
+    place, signs = parse_face_argument("webcam", argument)
     if not place.isdigit() and place and not Path(place).is_file():
         raise ConfigError(f"--face webcam:{place}: no such file, nor the number of a camera (0, 1, ...)")
     source = str(Path(place).absolute()) if place and not place.isdigit() else place or "0"
     worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
     opened = worker.messages(time.monotonic())[0]
-    return Webcam(worker, LiveFace(given.signs), opened.duration_s if isinstance(opened, WebcamOpened) else None)
+    return Webcam(worker, signs, opened.duration_s if isinstance(opened, WebcamOpened) else None)

@@ -26,37 +26,6 @@ NICE: Final = 5  # the servo loop goes first
 MOST_UNSENT: Final = 100  # pieces of voice and face for a run that does not read: older ones are left out
 
 
-class RunPipe:
-    """`page_server.Run` at the other end of a pipe. Nothing blocks."""
-
-    def __init__(self, parent: ParentPipe) -> None:
-        self._writer = PipeWriter(parent.outgoing, MOST_UNSENT, "run")
-
-    def command(self, visitor: int, name: str, values: Mapping[str, Any]) -> None:
-        """Send a command of a visitor."""
-        self.send(visitor, command=name, values=values)
-
-    def person(self, visitor: int, message: bytes) -> None:
-        """Send a piece of a visitor's voice, or a face."""
-        self._writer.offer(pickle.dumps((visitor, message)))
-
-    def left(self, visitor: int) -> None:
-        """Report that a visitor has the controls no more."""
-        self.send(visitor, left=True)
-
-    def watched(self, visitors: int) -> None:
-        """Send the number of visitors."""
-        self.send(0, watched=visitors)
-
-    def beat(self) -> None:
-        """Send a sign of life."""
-        self._writer.send(pickle.dumps(None))
-
-    def send(self, visitor: int, **document: Any) -> None:
-        """Send a document."""
-        self._writer.send(pickle.dumps((visitor, document)))
-
-
 class FromRun:
     """Messages of the run, handled in the server's loop; of pictures that come together the newest is shown."""
 
@@ -71,20 +40,14 @@ class FromRun:
         self._loop.call_soon_threadsafe(self._handle)
 
     def _handle(self) -> None:
-        picture: bytes | None = None
-        for _ in range(len(self._waiting)):
+        while self._waiting:
             message = self._waiting.popleft()
-            if isinstance(message, bytes):
-                if picture is not None:
-                    self._page.keep(picture)
-                picture = message
-            else:
-                if picture is not None:
-                    self._page.show(picture)
-                    picture = None
+            if not isinstance(message, bytes):
                 self._document(message[0], orjson.loads(message[1]))
-        if picture is not None:
-            self._page.show(picture)
+            elif self._waiting and isinstance(self._waiting[0], bytes):
+                self._page.keep(message)
+            else:
+                self._page.show(message)
 
     def _document(self, visitor: int, told: dict[str, Any]) -> None:
         do = told.pop("do")
@@ -111,14 +74,19 @@ def main(scene_of: SceneOf = lambda *_: None) -> None:
 
 
 async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> None:
-    run = RunPipe(parent)
+    writer = PipeWriter(parent.outgoing, MOST_UNSENT, "run")
+
+    def send(visitor: int, content: Mapping[str, Any] | bytes) -> None:
+        """Send a document, or a piece of a visitor's voice, or a face, without waiting."""
+        (writer.offer if isinstance(content, bytes) else writer.send)(pickle.dumps((visitor, content)))
+
     try:
         place = listen_at(address)
     except RobotError as error:
-        run.send(0, problem=str(error), of=type(error).__name__)
+        send(0, {"problem": str(error), "of": type(error).__name__})
         return
     over = asyncio.Event()
-    page = PageServer(run, place.token)
+    page = PageServer(send, place.token)
     loop = asyncio.get_running_loop()
     parent.forward(FromRun(page, scene_of).put, lambda: loop.call_soon_threadsafe(over.set))
     server = web_server(
@@ -131,9 +99,9 @@ async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> Non
     )
     serving = asyncio.create_task(server.serve(sockets=[place.socket]))
     page.prepare()
-    run.send(0, bound=place.url, token=place.token, taken=place.taken)
+    send(0, {"bound": place.url, "token": place.token, "taken": place.taken})
     while not over.is_set():
-        run.beat()
+        writer.send(pickle.dumps(None))  # a sign of life
         with suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), BEAT_S)
     server.should_exit = True

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
@@ -32,10 +32,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from sfms_robot.data import data_dir
 from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import PacketError
+from sfms_robot.face.human import FOLDER as HUMAN
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.viewer.page_messages import VERSION, Shown, frame_json, message_json, parse_command
-from sfms_robot.viewer.page_process import Asked
 from sfms_robot.viewer.web_server import CompressedFiles, application
 
 URDF: Final = "robot/robot.urdf"
@@ -52,11 +52,7 @@ FREE: Final = ("hello", "ping", "take", "give")  # commands that take no control
 _LINES_AT_ONCE: Final = 10  # of a platform each takes a millisecond and a half
 
 NewScene = Callable[[], RobotScene | None]
-
-
-def no_scene() -> RobotScene | None:
-    """Return None: a head without a picture."""
-    return None
+Send = Callable[[int, Mapping[str, Any] | bytes], None]
 
 
 class Visitor:
@@ -207,53 +203,50 @@ class Visitors:
         return message_json(type="controls", held=self.controls(visitor), needs_token=not visitor.allowed)
 
 
-class PageRun(Asked, Protocol):
-    """A run as the page's server sees it: carries out what visitors ask for. Never blocks."""
-
-    def watched(self, visitors: int) -> None:
-        """Note how many visitors are connected now."""
-
-
 class PageServer:
     """One page, whatever runs behind it. All in the thread of one event loop.
 
     Args:
-        run: carries out what visitors ask for.
+        send: sends the run, without waiting, a document or a piece of sound of a visitor (see `page_process`).
         token, now: see `Visitors`.
 
     Attributes:
         app: for an ASGI server.
     """
 
-    def __init__(self, run: PageRun, token: str | None, now: Callable[[], float] = time.monotonic) -> None:
-        self._run, self._token, self._now = run, token, now
-        self._visitors = Visitors(token, run.left, now)
+    def __init__(self, send: Send, token: str | None, now: Callable[[], float] = time.monotonic) -> None:
+        self._send_run, self._token, self._now = send, token, now
+        self._visitors = Visitors(token, lambda number: send(number, {"left": True}), now)
         self._hello: dict[str, Any] = {}
         self._began = asyncio.Event()  # there is a hello
-        self._new_scene: NewScene = no_scene
+        self._new_scene: NewScene = lambda: None
         self._scene: RobotScene | None = None
         self._record: Mapping[str, Any] | None = None
         self._recording: Path | None = None
         self._over: Mapping[str, Any] | None = None  # the report
         self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # (packed picture or not, message)
-        self._files = CompressedFiles()
-        self.prepare = self._files.prepare  # what takes a second, in threads; a page waits for it
+        self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
             [
                 Route("/", self._index),
                 Route("/runs/last", self._last_run),
                 Route("/recording", self._download),
-                Route("/human/head.bin", self._files.human_mesh),
                 Route("/robot/{file:path}", self._robot),
                 Route("/face_landmarker.task", self._face_model),
                 WebSocketRoute("/ws", self._visit),
                 Mount("/static", self._files),
+                Mount("/human", self._human),
             ]
         )
 
+    def prepare(self) -> None:
+        """Begin to compress what every page loads, in threads; a page waits for it."""
+        self._human.prepare("*.xz")
+        self._files.prepare()
+
     # --- from the run ---
 
-    def begin(self, hello: Mapping[str, Any], new_scene: NewScene = no_scene) -> None:
+    def begin(self, hello: Mapping[str, Any], new_scene: NewScene) -> None:
         """Begin a run: forget the last one, and send its `hello` to all visitors.
 
         `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
@@ -352,14 +345,14 @@ class PageServer:
             await _refuse(socket, str(error))
             return
         visitor.tell(self._hello_json(visitor))
-        self._run.watched(len(self._visitors))
+        self._send_run(0, {"watched": len(self._visitors)})
         sending = asyncio.create_task(self._send(socket, visitor))
         try:
             await self._receive(socket, visitor)
         finally:
             sending.cancel()
             self._visitors.leave(visitor)
-            self._run.watched(len(self._visitors))
+            self._send_run(0, {"watched": len(self._visitors)})
 
     async def _send(self, socket: WebSocket, visitor: Visitor) -> None:
         with suppress(WebSocketDisconnect, RuntimeError):  # it has disconnected
@@ -377,7 +370,7 @@ class PageServer:
                 if text is not None:
                     self._command(visitor, *parse_command(text))
                 elif self._visitors.holds(visitor):
-                    self._run.person(visitor.number, data)
+                    self._send_run(visitor.number, data)
                 else:
                     raise PacketError("sound and faces are taken from the holder of the controls, after `source`")
             except PacketError as error:
@@ -401,7 +394,7 @@ class PageServer:
             self._visitors.give(visitor)
         else:
             self._visitors.admit(visitor, name)
-            self._run.command(visitor.number, name, values)
+            self._send_run(visitor.number, {"command": name, "values": values})
 
     def _hello_json(self, visitor: Visitor) -> bytes:
         return message_json(

@@ -24,6 +24,7 @@ from starlette.types import ASGIApp
 
 from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import ConfigError
+from sfms_robot.face.human import FOLDER as HUMAN
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.web_server import STATIC, CompressedFiles, WebLoop, application, json_body, listen_at, web_server
 
@@ -66,13 +67,12 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
     async def page(request: Request) -> Response:
         return FileResponse(STATIC / "people.html", media_type="text/html")
 
-    files = CompressedFiles()
     return application(
         [
             Route("/", page),
             *(Route(path, command, methods=["POST"]) for path in ("/begin", "/next", "/answer")),
-            Route("/human/head.bin", files.human_mesh),
-            Mount("/static", files),
+            Mount("/human", CompressedFiles(HUMAN)),
+            Mount("/static", CompressedFiles()),
             Mount("/clips", StaticFiles(directory=study.clips)),
         ]
     )

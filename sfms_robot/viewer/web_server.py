@@ -308,12 +308,11 @@ class CompressedFiles(StaticFiles):
         super().__init__(directory=folder)
         self._folder = folder
         self._stored = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.xz")}
-        self._packed: dict[object, asyncio.Task[bytes]] = {}
+        self._packed: dict[tuple[Path, float], asyncio.Task[bytes]] = {}
 
-    def prepare(self) -> None:
-        """Begin to compress the virtual human and the files of the folder itself; others wait for the first request."""
-        self._once(_human)
-        for file in sorted(self._folder.iterdir()):
+    def prepare(self, pattern: str = "*") -> None:
+        """Begin to compress files of the folder itself; others wait for the first request."""
+        for file in sorted(self._folder.glob(pattern)):
             if file.is_file():
                 self._gzip(file)
 
@@ -327,43 +326,18 @@ class CompressedFiles(StaticFiles):
         plain.headers["Vary"] = "Accept-Encoding"
         headers = {key: value for key, value in plain.headers.items() if key not in ("content-length", "accept-ranges")}
         file = Path(plain.path)
-        if _takes_gzip(wanted) and (stored or "range" not in wanted):
+        if "gzip" in wanted.get("accept-encoding", "") and (stored or "range" not in wanted):
             return Response(await self._gzip(file), headers=headers | {"Content-Encoding": "gzip"})
         return Response(await asyncio.to_thread(_plain, file), headers=headers) if stored else plain
 
-    async def human_mesh(self, request: Request) -> Response:
-        """Answer with the mesh of the virtual human (`face.human`)."""
-        packed, headers = await self._once(_human), {"Vary": "Accept-Encoding"}
-        if _takes_gzip(request.headers):
-            headers["Content-Encoding"] = "gzip"
-        else:
-            packed = gzip.decompress(packed)
-        return Response(packed, media_type="application/octet-stream", headers=headers)
-
     def _gzip(self, file: Path) -> asyncio.Task[bytes]:
-        return self._once(_gzip, file, file.stat().st_mtime)
-
-    def _once(self, pack: Callable[..., bytes], *what: Any) -> asyncio.Task[bytes]:
-        """Return the task of a thread that packs something, started once."""
-        if (pack, what) not in self._packed:
-            self._packed[pack, what] = asyncio.create_task(asyncio.to_thread(pack, *what))
-        return self._packed[pack, what]
-
-
-def _takes_gzip(headers: Headers) -> bool:
-    return "gzip" in headers.get("accept-encoding", "")
-
-
-def _gzip(file: Path, changed_s: float) -> bytes:
-    return gzip.compress(_plain(file), _GZIP_LEVEL, mtime=0)
+        """Return the task of a thread that compresses the file; one for each version of it."""
+        version = (file, file.stat().st_mtime)
+        if version not in self._packed:
+            work = asyncio.to_thread(lambda: gzip.compress(_plain(file), _GZIP_LEVEL, mtime=0))
+            self._packed[version] = asyncio.create_task(work)
+        return self._packed[version]
 
 
 def _plain(file: Path) -> bytes:
     return lzma.decompress(file.read_bytes()) if file.suffix == ".xz" else file.read_bytes()
-
-
-def _human() -> bytes:
-    """Return the mesh of the virtual human, compressed. Blocks for a second."""
-    from sfms_robot.face.human import load_human, packed_human  # scipy: in this thread, not at start-up
-
-    return gzip.compress(packed_human(load_human()), _GZIP_LEVEL)

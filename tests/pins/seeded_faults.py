@@ -139,10 +139,10 @@ FAULTS = (
         '_FRAME: Final = struct.Struct("<ifiiB")',
         SOURCES,
     ),
-    Fault("sources/vmc.py", "x, y, z = -z, x, -y", "x, y, z = z, x, -y", SOURCES),
-    Fault("sources/vmc.py", "elif math.isfinite(value):", "else:", SOURCES),
+    Fault("sources/vmc.py", "[-y, 0.0, z]", "[y, 0.0, z]", SOURCES),
+    Fault("sources/vmc.py", "if _is_number(value) and math.isfinite(value):", "if _is_number(value):", SOURCES),
     Fault("sources/vmc.py", "if size <= 0 or start + size > len(data):", "if start + size > len(data):", SOURCES),
-    Fault("sources/vmc.py", "aw * by - ax * bz", "aw * by + ax * bz", SOURCES),
+    Fault("sources/vmc.py", "+ 2.0 * w * cross", "- 2.0 * w * cross", SOURCES),
     Fault("signals/tracks.py", '"cm": 0.01', '"cm": 0.1', "tests/signals"),
     Fault("signals/tracks.py", "motion[np.isnan(motion).any(axis=1)] = np.nan", "pass", "tests/signals"),
     Fault(

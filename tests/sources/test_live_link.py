@@ -4,6 +4,7 @@ import csv
 import gzip
 import socket
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
-from sfms_robot.errors import PacketError, PortError
+from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
 from sfms_robot.sources.live_face import Datagram, addresses_of_this_machine
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
@@ -71,9 +72,7 @@ def test_what_the_recording_itself_has_lost_is_counted():
 
 def test_the_head_of_a_packet_of_an_iphone():
     parsed = parse_packet(REAL_HEAD + bytes(61 * 4))
-    assert parsed.device == "5904AA4B-AD9D-43E5-98AB-89AAEB8AB277"
     assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)
-    assert parsed.part == pytest.approx(0.52738, abs=1e-5)
 
 
 def test_names_of_any_script():
@@ -81,10 +80,6 @@ def test_names_of_any_script():
     wide = struct.pack(">i", -2) + "電話".encode("utf-16-be")
     plain = packet(subject=b"")
     assert parse_packet(plain[:7] + wide + plain[11:]).subject == "電話"
-
-
-def test_no_face_is_a_packet_without_values():
-    assert parse_packet(packet(values=())).values is None
 
 
 @pytest.mark.parametrize(
@@ -112,14 +107,6 @@ def test_what_is_no_packet_is_refused_in_one_line(data, reason):
     with pytest.raises(PacketError, match=reason) as told:
         parse_packet(data)
     assert "\n" not in str(told.value)
-
-
-@given(st.binary(max_size=400))
-def test_any_bytes_are_a_packet_or_refused(data):
-    try:
-        parse_packet(b"\x06" + data)
-    except PacketError:
-        pass
 
 
 @given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
@@ -176,17 +163,13 @@ def test_faces_are_always_in_order_whatever_the_network_does(numbers):
     assert seen == sorted(seen) and seen[-1] == 11
 
 
-def test_who_does_not_count_is_seen_all_the_same():
+def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows_none():
     decoder = LiveLinkDecoder()
     for number, value in enumerate((0.1, 0.2, 0.3)):
         assert decoder.decode(packet(0, (value,) * 61), number / 60) is not None
-    assert decoder.statistics()["doubled"] == decoder.statistics()["lost"] == 0
-
-
-def test_a_packet_without_a_face_is_counted_and_shows_none():
-    decoder = LiveLinkDecoder()
-    assert decoder.decode(packet(1, values=()), 0.0) is None
-    assert decoder.statistics()["no_face"] == 1
+    assert decoder.decode(packet(1, values=()), 0.1) is None
+    counted = decoder.statistics()
+    assert (counted["doubled"], counted["lost"], counted["no_face"]) == (0, 0, 1)
 
 
 # --- over a socket ----------------------------------------------------------------------------------------------
@@ -206,41 +189,16 @@ def free_port():
         return probe.getsockname()[1]
 
 
-@pytest.fixture
-def phone(sight):
-    emulated = EmulatedPhone(*sight.address)
-    yield emulated
-    emulated.close()
-
-
-def test_an_emulated_phone_is_seen(sight, phone):
+def test_an_emulated_phone_is_seen(sight):
     assert sight.at(1e9) is None
-    phone.send_until(10 / 60)
+    with closing(EmulatedPhone(*sight.address)) as phone:
+        phone.send_until(10 / 60)
     while sight.statistics()["packets"] < 11:  # a slow call leaves some to the next
         sight.at(1e9)
     face = sight.at(1e9).face
-    expected = motion_of(parse_packet(PACKETS[10]).values)[SHAPES]
     assert face.time_s > 0
-    assert face.blendshapes.max() <= expected.max()
+    assert face.blendshapes.max() <= motion_of(parse_packet(PACKETS[10]).values)[SHAPES].max()
     assert sight.statistics()["faces"] == 11 and sight.statistics()["lost"] == 0
-
-
-def test_a_port_that_is_taken_is_one_line(sight):
-    with pytest.raises(PortError, match=r"live-link: UDP port \d+ on 127.0.0.1 is used by another program"):
-        open_live_link(f"127.0.0.1:{sight.address[1]}")
-
-
-@pytest.mark.parametrize("host", ["a..b", "203.0.113.7"])
-def test_an_address_that_is_not_this_machines_is_one_line(host):
-    with pytest.raises(PortError, match=f"live-link: UDP port 11111 on {host}: ") as told:
-        open_live_link(f"{host}:11111")
-    assert "\n" not in str(told.value)
-
-
-def test_a_port_is_free_again_after_close(sight):
-    sight.close()
-    sight.close()
-    open_live_link(f"127.0.0.1:{sight.address[1]}").close()
 
 
 def test_pose_channels_are_flipped_on_request():
@@ -280,19 +238,15 @@ def test_a_million_packets_of_noise_never_raise(sight):
     assert np.isfinite(sight.at(1e9).face.motion).all()
 
 
-def test_this_machine_alone_is_heard_and_what_a_phone_needs_is_said(caplog):
+def test_the_log_says_what_to_type_in_the_app(caplog):
     port = free_port()
     opened = open_live_link(str(port))
     assert opened.address == ("127.0.0.1", port)
     opened.close()
-    (said,) = [record.getMessage() for record in caplog.records]
-    assert said.startswith(f"live-link: 127.0.0.1, port {port}, this machine alone; for a phone ")
-    assert f"--face live-link:0.0.0.0:{port}, and in the app" in said and said.endswith(f", port {port}")
-
-
-def test_a_phone_is_told_the_addresses_of_this_machine(caplog):
-    port = free_port()
     open_live_link(f"0.0.0.0:{port}").close()
-    (said,) = [record.getMessage() for record in caplog.records]
+    alone, wider = [record.getMessage() for record in caplog.records]
     target = " or ".join(addresses_of_this_machine()) or "the address of this machine"
-    assert said == f"live-link: in the app, capture mode Live Link (ARKit), enter the target {target}, port {port}"
+    app = f"in the app, capture mode Live Link (ARKit), enter the target {target}, port {port}"
+    flag = f"--face live-link:0.0.0.0:{port}"
+    assert alone == f"live-link: 127.0.0.1, port {port}, this machine alone; for a phone {flag}, and {app}"
+    assert wider == f"live-link: {app}"

@@ -1,45 +1,176 @@
-"""`--play`: everybody goes by what leaves the loudspeaker. First in virtual time, then on a sound server."""
+"""`--play` in virtual time: what leaves the device at an instant is what is due then, and everything goes by it."""
 
+import math
 import threading
 import time
-from contextlib import closing
 
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
-from scripted_worker import wait_for_message
 
-from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
-from sfms_robot.signals.audio import energy_db, read_audio
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
-from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import OwnVoice
+from sfms_robot.sources.live_voice import GAP_S
+from sfms_robot.sources.microphone import Microphone
 from sfms_robot.sources.paired import PairedSource
-from sfms_robot.sources.playback import (
-    EARLY_S,
-    HUSH_S,
-    MARGIN_S,
-    PlaybackOpened,
-    PlaybackStream,
-    PlayedVoice,
-    Playout,
-    leaves_after_s,
-    open_playback,
-)
+from sfms_robot.sources.playback import EARLY_S, HUSH_S, MARGIN_S, PlaybackOpened, PlayedVoice, Playout
 from sfms_robot.sources.push import PushedSpeech
 from sfms_robot.sources.recording import RecordedVoice
-from sfms_robot.sources.registry import open_source
-from sfms_robot.sources.sound_devices import SoundDevice
 
-pytestmark = pytest.mark.realtime
-
-PATIENCE_S = 60.0  # on a computer with nothing to spare
 TICK_S = 0.01
 LATENCY_S = 0.06
+ORIGIN_S = 1000.0
+TONE_HZ = 40.0  # of which an instant can be told to a few milliseconds
+
+
+# --- the device --------------------------------------------------------------------------------------------------
+
+
+def tone(samples):
+    return np.sin(2 * np.pi * TONE_HZ / AUDIO_HZ * np.asarray(samples)).astype(np.float32)
+
+
+class VirtualDevice:
+    """A sound card with a clock of its own: what it is handed leaves sample by sample, `latency_s` later.
+
+    Attributes:
+        left_s, left: when each sample left, in loop time, and what it was.
+    """
+
+    def __init__(self, rate_hz, ppm=0.0, latency_s=0.06, begins_s=-0.5, jitter=None, says=tone):
+        self.playout, self._says = Playout(rate_hz), says
+        self._true_hz = rate_hz * (1 + ppm * 1e-6)
+        self._latency_s, self._jitter = latency_s, jitter or (lambda: 0.0)
+        self._n = round(rate_hz * 0.01)
+        self._leaves_s = begins_s + latency_s  # of the next sample, loop time
+        self._dry = False
+        self.left_s, self.left = np.zeros(0), np.zeros(0, np.float32)
+
+    def starve(self, for_s):
+        """It had nothing to play for so long, and says so with the next block."""
+        self._leaves_s += for_s
+        self._dry = True
+
+    def play(self, until_s, ahead_s=0.4):
+        """Blocks until loop time `until_s`; the tone is told so far ahead of what leaves."""
+        said_s = [], []
+        while self._leaves_s - self._latency_s < until_s:
+            now_s = self._leaves_s - self._latency_s
+            first = max(0, math.floor(now_s / FRAME_S))
+            frames = max(1, round(ahead_s / FRAME_S))
+            said = self._says(np.arange(first * FRAME_SAMPLES, (first + frames) * FRAME_SAMPLES))
+            self.playout.tell(first, said.astype(np.float32))
+            stamp_s = ORIGIN_S + self._leaves_s + self._jitter()
+            block = self.playout.block(self._n, stamp_s, self._dry)
+            said_s[0].append(self._leaves_s + np.arange(self._n) / self._true_hz)
+            said_s[1].append(block)
+            self._leaves_s, self._dry = self._leaves_s + self._n / self._true_hz, False
+        self.left_s, self.left = np.concatenate(said_s[0]), np.concatenate(said_s[1])
+        return self
+
+    def off_s(self, after_s):
+        """How far what left is from what was due, as time, at worst, from loop time `after_s` on."""
+        late = self.left_s > after_s
+        error = np.abs(self.left[late] - tone(self.left_s[late] * AUDIO_HZ))
+        return float(error.max()) / (2 * np.pi * TONE_HZ)
+
+
+@pytest.mark.parametrize("rate_hz", [16_000, 44_100, 48_000])
+@pytest.mark.parametrize("ppm", [-300.0, 0.0, 300.0])
+def test_a_device_that_drifts_is_followed(rate_hz, ppm):
+    """300 ppm are 0.6 s in half an hour; 30 s of it here. Nothing jumps, nothing is silent."""
+    device = VirtualDevice(rate_hz, ppm)
+    device.playout.start(ORIGIN_S)
+    device.play(30.0)
+    assert device.off_s(after_s=0.1) < 0.004
+    assert device.off_s(after_s=15.0) < 0.0005
+    told = device.playout.statistics()
+    assert (told["underruns"], told["jumps"]) == (0, 0)
+    assert told["drift_ppm"] == pytest.approx(ppm, abs=10)
+    assert [silence.first for silence in device.playout.silences] == []
+
+
+@given(seed=st.integers(0, 1000), latency_s=st.floats(0.01, 0.3))
+def test_stamps_that_come_late_change_little(seed, latency_s):
+    rng = np.random.default_rng(seed)
+    device = VirtualDevice(16_000, 50.0, latency_s, jitter=lambda: rng.exponential(0.004))
+    device.play(0.0)  # a device runs before the loop does
+    device.playout.start(ORIGIN_S)
+    device.play(6.0)
+    assert device.off_s(after_s=0.0) < 0.002
+    assert device.playout.statistics()["jumps"] == 0
+
+
+def test_what_was_due_before_a_late_start_is_silence():
+    device = VirtualDevice(48_000, begins_s=0.7, latency_s=0.1)
+    device.playout.start(ORIGIN_S)
+    device.play(3.0)
+    (silence,) = device.playout.silences
+    assert silence.first == 0 and silence.last == pytest.approx(0.8 * AUDIO_HZ, abs=2)
+    assert device.off_s(after_s=0.0) < 0.001
+
+
+@given(for_s=st.floats(0.005, 2.0), says_so=st.booleans())
+def test_a_device_that_ran_dry_was_silent_and_is_on_time_again(for_s, says_so):
+    """It says so with the next block; a gap of more than `GAP_S` is found without."""
+    device = VirtualDevice(16_000)
+    device.playout.start(ORIGIN_S)
+    device.play(2.0)
+    ended_s = device.left_s[-1]
+    for_s += 0.0 if says_so else GAP_S
+    device.starve(for_s)
+    device._dry = says_so
+    device.play(2.0 + for_s + 2.0)
+    (silence,) = device.playout.silences
+    assert silence.first / AUDIO_HZ == pytest.approx(ended_s, abs=0.001)
+    assert (silence.last - silence.first) / AUDIO_HZ == pytest.approx(for_s, abs=0.001)
+    assert device.off_s(after_s=0.0) < 0.001
+    assert device.playout.statistics()["underruns"] == 1
+
+
+def test_what_is_told_too_late_is_silence():
+    device = VirtualDevice(16_000, latency_s=0.06)
+    device.playout.start(ORIGIN_S)
+    device.play(1.0, ahead_s=FRAME_S)  # of a frame of 40 ms the device wants the end 60 ms before it leaves
+    silent = sum(each.last - each.first for each in device.playout.silences)
+    assert silent > 0.5 * AUDIO_HZ
+
+
+def test_a_stream_that_is_far_off_jumps_to_its_place():
+    """Its stamps were wrong by 60 ms, all of them, for long."""
+    wrong_s = 0.06
+    device = VirtualDevice(16_000, jitter=lambda: wrong_s)
+    device.playout.start(ORIGIN_S)
+    device.play(2.0)
+    wrong_s = 0.0
+    device.play(6.0)
+    assert device.playout.statistics()["jumps"] == 1
+    assert device.off_s(after_s=4.0) < 0.001
+
+
+def test_in_silence_it_is_put_right_at_once():
+    """Its first stamp was 15 ms late, which is less than a jump; the first word is in its place all the same."""
+    stamps_s = iter([0.015, *[0.0] * 1000])
+    device = VirtualDevice(
+        16_000, jitter=lambda: next(stamps_s), begins_s=0.0, says=lambda at: tone(at) * (at > 0.5 * AUDIO_HZ)
+    )
+    device.playout.start(ORIGIN_S)
+    device.play(2.0)
+    assert device.off_s(after_s=0.9) < 0.0005
+    assert not device.playout.silences and device.playout.statistics()["jumps"] == 0
+
+
+def test_before_the_loop_begins_it_plays_nothing():
+    playout = Playout(16_000)
+    playout.tell(0, np.ones(FRAME_SAMPLES, np.float32))
+    assert not playout.block(160, 5.0).any()
+    playout.start(6.0)
+    assert not playout.block(160, 5.01).any()
+    assert not playout.silences
+
+
+# --- the voice ---------------------------------------------------------------------------------------------------
 
 
 class VirtualLoudspeaker:
@@ -96,8 +227,10 @@ class Desk:
         frames: what was taken, frame by frame, from frame 1 on; frame 0 is over before anybody can ask.
     """
 
-    def __init__(self, spoken, late_s=0.0):
+    def __init__(self, spoken, late_s=0.0, clock=None):
         self.loudspeaker = VirtualLoudspeaker()
+        if clock is not None:
+            clock.append(self.loudspeaker)
         self.voice = PlayedVoice(self.loudspeaker, spoken, lambda: self.loudspeaker.now_s)
         spoken.played_by(self.voice)
         self.voice.start(self.loudspeaker.now_s)
@@ -129,19 +262,11 @@ def noise(seconds, seed=0):
     return (0.3 * np.random.default_rng(seed).uniform(-1, 1, round(seconds * AUDIO_HZ))).astype(np.float32)
 
 
-@pytest.fixture
 def talk():
-    """A robot that is told what to say, and the desk that it speaks at."""
-    now_s = [50.0]
-    spoken = PushedSpeech(lambda: now_s[0])
-    desk = Desk(spoken)
-    tick = desk.loudspeaker.tick
-
-    def both():
-        tick()
-        now_s[0] = desk.loudspeaker.now_s
-
-    desk.loudspeaker.tick = both
+    """Return speech that a program pushes, in the desk's time, and the desk."""
+    clock = []
+    spoken = PushedSpeech(lambda: clock[0].now_s)
+    desk = Desk(spoken, clock=clock)
     return spoken, desk
 
 
@@ -158,73 +283,49 @@ def test_of_a_recording_what_is_taken_a_frame_early_is_what_leaves(late_s):
 
 
 @given(at_s=st.floats(0.0, 1.0), seconds=st.floats(0.05, 0.5))
-def test_what_is_said_leaves_as_soon_as_it_can_and_is_told_when_it_does(at_s, seconds):
-    now_s = [50.0]
-    spoken = PushedSpeech(lambda: now_s[0])
-    desk = Desk(spoken)
+def test_speech_leaves_as_soon_as_it_can_and_is_taken_when_it_does(at_s, seconds):
+    spoken, desk = talk()
     desk.until(at_s)
-    now_s[0] = desk.loudspeaker.now_s
     assert not any(frame is not None for frame in desk.frames)
     said = noise(seconds)
     spoken.say(said, AUDIO_HZ)
-    begins = round((now_s[0] - 50.0 + FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
-    for _ in range(150):
-        desk.until(desk.loop_s + TICK_S)
-        now_s[0] = desk.loudspeaker.now_s
+    begins = round((desk.loop_s + FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
+    desk.until(desk.loop_s + 1.5)
     np.testing.assert_allclose(desk.left[begins : begins + len(said)], said, atol=1e-5)
     assert np.count_nonzero(desk.left) <= len(said) + 40
     np.testing.assert_allclose(desk.taken[FRAME_SAMPLES:], desk.left[FRAME_SAMPLES:], atol=1e-5)
 
 
-def test_a_sentence_in_pieces_is_one_sentence(talk):
-    spoken, desk = talk
-    said = noise(1.0)
+@pytest.mark.parametrize("at_s", [None, 0.9])
+def test_a_sentence_in_pieces_is_one_sentence_and_leaves_at_its_time(at_s):
+    spoken, desk = talk()
+    said = noise(0.3)
     for at in range(0, len(said), 320):
-        spoken.say(said[at : at + 320], AUDIO_HZ)
+        spoken.say(said[at : at + 320], AUDIO_HZ, at_s and 50.0 + at_s + at / AUDIO_HZ)
         desk.until(desk.loop_s + TICK_S)  # twice as fast as it is spoken
     desk.until(2.0)
-    begins = round((FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
+    begins = round((at_s or FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
     np.testing.assert_allclose(desk.left[begins : begins + len(said)], said, atol=1e-5)
 
 
-def test_a_time_is_when_it_leaves_the_loudspeaker(talk):
-    spoken, desk = talk
-    said = noise(0.3)
-    spoken.say(said, AUDIO_HZ, at_s=50.0 + 0.9)
-    desk.until(2.0)
-    np.testing.assert_allclose(desk.left[round(0.9 * AUDIO_HZ) :][: len(said)], said, atol=1e-5)
-
-
 @given(at=st.integers(30, 90))
-def test_a_hush_is_heard_as_soon_as_the_device_can(at):
-    now_s = [50.0]
-    spoken = PushedSpeech(lambda: now_s[0])
-    desk = Desk(spoken)
+def test_a_hush_is_heard_as_soon_as_the_device_can_and_the_next_sentence_after_it(at):
+    spoken, desk = talk()
     spoken.say(noise(5.0), AUDIO_HZ)
-    for tick in range(200):
-        desk.until(desk.loop_s + TICK_S)
-        now_s[0] = desk.loudspeaker.now_s
-        if tick == at:
-            spoken.hush()
-            hushed = round(desk.loop_s * AUDIO_HZ)
+    desk.until(at * TICK_S)
+    spoken.hush()
+    hushed = round(desk.loop_s * AUDIO_HZ)
+    desk.until(2.0)
     silent = hushed + round((LATENCY_S + HUSH_S + 0.006) * AUDIO_HZ)
     assert np.abs(desk.left[hushed:silent]).max() > 0.2
     assert not desk.left[silent + 40 :].any()
-    np.testing.assert_allclose(desk.taken[FRAME_SAMPLES:], desk.left[FRAME_SAMPLES:], atol=1e-5)
-    assert desk.voice.statistics()["unsaid_ms"] == 0.0
-
-
-def test_after_a_hush_it_speaks_again(talk):
-    spoken, desk = talk
-    spoken.say(noise(3.0), AUDIO_HZ)
-    desk.until(0.6)
-    spoken.hush()
     again = noise(0.3, 1)
     spoken.say(again, AUDIO_HZ)
-    desk.until(2.0)
-    begins = round((0.6 + FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
+    begins = round((desk.loop_s + FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
+    desk.until(3.0)
     np.testing.assert_allclose(desk.left[begins : begins + len(again)], again, atol=1e-5)
-    assert not desk.left[begins + len(again) + 40 :].any()
+    np.testing.assert_allclose(desk.taken[FRAME_SAMPLES:], desk.left[FRAME_SAMPLES:], atol=1e-5)
+    assert desk.voice.statistics()["unsaid_ms"] == 0.0
 
 
 def test_a_device_that_runs_dry_is_a_silence_that_is_told_and_counted(caplog):
@@ -276,196 +377,33 @@ def test_threads_that_speak_and_hush_do_not_hold_up_the_loop():
     assert all(frame is None or frame.shape == (FRAME_SAMPLES,) for frame in taken)
 
 
-# --- the device -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("ahead_s", "expected_s"), [(0.03, 0.03), (None, 0.05), (-0.01, 0.05), (1e6, 0.05), (float("nan"), 0.05)]
-)
-def test_a_block_leaves_when_its_device_says_so_where_that_can_be(ahead_s, expected_s):
-    assert leaves_after_s(ahead_s, 0.05) == expected_s
-
-
-@pytest.mark.parametrize("channels", [1, 2, 8])
-def test_of_many_channels_the_first_two_speak(channels):
-    stream = PlaybackStream(SoundDevice(name="room", number=3, channels=channels, rate_hz=48_000.0), 48_000.0, channels)
-    stream.playout.start(time.monotonic())
-    stream.playout.tell(0, np.full(50 * FRAME_SAMPLES, 0.25, np.float32))
-    stamp = type("Stamp", (), {"outputBufferDacTime": 5.2, "currentTime": 5.0})
-    out = np.ones((480, channels), np.float32)
-    stream._called(out, 480, stamp, type("Status", (), {"output_underflow": False}))
-    assert out[:, :2] == pytest.approx(np.full((480, min(channels, 2)), 0.25), abs=1e-5)
-    assert not out[:, 2:].any()
-
-
-# --- a sound server -------------------------------------------------------------------------------------------------
-
-
-def pause(played):
-    """Wait until its worker has sent something."""
-    wait_for_message(played._loudspeaker, FRAME_S)
-
-
-def recorded(seconds, begin):
-    """What `person.monitor` records meanwhile, on the grid that begins now, and what `begin(origin)` gave."""
-    from sfms_robot.sources.microphone import open_capture
-
-    heard = LiveVoice()
-    with open_capture("person.monitor", "--audio mic") as capture:
-        origin_s = time.monotonic()
-        heard.start(origin_s)
-        step = begin(origin_s)
-        frames = []
-        while len(frames) < round(seconds / FRAME_S):
-            capture.pass_on(heard, 0.02)
-            step()
-            frame = heard.take(len(frames))
-            if frame is not None:
-                frames.append(frame)
-            assert time.monotonic() < origin_s + PATIENCE_S
-    return np.concatenate(frames)
-
-
-def found(part, whole):
-    """Where a part lies in the whole, in samples, and how well it correlates with what is there."""
-    size = len(part) + len(whole)
-    together = np.fft.irfft(np.fft.rfft(whole, size) * np.fft.rfft(part, size).conj(), size)
-    begin = int(together[: len(whole) - len(part)].argmax())
-    there = whole[begin : begin + len(part)]
-    return begin, float(together[begin] / np.sqrt((part**2).sum() * (there**2).sum()))
-
-
-@pytest.mark.slow
-def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
-    """A sound server's own time stamps: of what is played, and of what its monitor records of it."""
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 7 * AUDIO_HZ]
-    with closing(open_playback("person", RecordedVoice(said))) as played:
-        taken = []
-
-        def begin(origin_s):
-            played.start(origin_s)
-
-            def step():
-                while (time.monotonic() - origin_s) / FRAME_S >= len(taken):
-                    taken.append(played.take(len(taken)))
-
-            return step
-
-        heard = recorded(8.0, begin)
-    assert played.device == "person"
-    whole = np.concatenate([np.zeros(FRAME_SAMPLES, np.float32) if frame is None else frame for frame in taken])
-    begins = range(2 * AUDIO_HZ, 6 * AUDIO_HZ, AUDIO_HZ)  # both clocks are being learnt before
-    places, likenesses = zip(*(found(whole[at : at + AUDIO_HZ], heard) for at in begins), strict=True)
-    assert np.median(likenesses) > 0.8
-    assert np.median(np.abs(np.array(places) - np.array(begins))) / AUDIO_HZ < 0.05
-
-
-@pytest.mark.slow
-def test_a_hush_silences_the_sound_server(sound_server):
-    spoken = PushedSpeech()
-    with closing(open_playback("person", spoken)) as played:
-        asked = []
-
-        def begin(origin_s):
-            played.start(origin_s)
-            spoken.say(noise(10.0), AUDIO_HZ)
-
-            def step():
-                loop_s = time.monotonic() - origin_s
-                played.take(int(loop_s / FRAME_S) + 1)
-                if loop_s > 1.5 and not asked:
-                    asked.append(loop_s)
-                    spoken.hush()
-
-            return step
-
-        heard = recorded(2.5, begin)
-    levels = [energy_db(frame) for frame in heard.reshape(-1, FRAME_SAMPLES)]
-    assert max(levels[20:30]) > -20.0
-    ended_s = max(index for index, level in enumerate(levels) if level > -60.0) * FRAME_S
-    assert asked[0] - 0.05 < ended_s < asked[0] + 0.6
-
-
-@pytest.mark.slow
-def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
-    said = noise(60.0)
-    with closing(open_source("none", "none", agent=RecordedVoice(said), play="person")) as source:
-        origin_s = time.monotonic()
-        source.start(origin_s)
-        frames = []
-
-        def until(enough):
-            before = len(frames)
-            while not enough(frames[before:]):
-                assert time.monotonic() < origin_s + PATIENCE_S
-                frames.extend(source.read(time.monotonic() - origin_s))
-                pause(source._agent)
-
-        until(lambda new: any(frame.agent_audio is not None and frame.agent_audio.any() for frame in new))
-        sound_server.unplug("person")
-        until(lambda _: "agent_audio" in source.missing)
-        until(lambda new: len(new) > 5 and not any(frame.agent_audio.any() for frame in new[-3:]))
-        sound_server.plug("person")
-        until(lambda _: not source.missing)
-        until(lambda new: any(frame.agent_audio.any() for frame in new))
-    told = [record.getMessage() for record in caplog.records]
-    assert told[0].startswith("loudspeaker: person, ") and told[-1] == "loudspeaker: running again"
-
-
-def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_server):
-    for wanted in ("nobody", "7"):
-        with pytest.raises(ConfigError, match=f"^--play {wanted}: no such device .*person") as raised:
-            open_playback(wanted, RecordedVoice(noise(0.1)))
-        assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("agent_audio", ["none", "device:robot.monitor"])
-def test_what_is_not_said_here_is_not_played(agent_audio):
-    with pytest.raises(ConfigError, match=f"^--play default: nothing is played of --agent-audio {agent_audio} .*tcp"):
-        open_source("none", "none", agent_audio=agent_audio, play="default")
-
-
-@pytest.mark.slow
-def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
-    """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks."""
-    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
-    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
-    sound_server.plug("robot")
-    sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
-    with closing(
-        open_source("mic:person.monitor", "none", agent_audio=str(tmp_path / "said.wav"), play="robot")
-    ) as one:
-        origin_s, frames = time.monotonic(), []
-        one.start(origin_s)
-        while len(frames) < 150:
-            assert time.monotonic() < origin_s + PATIENCE_S
-            frames += one.read(time.monotonic() - origin_s)
-            pause(one._agent._inner)
-    settled = [frame for frame in frames[75:] if len(frame.audio) and frame.agent_audio.any()]
-    heard, own = (
-        [energy_db(part) for part in parts]
-        for parts in ([frame.audio for frame in settled], [frame.agent_audio for frame in settled])
-    )
-    # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
-    assert np.median(own) > -40.0
-    assert np.median(heard) < np.median(own) - 15.0
-
-
-def test_programs_behind_what_is_said_are_told_also_where_it_is_played_and_taken_out():
+def test_programs_behind_what_is_said_are_told_also_where_it_is_played():
     spoken = PushedSpeech()
     spoken.outlet = object()
     played = PlayedVoice(VirtualLoudspeaker(), spoken)
-    assert list(PairedSource(None, None, OwnVoice(played)).outlets) == [spoken.outlet]
+    assert list(PairedSource(None, None, played).outlets) == [spoken.outlet]
 
 
-def test_the_echo_canceller_is_told_a_little_early():
-    """And where it asks, the frame before the newest, it is told all of it."""
-    desk = Desk(RecordedVoice(noise(2.0)))
-    own = OwnVoice(desk.voice)
+class Sent(list):
+    """A microphone's worker that keeps what it is sent."""
+
+    tell = list.append
+
+    def messages(self, now_s):
+        return []
+
+
+def test_the_echo_canceller_is_told_every_frame_and_a_little_early():
+    """It asks, the frame before the newest too, before the microphone's frame is there."""
+    desk, sent = Desk(RecordedVoice(noise(2.0))), Sent()
+    source = PairedSource(Microphone(sent, EARLY_S), None, desk.voice)
+    source.start(desk.loudspeaker.now_s)
     for index in range(1, 26):
         desk.until(index * FRAME_S)
-        own.ask(index)
-    first, told = own.newest()
+        source.read(desk.loop_s)
+    ends = [each.first + len(each.said) // FRAME_SAMPLES for each in sent[1:]]
+    assert ends == list(range(2, 27))
+    first, told = sent[-1].first, sent[-1].said
     early = round(EARLY_S * AUDIO_HZ)
     assert early + ECHO_LATENCY_SAMPLES <= FRAME_SAMPLES
     np.testing.assert_allclose(

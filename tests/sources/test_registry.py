@@ -13,7 +13,7 @@ from sfms_robot.ports import Source
 from sfms_robot.sources.paired import LONGEST_WAIT_S
 from sfms_robot.sources.push import PushedSight, PushedVoice
 from sfms_robot.sources.recording import RecordedVoice
-from sfms_robot.sources.registry import SIGHTS, VOICES, check_source, open_source, shipped_speaker, source_kinds
+from sfms_robot.sources.registry import KINDS, check_source, open_source, shipped_speaker, source_kinds
 
 
 class Entry:
@@ -39,12 +39,12 @@ class Own(Source):
 
 
 def kinds(**loaded):
-    return source_kinds([Entry(name, f"theirs:{name}", value) for name, value in loaded.items()])
+    return [Entry(name, f"theirs:{name}", value) for name, value in loaded.items()]
 
 
 def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
     inner, told = Own(), []
-    source = open_source("ear:left:2", kinds=kinds(ear=lambda argument: told.append(argument) or inner))
+    source = open_source("ear:left:2", others=kinds(ear=lambda argument: told.append(argument) or inner))
     source.close()
     assert told == ["left:2"] and inner.closed
 
@@ -54,7 +54,7 @@ def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
 @pytest.mark.parametrize("agent_audio", ["katie", "none"])
 def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
-    source = open_source(audio, face, 2.0, agent_audio=agent_audio, kinds=theirs)
+    source = open_source(audio, face, 2.0, agent_audio=agent_audio, others=theirs)
     source.start(0.0)
     frames = source.read(2.0 + LONGEST_WAIT_S)
     assert [frame.time_s for frame in frames] == [index / 25 for index in range(1, 51)]
@@ -63,32 +63,33 @@ def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     source.close()
 
 
-def test_a_face_that_is_named_goes_without_the_default_voice():
-    with closing(open_source("default", "push:0")) as source:
-        assert source.duration_s is None
-    assert open_source("default", "none").duration_s == pytest.approx(47.68)
-
-
-def test_a_recording_ends_a_run_also_beside_a_live_face_and_what_is_live_does_not():
-    with closing(open_source("katie", "push:0")) as source:
-        assert source.duration_s == pytest.approx(18.36)
-    with closing(open_source("push:0", "auto", agent_audio="katie")) as source:
-        assert source.duration_s is None
+@pytest.mark.parametrize(
+    ("audio", "face", "agent_audio", "duration_s"),
+    [
+        ("default", "push:0", "none", None),  # a face that is named goes without the default voice
+        ("default", "none", "none", 47.68),
+        ("katie", "push:0", "none", 18.36),  # a recording ends a run, also beside a live face
+        ("push:0", "auto", "katie", None),
+    ],
+)
+def test_a_run_lasts_as_long_as_its_recording(audio, face, agent_audio, duration_s):
+    with closing(open_source(audio, face, agent_audio=agent_audio)) as source:
+        assert source.duration_s == (duration_s and pytest.approx(duration_s))
 
 
 def test_a_whole_source_brings_its_own_face():
     inner = Own()
     with pytest.raises(ConfigError, match="--face push: --audio ear brings its own"):
-        open_source("ear", "push", kinds=kinds(ear=lambda argument: inner))
+        open_source("ear", "push", others=kinds(ear=lambda argument: inner))
     assert inner.closed
 
 
 def test_a_face_is_no_voice_and_a_voice_no_face():
     theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
     with pytest.raises(ConfigError, match="--audio eye: theirs:eye gave a PushedSight, no voice or source"):
-        open_source("eye", kinds=theirs)
+        open_source("eye", others=theirs)
     with pytest.raises(ConfigError, match="--face ear: theirs:ear gave a PushedVoice, no face"):
-        open_source("none", "ear", kinds=theirs)
+        open_source("none", "ear", others=theirs)
 
 
 def test_what_was_opened_is_closed_when_the_next_cannot_be():
@@ -100,16 +101,16 @@ def test_what_was_opened_is_closed_when_the_next_cannot_be():
 
     ear = Ear(np.zeros(640, dtype=np.float32))
     with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError"):
-        open_source("ear", "broken", kinds=kinds(ear=lambda argument: ear, broken=None))
+        open_source("ear", "broken", others=kinds(ear=lambda argument: ear, broken=None))
     assert ear.closed
 
 
 def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours():
     theirs = kinds(push=Own, broken=None)
-    assert theirs.voices["push"] is VOICES["push"] and theirs.sights["push"] is SIGHTS["push"]
-    check_source("broken", kinds=theirs)
+    assert all(source_kinds(flag, theirs)["push"] is KINDS[flag]["push"] for flag in ("--audio", "--face"))
+    check_source("broken", others=theirs)
     with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError: no module named so"):
-        open_source("broken", kinds=theirs)
+        open_source("broken", others=theirs)
 
 
 @pytest.mark.parametrize("fault", [KeyError("ear"), OSError(19, "No such device"), SystemExit(1)])
@@ -118,7 +119,7 @@ def test_a_kind_that_raises_when_it_is_made_is_one_line(fault):
         raise fault
 
     with pytest.raises(ConfigError, match=f"^plug-in ear .*theirs:ear.: {type(fault).__name__}: .+$"):
-        open_source("ear", kinds=kinds(ear=made))
+        open_source("ear", others=kinds(ear=made))
 
 
 def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
@@ -128,9 +129,11 @@ def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
         "sys.exit(bool({'numpy', 'soundfile', 'soxr'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-    with pytest.raises(ConfigError, match="--audio nothing-so: no such file .mic, push, browser, FILE.wav"):
-        check_source("nothing-so")
-    with pytest.raises(ConfigError, match="--face nothing-so: no such file .live-link, vmc, webcam, push"):
-        check_source(face="nothing-so")
-    with pytest.raises(ConfigError, match="--agent-audio nothing-so: no such file .device, tcp, FILE.wav"):
-        check_source(agent_audio="nothing-so")
+    for flag, choices in (
+        ("audio", "mic, push, browser, FILE.wav"),
+        ("face", "live-link, vmc, webcam, push"),
+        ("agent_audio", "device, tcp, FILE.wav"),
+    ):
+        said = f"--{flag.replace('_', '-')} nothing-so: no such file .{choices}"
+        with pytest.raises(ConfigError, match=said):
+            check_source(**{flag: "nothing-so"})

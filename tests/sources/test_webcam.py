@@ -1,4 +1,4 @@
-"""`--face webcam`: what is told of a picture, when, and what is said where there is no camera."""
+"""`--face webcam`: a face in our axes, the choice among several, and pictures of a camera, or none."""
 
 import sys
 import time
@@ -6,22 +6,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scripted_worker import shows
 
 from sfms_robot.errors import ConfigError, MissingExtra, PortError
 from sfms_robot.face.drawing import VirtualWebcam
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS
 from sfms_robot.lab.bench.webcam_bench import face_of, webcam, write_video
-from sfms_robot.sources.live_face import FaceArgument, LiveFace
+from sfms_robot.signals.rotations import rotation
 from sfms_robot.sources.webcam import (
+    GONE_S,
+    NEARER,
+    TAKE_OVER_S,
     Landmarker,
     SeenFace,
     SeenPicture,
     Webcam,
     WebcamOpened,
+    choose,
     live,
     open_video,
     open_webcam,
     played,
+    seen_face,
     watch,
 )
 from sfms_robot.sources.worker import SourceWorker
@@ -49,15 +57,16 @@ def camera():
         opened.append(worker)
         for _ in messages:
             worker.wait()
-        return Webcam(worker, LiveFace(FaceArgument("").signs), None)
+        return Webcam(worker, None, None)
 
     yield of
     for worker in opened:
         worker.close()
 
 
-def test_the_newest_face_at_or_before_is_told_however_old(camera):
-    looking = camera(seen(0.02), seen(0.05), seen(0.09))
+def test_the_newest_face_since_the_start_at_or_before_is_seen_however_old(camera):
+    looking = camera(seen(-0.5), seen(0.02), seen(0.05), seen(0.09))
+    assert looking.at(0.0) is None and looking.latency_s == 0.0
     looking.start(ORIGIN_S)
     assert looking.at(0.01) is None
     assert looking.at(0.04).face.time_s == pytest.approx(0.02)
@@ -65,15 +74,7 @@ def test_the_newest_face_at_or_before_is_told_however_old(camera):
     assert looking.at(5.0).face.time_s == pytest.approx(0.09)
     np.testing.assert_array_equal(looking.at(5.0).place_m, PLACE_M)
     assert looking.at(5.0).attention is None
-    assert looking.latency_s == pytest.approx(0.02)
-
-
-def test_nothing_is_told_before_the_start_and_nothing_that_was_seen_before_it(camera):
-    looking = camera(seen(-0.5))
-    assert looking.at(0.0) is None
-    looking.start(ORIGIN_S)
-    assert looking.at(1.0) is None and looking.statistics()["pictures"] == 0
-    assert looking.latency_s == 0.0
+    assert looking.latency_s == pytest.approx(0.02) and looking.statistics()["pictures"] == 3
 
 
 def test_what_was_not_seen_is_counted(camera):
@@ -142,6 +143,105 @@ def test_a_covered_lens_shows_no_face():
     landmarker = Landmarker()
     assert landmarker.faces(np.zeros((480, 640, 3), np.uint8), 0.0) == []
     landmarker.close()
+
+
+# --- a face in our axes -----------------------------------------------------------------------------------------
+
+
+def matrix_of(roll, pitch, yaw, right_up_near_cm=(0.0, 0.0, -60.0)):
+    """Face -> camera as MediaPipe gives it: our rotation, with x = left, y = up, z = forward."""
+    theirs, matrix = [1, 2, 0], np.eye(4)  # their axes, among ours
+    matrix[:3, :3] = rotation(np.array([roll, pitch, yaw]))[np.ix_(theirs, theirs)]
+    matrix[:3, 3] = right_up_near_cm
+    return matrix
+
+
+@given(st.tuples(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5), st.floats(-3.0, 3.0)))
+def test_the_rotation_is_ours_signs_included(turn):
+    pose = seen_face(matrix_of(*turn), {}).motion[:3]
+    np.testing.assert_allclose(matrix_of(*pose), matrix_of(*turn), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "right_up_near_cm", "place", "eyes"),
+    [
+        (0, (10.0, 5.0, -60.0), (-0.6, 0.1, 0.05), (0.6 - 0.0347, -0.1, 0.05 + 0.0262)),
+        (np.pi / 2, (0.0, 0.0, -60.0), (-0.6, 0.0, 0.0), (0.6, -0.0347, 0.0262)),  # to their left: the picture's right
+    ],
+)
+def test_the_place_is_the_persons_and_the_eyes_are_seen_from_the_camera(yaw, right_up_near_cm, place, eyes):
+    seen = seen_face(matrix_of(0, 0, yaw, right_up_near_cm), {})
+    np.testing.assert_allclose(seen.motion[3:6], place, atol=1e-6)
+    np.testing.assert_allclose(seen.place_m, eyes, atol=1e-6)
+
+
+def test_blendshapes_go_by_name_and_the_tongue_is_not_seen():
+    told = {name: place / 100 for place, name in enumerate(ORDERS["mediapipe"])}
+    seen = seen_face(matrix_of(0, 0, 0), told)
+    for name in BLENDSHAPES:
+        assert seen.motion[CHANNEL_INDEX[name]] == np.float32(told.get(name, 0.0))
+    assert seen.motion[CHANNEL_INDEX["tongueOut"]] == 0.0
+
+
+# --- the person among several faces -----------------------------------------------------------------------------
+
+
+STEP_S = 1 / 30
+LEFT, RIGHT = np.array([0.6, 0.3, 0.0]), np.array([0.6, -0.3, 0.0])
+
+
+def followed(pictures):
+    """The chosen place in every picture (a list of places), None where nobody is."""
+    before, out = None, []
+    for number, places in enumerate(pictures):
+        index, before = choose(places, number * STEP_S, before)
+        out.append(None if index is None else places[index])
+    return out
+
+
+@given(st.lists(st.tuples(st.floats(0.93, 1.07), st.floats(0.93, 1.07), st.booleans()), min_size=1, max_size=120))
+def test_of_two_that_are_equally_near_the_first_chosen_stays(sways):
+    pictures = []
+    for left, right, swapped in [(1.0, 1.01, False), *sways]:
+        both = [left * LEFT, right * RIGHT]
+        pictures.append(both[::-1] if swapped else both)
+    assert all(place[1] > 0 for place in followed(pictures))
+
+
+def test_one_who_is_clearly_nearer_takes_over_after_a_while_and_stays():
+    near = 0.9 * NEARER * RIGHT
+    chosen = followed([[LEFT]] * 10 + [[LEFT, near]] * 90)
+    switches = [k for k in range(1, len(chosen)) if chosen[k] is not chosen[k - 1]]
+    assert len(switches) == 1 and (switches[0] - 10) * STEP_S == pytest.approx(TAKE_OVER_S, abs=2 * STEP_S)
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        ([[LEFT, 0.9 * NEARER * RIGHT]] * round(0.8 * TAKE_OVER_S / STEP_S) + [[LEFT, RIGHT]]) * 5,  # leans in
+        [[RIGHT]] * round(0.8 * GONE_S / STEP_S) + [[RIGHT, LEFT]] * 5,  # the chosen one is hidden
+    ],
+)
+def test_a_moment_changes_nothing(moment):
+    assert all(place is LEFT or place is None for place in followed([[LEFT, RIGHT]] + moment))
+
+
+def test_another_is_chosen_only_once_the_chosen_one_is_gone():
+    chosen = followed([[LEFT]] + [[RIGHT]] * 60)
+    alone = [place is None for place in chosen[1:]]
+    taken = alone.index(False)
+    assert taken * STEP_S == pytest.approx(GONE_S, abs=2 * STEP_S) and not any(alone[taken:])
+
+
+def test_a_face_is_followed_as_it_walks():
+    walk = [[np.array([0.6, y, 0.0]), np.array([0.9, 0.0, 0.1])] for y in np.linspace(-0.4, 0.4, 60)]
+    assert all(place[0] == 0.6 for place in followed(walk))
+
+
+@given(st.permutations(range(3)))
+def test_the_order_of_the_faces_does_not_matter(order):
+    faces = [LEFT, 0.7 * RIGHT, 1.5 * LEFT]
+    assert followed([[faces[k] for k in order]])[0] is faces[1]
 
 
 # --- closed loop: the virtual human before the camera ---------------------------------------------------------------

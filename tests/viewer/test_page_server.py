@@ -30,7 +30,7 @@ def told(visitor):
     return [json.loads(each) if each.startswith("{") else each for each in asyncio.run(all_of_it())]
 
 
-def test_who_does_something_first_has_the_controls_until_they_are_given_back() -> None:
+def test_who_does_something_first_has_the_controls_until_they_are_given_back():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.admit(a, "show")
@@ -38,21 +38,15 @@ def test_who_does_something_first_has_the_controls_until_they_are_given_back() -
     assert told(b) == [{"type": "controls", "held": "other", "needs_token": False}]
     with pytest.raises(PacketError, match="another visitor holds the controls"):
         here.visitors.admit(b, "show")
+    here.visitors.admit(b, "halt")  # needs no controls
+    assert here.visitors.controls(a) == "you"
     here.visitors.give(a)
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody"
     here.visitors.admit(b, "show")
     assert here.visitors.controls(b) == "you"
 
 
-def test_anybody_may_halt() -> None:
-    here = Here()
-    a, b = here.visitors.enter(), here.visitors.enter()
-    here.visitors.take(a)
-    here.visitors.admit(b, "halt")
-    assert here.visitors.controls(a) == "you"
-
-
-def test_controls_that_are_not_used_go_to_who_asks() -> None:
+def test_controls_that_are_not_used_go_to_who_asks():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.take(a)
@@ -66,7 +60,7 @@ def test_controls_that_are_not_used_go_to_who_asks() -> None:
     assert here.visitors.controls(b) == "you" and here.left == [a.number]
 
 
-def test_who_goes_leaves_the_controls() -> None:
+def test_who_goes_leaves_the_controls():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.take(a)
@@ -75,7 +69,7 @@ def test_who_goes_leaves_the_controls() -> None:
 
 
 @pytest.mark.parametrize("command", ["halt", "show"])
-def test_with_a_token_who_has_not_shown_it_only_looks(command) -> None:
+def test_with_a_token_who_has_not_shown_it_only_looks(command):
     here = Here("secret")
     visitor = here.visitors.enter()
     with pytest.raises(PacketError, match="the token is needed"):
@@ -87,13 +81,13 @@ def test_with_a_token_who_has_not_shown_it_only_looks(command) -> None:
     here.visitors.admit(visitor, command)
 
 
-def test_a_page_of_another_version_is_to_be_loaded_again() -> None:
+def test_a_page_of_another_version_is_to_be_loaded_again():
     here = Here()
     with pytest.raises(PacketError, match="version: expected 1, got 0: load the page again"):
         here.visitors.greet(here.visitors.enter(), 0, "")
 
 
-def test_there_is_room_for_some_and_not_for_all() -> None:
+def test_there_is_room_for_some_and_not_for_all():
     here = Here()
     first = [here.visitors.enter() for _ in range(MOST_VISITORS)][0]
     with pytest.raises(PacketError, match="look at this head already"):
@@ -102,7 +96,7 @@ def test_there_is_room_for_some_and_not_for_all() -> None:
     assert here.visitors.enter().number == MOST_VISITORS + 1
 
 
-def test_of_pictures_the_newest_is_sent_and_of_messages_all() -> None:
+def test_of_pictures_the_newest_is_sent_and_of_messages_all():
     visitor = Here().visitors.enter()
     for picture in ("old", "new"):
         visitor.show(picture)
@@ -111,7 +105,7 @@ def test_of_pictures_the_newest_is_sent_and_of_messages_all() -> None:
     assert told(visitor) == [{"n": 1}, {"n": 2}, "new"]
 
 
-def test_who_reads_nothing_is_found_out() -> None:
+def test_who_reads_nothing_is_found_out():
     visitor = Here().visitors.enter()
     for _ in range(OUTBOX):
         visitor.tell(b"{}")
@@ -120,7 +114,7 @@ def test_who_reads_nothing_is_found_out() -> None:
     assert visitor.behind
 
 
-def test_a_flood_is_read_slowly_and_a_burst_at_once() -> None:
+def test_a_flood_is_read_slowly_and_a_burst_at_once():
     visitor = Here().visitors.enter()
     pauses = [visitor.pause_s(0.01, 100.0) for _ in range(100)]
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)

@@ -20,7 +20,7 @@ from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face import drawing
-from sfms_robot.face.human import load_human, with_hair
+from sfms_robot.face.human import load_human
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_S, Doubles, Floats
 from sfms_robot.signals.events import find_nods, runs
 
@@ -317,7 +317,7 @@ def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
     widths, cell_high = _ALONE_PX if scene is None else _BESIDE_PX
     wide, high = sum(widths) + _GAP_PX, cell_high + _CAPTION_PX
     size = (_COLUMNS * wide + _GAP_PX, -(-len(instants) // _COLUMNS) * high + _TITLE_PX)
-    window, human = drawing.open_window(vtk, size), with_hair(load_human())
+    window, human = drawing.open_window(vtk, size), load_human(hair=True)
     paper = drawing.add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     drawing.add_text(vtk, paper, recording.title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
     for index, instant in enumerate(instants):

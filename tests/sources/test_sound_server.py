@@ -1,0 +1,366 @@
+"""`--audio mic` and `--play` on the real path: PortAudio, ALSA and a sound server, in real time."""
+
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+import soundfile
+from scripted_worker import wait_for_message
+
+from sfms_robot.data import data_dir
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
+from sfms_robot.signals.audio import energy_db, read_audio
+from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.microphone import open_microphone
+from sfms_robot.sources.playback import open_playback
+from sfms_robot.sources.push import PushedSpeech
+from sfms_robot.sources.recording import RecordedVoice
+from sfms_robot.sources.registry import open_source
+from sfms_robot.sources.sound_devices import Capture, sound_devices
+
+pytestmark = pytest.mark.realtime
+
+PATIENCE_S = 60.0  # on a computer with nothing to spare
+CALLED_S = 4.0  # before it speaks
+
+
+class Hearing:
+    """A source that is read in real time; every wait is for what its worker sends."""
+
+    def __init__(self, source, microphone):
+        self.source, self.microphone = source, microphone
+        self.frames = []
+        self.start(time.monotonic())
+
+    def start(self, origin_s):
+        self.origin_s = origin_s
+        self.source.start(origin_s)
+
+    def until(self, enough):
+        """Read frames until `enough()`; returns those."""
+        before = len(self.frames)
+        while not enough():
+            assert time.monotonic() < self.origin_s + PATIENCE_S
+            wait_for_message(self.microphone._worker, FRAME_S)
+            self.frames += self.source.read(time.monotonic() - self.origin_s)
+        return self.frames[before:]
+
+    def seconds(self, seconds):
+        wanted = len(self.frames) + round(seconds / FRAME_S)
+        return self.until(lambda: len(self.frames) >= wanted)
+
+
+@pytest.fixture
+def hear():
+    """How to open `--audio` and `--agent-audio` and listen; all is closed afterwards."""
+    sources = []
+
+    def opened(audio="mic", **how):
+        source = open_source(audio, "none", **how)
+        sources.append(source)
+        return Hearing(source, source._voice)
+
+    yield opened
+    for source in sources:
+        source.close()
+
+
+@pytest.fixture
+def play(sound_server):
+    """How to play a file to a sink; what still plays is ended afterwards."""
+    players = []
+
+    def played(sink, file):
+        players.append(sound_server.play(sink, file))
+        return players[-1]
+
+    yield played
+    for player in players:
+        player.kill()
+        player.wait()
+
+
+def heard(frames):
+    """(n,) whole, silence for what did not come in time."""
+    silence = np.zeros(FRAME_SAMPLES, np.float32)
+    return np.concatenate([frame.audio if len(frame.audio) else silence for frame in frames])
+
+
+def found(part, whole):
+    """Where a part lies in the whole, in samples, and how well it correlates with what is there."""
+    size = len(part) + len(whole)
+    together = np.fft.irfft(np.fft.rfft(whole, size) * np.fft.rfft(part, size).conj(), size)
+    begin = int(together[: len(whole) - len(part)].argmax())
+    there = whole[begin : begin + len(part)]
+    return begin, float(together[begin] / np.sqrt((part**2).sum() * (there**2).sum()))
+
+
+@pytest.mark.slow
+def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 3 * AUDIO_HZ]
+    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
+    hearing = hear("mic:person")
+    player = play("person", tmp_path / "said.wav")
+    hearing.until(lambda: player.poll() is not None)
+    hearing.seconds(0.4)
+    frames = hearing.frames
+    assert [frame.time_s for frame in frames] == pytest.approx(FRAME_S * np.arange(1, len(frames) + 1))
+    begins = range(AUDIO_HZ // 2, len(said), AUDIO_HZ // 2)  # the first half second is nearly silent
+    whole = heard(frames)
+    places, correlations = zip(*(found(said[at : at + AUDIO_HZ // 2], whole) for at in begins), strict=True)
+    late = np.array(places) - np.array(begins)
+    assert np.median(correlations) > 0.85 and min(correlations) > 0.7
+    assert np.ptp(late) < 0.05 * AUDIO_HZ  # nothing is lost between them: the card's clock is still being learnt
+    told = hearing.source.statistics()["voice"]
+    assert told["device"] == "person.monitor" and told["state"] == "running" and told["voice_frames"] > 25
+    assert 0.0 < hearing.microphone.latency_s < 1.0
+
+
+@pytest.mark.slow
+def test_an_unplugged_microphone_is_lost_and_comes_back(hear, sound_server, caplog):
+    hearing = hear("mic:person.monitor")
+    hearing.seconds(0.4)
+    assert not hearing.microphone.lost
+    sound_server.unplug("person")
+    hearing.until(lambda: hearing.microphone.lost)
+    silent = hearing.seconds(0.4)
+    assert not any(len(frame.audio) for frame in silent)
+    sound_server.plug("person")
+    hearing.until(lambda: not hearing.microphone.lost)
+    again = hearing.seconds(1.0)
+    assert any(len(frame.audio) for frame in again)
+    assert [frame.time_s for frame in hearing.frames] == pytest.approx(FRAME_S * np.arange(1, len(hearing.frames) + 1))
+    assert [record.getMessage() for record in caplog.records] == [
+        "microphone: person.monitor",
+        "microphone: person.monitor gives no more sound; restarting",
+        "microphone: running again",
+    ]
+
+
+@pytest.mark.slow
+def test_a_sound_server_that_is_started_again_is_found_again(hear, sound_server):
+    hearing = hear("mic")
+    hearing.seconds(0.4)
+    sound_server.stop()
+    hearing.until(lambda: hearing.microphone.lost)
+    sound_server.start("person")
+    hearing.until(lambda: not hearing.microphone.lost)
+    assert any(len(frame.audio) for frame in hearing.seconds(1.0))
+    assert hearing.microphone.statistics()["restarts"] > 0
+
+
+def called(seconds, said):
+    """A loud noise, silence until `seconds` after its beginning, then what is said."""
+    noise = 0.5 * np.random.default_rng(1).standard_normal(AUDIO_HZ // 10).clip(-1, 1)
+    return np.concatenate([noise, np.zeros(round(seconds * AUDIO_HZ) - len(noise)), said]).astype(np.float32)
+
+
+def heard_loud_s(hearing):
+    """`time.monotonic` of the first loud frame, None as long as there was none."""
+    loud = [frame.time_s for frame in hearing.frames if len(frame.audio) and energy_db(frame.audio) > -20.0]
+    return hearing.origin_s + loud[0] - FRAME_S if loud else None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("told_by", ["file", "device", "program"])
+def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_server, tmp_path, told_by):
+    """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks.
+
+    When the player begins nobody knows on a busy computer. So it calls first, and what it says is told for a tenth of
+    a second before it will be heard.
+    """
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
+    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
+    soundfile.write(tmp_path / "played.wav", called(CALLED_S, said), AUDIO_HZ)
+    sound_server.plug("robot")
+    sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
+    speech = PushedSpeech()
+    how = {
+        "file": {"agent_audio": str(tmp_path / "said.wav")},
+        "device": {"agent_audio": "device:robot.monitor"},
+        "program": {"agent": speech},
+    }
+    levels = []
+    for taken_out in (False, True):
+        ear, hearing = hear("mic:person.monitor"), hear("mic:person.monitor", **(how[told_by] if taken_out else {}))
+        player = play("robot", tmp_path / "played.wav")
+        ear.until(lambda ear=ear: heard_loud_s(ear) is not None)
+        told_s = heard_loud_s(ear) + CALLED_S - 0.1
+        assert time.monotonic() < told_s, "this computer is too busy to be told in time"
+        speech.say(said, AUDIO_HZ, told_s)
+        hearing.start(told_s)
+        frames = hearing.seconds(6.0)
+        levels.append(energy_db(heard(frames[75:])))
+        player.wait()
+        ear.source.close()
+        hearing.source.close()
+    assert levels[0] > -40.0
+    assert levels[1] < levels[0] - 15.0
+    assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in frames)
+
+
+def test_a_loudspeaker_is_heard_without_a_microphone_too(sound_server):
+    with closing(open_source("none", "none", agent_audio="device:person.monitor", duration_s=60.0)) as source:
+        hearing = Hearing(source, source._agent._recorder)
+        hearing.until(lambda: sum(frame.agent_audio is not None for frame in hearing.frames) >= 5)
+        assert not any(len(frame.audio) for frame in hearing.frames)
+
+
+def test_a_device_that_is_not_there_is_one_line_with_the_choices(sound_server):
+    assert [device.label for device in sound_devices() if "hw:" not in device.name] == [
+        "0 pulse",
+        "1 default",
+        "person.monitor",
+    ]
+    for wanted, problem in (("nobody", "no such device"), ("7", "no such device"), ("p", "fits several devices")):
+        with pytest.raises(ConfigError, match=f"--audio mic:{wanted}: {problem} .*person.monitor") as raised:
+            open_microphone(wanted)
+        assert "\n" not in str(raised.value)
+
+
+# --- what the robot says, played ---------------------------------------------------------------------------------
+
+
+def noise(seconds):
+    return (0.3 * np.random.default_rng(0).uniform(-1, 1, round(seconds * AUDIO_HZ))).astype(np.float32)
+
+
+def pause(played):
+    """Wait until its worker has sent something."""
+    wait_for_message(played._loudspeaker, FRAME_S)
+
+
+def recorded(seconds, begin):
+    """What `person.monitor` records meanwhile, on the grid that begins now, and what `begin(origin)` gave."""
+    heard = LiveVoice()
+    with Capture.opened("person.monitor", "--audio mic") as capture:
+        origin_s = time.monotonic()
+        heard.start(origin_s)
+        step = begin(origin_s)
+        frames = []
+        while len(frames) < round(seconds / FRAME_S):
+            capture.pass_on(heard, 0.02)
+            step()
+            frame = heard.take(len(frames))
+            if frame is not None:
+                frames.append(frame)
+            assert time.monotonic() < origin_s + PATIENCE_S
+    return np.concatenate(frames)
+
+
+@pytest.mark.slow
+def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
+    """A sound server's own time stamps: of what is played, and of what its monitor records of it."""
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 7 * AUDIO_HZ]
+    with closing(open_playback("person", RecordedVoice(said))) as played:
+        taken = []
+
+        def begin(origin_s):
+            played.start(origin_s)
+
+            def step():
+                while (time.monotonic() - origin_s) / FRAME_S >= len(taken):
+                    taken.append(played.take(len(taken)))
+
+            return step
+
+        heard = recorded(8.0, begin)
+    assert played.device == "person"
+    whole = np.concatenate([np.zeros(FRAME_SAMPLES, np.float32) if frame is None else frame for frame in taken])
+    begins = range(2 * AUDIO_HZ, 6 * AUDIO_HZ, AUDIO_HZ)  # both clocks are being learnt before
+    places, likenesses = zip(*(found(whole[at : at + AUDIO_HZ], heard) for at in begins), strict=True)
+    assert np.median(likenesses) > 0.8
+    assert np.median(np.abs(np.array(places) - np.array(begins))) / AUDIO_HZ < 0.05
+
+
+@pytest.mark.slow
+def test_a_hush_silences_the_sound_server(sound_server):
+    spoken = PushedSpeech()
+    with closing(open_playback("person", spoken)) as played:
+        asked = []
+
+        def begin(origin_s):
+            played.start(origin_s)
+            spoken.say(noise(10.0), AUDIO_HZ)
+
+            def step():
+                loop_s = time.monotonic() - origin_s
+                played.take(int(loop_s / FRAME_S) + 1)
+                if loop_s > 1.5 and not asked:
+                    asked.append(loop_s)
+                    spoken.hush()
+
+            return step
+
+        heard = recorded(2.5, begin)
+    levels = [energy_db(frame) for frame in heard.reshape(-1, FRAME_SAMPLES)]
+    assert max(levels[20:30]) > -20.0
+    ended_s = max(index for index, level in enumerate(levels) if level > -60.0) * FRAME_S
+    assert asked[0] - 0.05 < ended_s < asked[0] + 0.6
+
+
+@pytest.mark.slow
+def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
+    said = noise(60.0)
+    with closing(open_source("none", "none", agent=RecordedVoice(said), play="person")) as source:
+        origin_s = time.monotonic()
+        source.start(origin_s)
+        frames = []
+
+        def until(enough):
+            before = len(frames)
+            while not enough(frames[before:]):
+                assert time.monotonic() < origin_s + PATIENCE_S
+                frames.extend(source.read(time.monotonic() - origin_s))
+                pause(source._agent)
+
+        until(lambda new: any(frame.agent_audio is not None and frame.agent_audio.any() for frame in new))
+        sound_server.unplug("person")
+        until(lambda _: "agent_audio" in source.missing)
+        until(lambda new: len(new) > 5 and not any(frame.agent_audio.any() for frame in new[-3:]))
+        sound_server.plug("person")
+        until(lambda _: not source.missing)
+        until(lambda new: any(frame.agent_audio.any() for frame in new))
+    told = [record.getMessage() for record in caplog.records]
+    assert told[0].startswith("loudspeaker: person, ") and told[-1] == "loudspeaker: running again"
+
+
+def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_server):
+    for wanted in ("nobody", "7"):
+        with pytest.raises(ConfigError, match=f"^--play {wanted}: no such device .*person") as raised:
+            open_playback(wanted, RecordedVoice(noise(0.1)))
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("agent_audio", ["none", "device:robot.monitor"])
+def test_what_is_not_said_here_is_not_played(agent_audio):
+    with pytest.raises(ConfigError, match=f"^--play default: nothing is played of --agent-audio {agent_audio} .*tcp"):
+        open_source("none", "none", agent_audio=agent_audio, play="default")
+
+
+@pytest.mark.slow
+def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
+    """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks."""
+    said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
+    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
+    sound_server.plug("robot")
+    sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
+    with closing(
+        open_source("mic:person.monitor", "none", agent_audio=str(tmp_path / "said.wav"), play="robot")
+    ) as one:
+        origin_s, frames = time.monotonic(), []
+        one.start(origin_s)
+        while len(frames) < 150:
+            assert time.monotonic() < origin_s + PATIENCE_S
+            frames += one.read(time.monotonic() - origin_s)
+            pause(one._agent)
+    settled = [frame for frame in frames[75:] if len(frame.audio) and frame.agent_audio.any()]
+    heard, own = (
+        [energy_db(part) for part in parts]
+        for parts in ([frame.audio for frame in settled], [frame.agent_audio for frame in settled])
+    )
+    # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
+    assert np.median(own) > -40.0
+    assert np.median(heard) < np.median(own) - 15.0
