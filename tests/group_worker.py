@@ -11,7 +11,7 @@ from tiny_arig_training import settings
 
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.job import Run
-from sfms_robot.lab.learning.process_group import joined
+from sfms_robot.lab.learning.job import joined
 
 
 def main() -> None:

@@ -64,7 +64,7 @@ def tokenizer(
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
     if table is None:
-        from sfms_robot.lab.evaluation.listener_evaluation import evaluate_tokenizer
+        from sfms_robot.lab.evaluation.listener_tables import evaluate_tokenizer
 
         if data is None:
             raise BadParameter("--data is needed without --table")
@@ -100,7 +100,7 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.lab.evaluation.listener_evaluation import evaluate_listener
+    from sfms_robot.lab.evaluation.listener_tables import evaluate_listener
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
@@ -116,7 +116,7 @@ def listener_(
         found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
         show(found, json)
         return
-    from sfms_robot.lab.evaluation.papers import sfms_table
+    from sfms_robot.lab.evaluation.arig_tables import sfms_table
 
     options: dict[str, Any] = {
         "samples": samples, "limit": clips, "seed": seed, "order": order.value if order else None, "hop": hop,
@@ -141,7 +141,7 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.lab.evaluation.papers import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.lab.evaluation.arig_tables import EVERY, PapersOptions, evaluate_papers
 
     options = PapersOptions(
         data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed

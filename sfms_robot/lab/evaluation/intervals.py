@@ -44,6 +44,11 @@ def ends(values: Doubles) -> Doubles:
     return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
+def rounded(value: float, digits: int = 4) -> float | None:
+    """Return a figure as reports have it; None if it is not finite."""
+    return round(float(value), digits) if np.isfinite(value) else None
+
+
 def draw_people(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
     """Draw sets of `count` people with replacement; return how often each is in each set (draws, count)."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), draws)

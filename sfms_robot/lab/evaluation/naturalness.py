@@ -32,11 +32,10 @@ from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
 from sfms_robot.lab.corpora.reading import speaks
-from sfms_robot.lab.evaluation.behaviour_stats import movement, slow_poses_deg
+from sfms_robot.lab.evaluation.detection import movement, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import ends
-from sfms_robot.lab.evaluation.listener_evaluation import bar
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
+from sfms_robot.lab.evaluation.rollout import bar, frames_of_dyad, load_at_hop, rollout, spread
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Final, Literal
@@ -79,20 +79,12 @@ def evaluate_robustness(
     voices = voice_folders(data)
     everybody = unseen(voices, split)[:speakers]
     tasks = [
-        _RobustnessTask(
-            folder=folder,
-            voices=voices,
-            split=split,
-            speaker=place,
-            inputs=inputs,
-            condition=CONDITIONS.index(condition),
-            minutes=minutes,
-            seeds=range(seed, seed + seeds),
-        )
+        (place, inputs, CONDITIONS.index(condition))
         for place, speaker in enumerate(everybody)
         for inputs, condition in cases(speaker)
     ]
-    rows = run_in_processes(_play, tasks, jobs, "speakers heard")
+    work = partial(_play, folder, voices, split, minutes, range(seed, seed + seeds))
+    rows = run_in_processes(work, tasks, jobs, "speakers heard")
     found: dict[str, Any] = {}
     for kind in RANGES:
         rate_key, scatter_key = f"{kind}s_per_minute", f"{kind}s_variance_over_mean"
@@ -117,31 +109,21 @@ def evaluate_robustness(
     }
 
 
-@dataclass(frozen=True, kw_only=True)
-class _RobustnessTask:
-    """One speaker in one condition: places of `speaker` among the voices of `split`, and in `CONDITIONS`."""
-
-    folder: Path
-    voices: tuple[Path, ...]
-    split: Split
-    speaker: int
-    inputs: Inputs
-    condition: int
-    minutes: float
-    seeds: range
-
-
-def _play(task: _RobustnessTask) -> dict[str, Any]:
-    speaker, condition = unseen(task.voices, task.split)[task.speaker], CONDITIONS[task.condition]
-    rng = np.random.default_rng([task.seeds.start, task.speaker, task.condition])
-    frames = heard_and_seen(speaker, task.inputs, condition, task.minutes, rng)
-    played = rollout(_listener(task.folder), frames, task.seeds)
+def _play(
+    folder: Path, voices: tuple[Path, ...], split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
+) -> dict[str, Any]:
+    """Play one speaker in one condition: places among the voices of `split`, and in `CONDITIONS`."""
+    place, inputs, number = task
+    speaker, condition = unseen(voices, split)[place], CONDITIONS[number]
+    rng = np.random.default_rng([seeds.start, place, number])
+    frames = heard_and_seen(speaker, inputs, condition, minutes, rng)
+    played = rollout(_listener(folder), frames, seeds)
     return {
         "speaker": speaker.name,
-        "inputs": task.inputs,
+        "inputs": inputs,
         "condition": condition.name,
-        "tells_speech": condition.tells_speech(task.inputs),
-        **rates(counted(played), len(frames) / FRAME_HZ / 60, listened_minutes(speaker, task.minutes)),
+        "tells_speech": condition.tells_speech(inputs),
+        **rates(counted(played), len(frames) / FRAME_HZ / 60, listened_minutes(speaker, minutes)),
     }
 
 

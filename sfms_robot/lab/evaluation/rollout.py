@@ -11,9 +11,11 @@ A listener that follows events receives the given ones, each `LEAD_FRAMES` befor
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -82,6 +84,13 @@ def run_in_processes(
                 done.result()
                 progress.advance(bar)
             return [one.result() for one in waiting]
+
+
+@contextmanager
+def bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show a progress bar on stderr; yield the function that advances it."""
+    with Progress(console=Console(stderr=True)) as progress:
+        yield partial(progress.advance, progress.add_task(title, total=total))
 
 
 def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:

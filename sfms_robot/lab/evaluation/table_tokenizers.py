@@ -307,7 +307,7 @@ def keyframe_bits(frames: int, k: int, codes: int) -> float:
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
-def save(folder: Path, model: TableModel) -> None:
+def save_tokenizer(folder: Path, model: TableModel) -> None:
     """Write config.yaml and weights, in half precision: the codes stay the same, and a table needs many tokenizers."""
     folder.mkdir(parents=True, exist_ok=True)
     raw = model.recipe.model_dump(mode="json", exclude_defaults=True)
@@ -317,12 +317,8 @@ def save(folder: Path, model: TableModel) -> None:
     checkpoint.save_weights(folder / checkpoint.WEIGHTS, model, bits=16)
 
 
-def read(folder: Path) -> TableModel:
+def load_tokenizer(folder: Path) -> TableModel:
     """Read the tokenizer of a folder. Raises ConfigError or ModelError."""
     model = TableModel(load(config.Recipe, folder / checkpoint.CONFIG))
     checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
     return model.eval()
-
-
-def is_there(folder: Path) -> bool:
-    return (folder / checkpoint.CONFIG).is_file() and (folder / checkpoint.WEIGHTS).is_file()

@@ -23,9 +23,9 @@ from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_shifts
-from sfms_robot.lab.evaluation.hazard_scores import spans_of
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
+from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.signals import phase
 from sfms_robot.signals.events import MOTION_EVENTS, Bools
 
@@ -133,12 +133,12 @@ def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]
     `own_voice`: it spoke when the person did. Shifting its nods by a minute would shift them against that voice too, so
     their contingency on the others is left out.
     """
-    nods = [spans_of(decided, "nod") for decided in streams]
+    nods = [event_spans(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
     if not own_voice:
         sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
     for kind in (*ANNOTATED, "smile", "blink"):
-        sums |= _other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
+        sums |= _other_sums("decided_", one, kind, [event_spans(decided, kind) for decided in streams])
     return sums
 
 
@@ -265,11 +265,6 @@ def smoothed_rates(counts: Doubles) -> Doubles:
     if not nods or not minutes:
         return np.zeros(CELLS)
     return np.asarray((counts[0] + _PRIOR_NODS) / (counts[1] + _PRIOR_NODS * minutes / nods))
-
-
-def table_sums(one: ListenerMeeting, rates: Doubles) -> Sums:
-    """Return how the nod table with these rates ranks the nods."""
-    return {"table_nod_auc": ranked(rates[cells(phase.times(one.others))], one)}
 
 
 # --- people and figures ---------------------------------------------------------------------------------------------

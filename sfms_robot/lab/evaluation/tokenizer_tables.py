@@ -37,10 +37,10 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     SIZES,
     SizeName,
     TableModel,
-    is_there,
-    read,
+    load_tokenizer,
 )
 from sfms_robot.lab.learning.corpus import first_frames, windows
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.signals.tracks import Take, folder_takes
 
@@ -341,7 +341,7 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     held_out = recorded[takes.HELD_OUT] if options.data is None else folder_takes(options.data)
     wanted = list(dict.fromkeys(name for table in chosen for name in needed(table, options.models is None)))
     train_missing(options, wanted, folder, recorded)
-    loaded = {name: read(folder / name) for name in wanted}
+    loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))
     for name, model in loaded.items():  # errors in different units cannot stand in one table
         if not torch.allclose(model.motion_std, first.motion_std, rtol=1e-2) or model.window != first.window:
@@ -356,7 +356,7 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     with Console(stderr=True).status("scoring"), torch.inference_mode():
         tables = [build(name, loaded, seen) for name in chosen]
     if options.plots is not None:
-        from sfms_robot.lab.evaluation.table_plots import draw
+        from sfms_robot.lab.evaluation.table_training import draw
 
         errors = {
             f"{row.spec.name}, {row.values['bits_per_window']:,.0f} bits": row.errors
@@ -387,7 +387,12 @@ def _chosen(options: TableOptions) -> Sequence[str]:
 
 def train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, recorded: dict[str, list[Take]]) -> None:
     """Train the tokenizers of `wanted` that `folder` lacks. Raises ConfigError if that is the package's folder."""
-    missing = [name for name in wanted if options.train or not is_there(folder / name)]
+    missing = [
+        name
+        for name in wanted
+        if options.train
+        or not all((folder / name / file).is_file() for file in (checkpoint.CONFIG, checkpoint.WEIGHTS))
+    ]
     if not missing:
         return
     if options.models is None:

@@ -1,6 +1,6 @@
 """Evidence and hazards of whole recordings at once: what `EventModel.decide_each` draws step by step.
 
-`heard_in` and `done_in` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
+`heard_in` and `done_at` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
 given nothing has to be decided, so every step is asked together (`hazards_in`). Where none is, `most_in` says how
 likely each kind can be at all, whatever was done: at a step whose draws all lie above that nothing can happen, and only
 the others have to be decided one after the other.
@@ -214,20 +214,13 @@ _SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
 _SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
 
 
-def done_in(
-    spans_s: Mapping[str, Doubles], frames: int, log_rate: Doubles | float, aside: Bools | None = None
-) -> Doubles:
-    """Return (frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
-
-    `aside` (K,): which of the gaze shifts go away from the person.
-    """
-    return done_at(spans_s, np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64), log_rate, aside)
-
-
 def done_at(
     spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
 ) -> Doubles:
-    """Return `done_in` at instants (M,): (M, len(DONE))."""
+    """Return the rows (M, len(DONE)) at instants (M,) from spans (K, 2) by kind of `EVENT_KINDS`.
+
+    Kinds that are not there have never been. `aside` (K,): which of the gaze shifts go away from the person.
+    """
     columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
     for kind in _SINCE_END:
         columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
@@ -269,7 +262,7 @@ def hazards_in(
     """Return `Decision.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
     steps = steps_in(len(heard))
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
-    spans_s = {kind: _spans(own, kind) for kind in EVENT_KINDS}
+    spans_s = {kind: event_spans(own, kind) for kind in EVENT_KINDS}
     away = np.array([event.target_rad != AT_PERSON for event in own if event.kind == "gaze_shift"], bool)
     log_rate = _log_rate(model, calmness)
     odds = [
@@ -325,7 +318,8 @@ def _blocks(rows: Doubles) -> list[Doubles]:
     return np.array_split(rows, len(rows) // _TOGETHER + 1)
 
 
-def _spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
+def event_spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
+    """Return (K, 2) start, end of the events of a kind."""
     return np.array([(one.start_s, one.end_s) for one in events if one.kind == kind], np.float64).reshape(-1, 2)
 
 

@@ -8,11 +8,15 @@ a frame with its neighbour asks `Corpus.steps`.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -20,10 +24,11 @@ from torch import Tensor
 
 from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
-from sfms_robot.lab.learning.staged_frames import Scratch, StagedFrames, read_staged
+from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
 
 if TYPE_CHECKING:
@@ -109,23 +114,21 @@ def gather(
 
     Raises ConfigError when none is left, and whatever `frames_of` raises.
     """
-    if scratch is None or scratch.group.local_rank == 0:
-        corpus = _read(scenes, window, frames_of, scratch)
     if scratch is None:
-        return corpus
+        return _read(scenes, window, frames_of, None)
+    if scratch.group.local_rank == 0:
+        corpus = _read(scenes, window, frames_of, scratch.folder)
     scratch.group.wait()
     if scratch.group.local_rank == 0:
         return corpus
-    like = frames_of(next(iter(usable(next(iter(scenes.values()))))))
-    found, lengths, named = read_staged(scratch.folder)
-    return Corpus(replace(like, **found), lengths, named, staged=True)
+    return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), scratch.folder)
 
 
 def _read(
-    scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames], scratch: Scratch | None
+    scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames], folder: Path | None
 ) -> Corpus[Frames]:
     parts: list[Frames] = []
-    files = None if scratch is None else StagedFrames(scratch.folder)
+    files = None if folder is None else StagedFrames(folder)
     lengths: list[int] = []
     named: list[str] = []
     short = 0
@@ -142,16 +145,15 @@ def _read(
                 parts = [one]
             lengths.append(len(dyad.listener))
             named.append(scene)
-    total = sum(len(dyads) for dyads in scenes.values())
+    total = sum(map(len, scenes.values()))
     left_out = f"{short} are shorter than a window of {window} frames, {total - len(lengths) - short} cannot be read"
     if not lengths:
         raise ConfigError(f"none of {total} dyads can be used: {left_out}")
     if len(lengths) < total:
         log.warning("%d of %d dyads are used: %s", len(lengths), total, left_out)
-    if files is not None and scratch is not None:
+    if files is not None and folder is not None:
         files.close(lengths, named)
-        found, _, _ = read_staged(scratch.folder)
-        return Corpus(replace(parts[0], **found), tuple(lengths), tuple(named), staged=True)
+        return read_staged(parts[0], folder)
     joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(parts[0])}
     return Corpus(replace(parts[0], **joined), tuple(lengths), tuple(named))
 
@@ -242,3 +244,168 @@ def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
             bounds.append((0.01, 0.01))
     least, most = torch.tensor(bounds).T
     return least, most
+
+
+# --- Frames on disk --------------------------------------------------------------------------------------------------
+#
+# The processes of a machine share the system's file cache; the first process writes. A folder with frames of an earlier
+# run is written again.
+
+_INDEX = "index.json"
+
+
+class StagedFrames:
+    """Frames that are added dyad by dyad and then read as tensors that lie in files. Raises ConfigError."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._rows, self._shapes = folder, 0, dict[str, tuple[str, list[int]]]()
+        with _writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            for left in [*folder.glob("*.frames"), folder / _INDEX]:
+                left.unlink(missing_ok=True)
+
+    def add(self, frames: DataclassInstance) -> None:
+        """Append tensors (N, ...) of one dyad."""
+        for name, tensor in vars(frames).items():
+            array = tensor.contiguous().numpy()
+            self._shapes[name] = (str(array.dtype), list(array.shape[1:]))
+            file = self._folder / f"{name}.frames"
+            with _writing(file), file.open("ab") as opened:
+                opened.write(array.tobytes())
+        self._rows += len(array)
+
+    def close(self, lengths: Sequence[int], scenes: Sequence[str]) -> None:
+        """Write what the other processes need to read them."""
+        index = {"rows": self._rows, "shapes": self._shapes, "lengths": list(lengths), "scenes": list(scenes)}
+        with _writing(self._folder):
+            (self._folder / _INDEX).write_text(json.dumps(index), encoding="utf-8")
+
+
+def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
+    """Return the corpus whose frames lie in a folder, with the fields of `like`. Raises ConfigError."""
+    try:
+        index: dict[str, Any] = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{folder}: the first process of this machine has staged no frames ({error})") from error
+    found, rows = {}, index["rows"]
+    for name, (dtype, shape) in index["shapes"].items():
+        kind, count = torch.from_numpy(np.zeros(0, dtype)).dtype, rows * math.prod(shape)
+        flat = torch.zeros(0, dtype=kind)
+        if count:
+            flat = torch.from_file(str(folder / f"{name}.frames"), shared=False, size=count, dtype=kind)
+        found[name] = flat.view(rows, *shape)
+    return Corpus(replace(like, **found), tuple(index["lengths"]), tuple(index["scenes"]), staged=True)
+
+
+@contextmanager
+def _writing(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"--scratch: {file} cannot be written: {error.strerror or error}") from error
+
+
+# --- Slow motion of a head -------------------------------------------------------------------------------------------
+
+CUT_HZ: Final = 1.0
+HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
+MARGIN_FRAMES: Final = 2  # around an event that may still be it
+UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen: below 0.1 Hz it still counts
+LONGEST: Final = 2048  # frames of a spectrum
+ROUNDS: Final = 8  # to choose between people and mirror images, at most
+
+
+def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
+    """Return the slow part (N, S) of motion (N, S): below `CUT_HZ`, and smooth across the events that move the head.
+
+    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. Frames of a nod weigh
+    nothing: sway cannot be seen in them, a low-pass alone would take the mean of a nod for sway, and give the nod a
+    swing in the opposite direction before it begins.
+    """
+    from scipy.linalg import solveh_banded
+
+    n = len(motion)
+    if n < 3:
+        return motion.copy()
+    weight = np.ones(n)
+    for event in events:
+        if event.kind in HEAD_KINDS:
+            first = int(np.floor(event.start_s * FRAME_HZ)) - MARGIN_FRAMES
+            last = int(np.ceil(event.end_s * FRAME_HZ)) + MARGIN_FRAMES
+            weight[max(0, first) : max(0, last)] = UNKNOWN
+    mu = (2 * np.sin(np.pi * CUT_HZ / FRAME_HZ)) ** -4.0  # half of it passes at the cut
+    bands = np.zeros((3, n))
+    difference = (1.0, -2.0, 1.0)
+    for a, left in enumerate(difference):
+        for b, right in enumerate(difference[a:]):
+            bands[b, a : n - 2 + a] += mu * left * right
+    bands[0] += weight
+    slow: Doubles = solveh_banded(bands, weight[:, None] * motion.astype(np.float64), lower=True)
+    return slow.astype(np.float32)
+
+
+def without_sway(
+    motion: Tensor, space: MotionSpace, channels: Sequence[str], events: Sequence[ListenerEvent]
+) -> tuple[Tensor, Tensor]:
+    """Motion (N, C) of a space less the sway of its head, and that sway (N, S), by how far it is off neutral."""
+    head = head_channels(channels)
+    slow = torch.from_numpy(slow_part(motion[:, head].numpy(), events))
+    sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
+    fast = motion.clone()
+    fast[:, head] -= sway
+    return fast, sway
+
+
+def fit_sway(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+    """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
+
+    Each person is scaled to the mean size before powers are taken; `spread` holds the sizes. Of a person and the mirror
+    image, with `lateral` channels inverted, the one nearer to the other people counts.
+    """
+    tracks = [one.double() - one.double().mean(0) for one in slow if len(one) >= 2 * FRAME_HZ]
+    if not tracks:
+        raise ValueError("no motion of 2 s or more to fit sway on")
+    sizes = torch.stack([track.square().mean(0).sqrt().clamp(min=1e-9).log() for track in tracks])  # (K, S)
+    common = (sizes - sizes.mean(0)).mean(1)  # of the whole head
+    weight = torch.tensor([float(len(track)) for track in tracks], dtype=torch.float64)
+    spread = common.std(correction=0) if len(tracks) > 1 else torch.zeros((), dtype=torch.float64)
+    powers = torch.stack(
+        [band_powers(track / one.exp()) * weight_ for track, one, weight_ in zip(tracks, common, weight, strict=True)]
+    )
+    powers = _one_side(powers, lateral).sum(0) / weight.sum()
+    value, vector = torch.linalg.eigh(powers)
+    root = vector * value.clamp(min=0).sqrt()[:, None] @ vector.mT  # symmetric
+    return root.float(), spread.float()
+
+
+def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
+    """Powers (K, BANDS, S, S) of people or of their mirror images, whichever are more alike."""
+    turned = torch.ones(powers.shape[-1], dtype=powers.dtype)
+    turned[list(lateral)] = -1
+    mirror = turned[:, None] * turned
+    size = powers.sum((0, 1)).diagonal().clamp(min=1e-30).sqrt()
+    alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel as much as any other
+    mirrored = torch.zeros(len(powers), 1, 1, dtype=torch.bool)
+    for _ in range(ROUNDS):
+        mean = torch.where(mirrored, alike * mirror, alike).sum(0)
+        likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of what a mirror changes, as each stands
+        before, mirrored = mirrored, (likeness < 0)[:, None, None]
+        if torch.equal(before, mirrored):
+            break
+    return torch.where(mirrored[:, None], powers * mirror, powers)
+
+
+def band_powers(track: Tensor) -> Tensor:
+    """Co-spectrum (BANDS, S, S) of a track (N, S): what its channels do together within each of `BANDS_HZ`; what is
+    slower counts in the first.
+    """
+    from scipy import signal
+
+    length = min(len(track), LONGEST)
+    values = track.numpy()
+    how = {"fs": FRAME_HZ, "nperseg": length, "detrend": "constant"}
+    frequency_hz, density = signal.csd(values.T[:, None], values.T[None], **how)
+    band = np.clip(np.searchsorted(BANDS_HZ, frequency_hz, side="right") - 1, 0, BANDS)
+    powers = np.zeros((BANDS + 1, *density.shape[:2]))
+    np.add.at(powers, band, np.moveaxis(density.real, -1, 0) * (frequency_hz[1] - frequency_hz[0]))
+    return torch.from_numpy(powers[:BANDS])

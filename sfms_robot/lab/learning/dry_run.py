@@ -26,10 +26,8 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, MOTION_DIM, ListenerEvent
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.learning.arig import features as arig
-from sfms_robot.lab.learning.arig.losses import Student
-from sfms_robot.lab.learning.arig.trainer import arig_job
-from sfms_robot.lab.learning.job import Job
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.arig.trainer import Student, arig_job
+from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.sfms import features as sfms
 from sfms_robot.lab.learning.sfms.predictor_trainer import listener_job
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_job

@@ -30,21 +30,122 @@ Five duties make a resumed run bit-identical on a CPU:
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.distributed as dist
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
 
 from sfms_robot import config
-from sfms_robot.errors import optional
-from sfms_robot.lab.learning.process_group import ProcessGroup
-from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.errors import ConfigError, GroupError, optional
+
+PATIENCE = timedelta(minutes=30)  # a process looks at held-out data, or stages files, while others wait
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process among `size` that train together; `local_rank` among those on its machine."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+    restarts: int = 0
+
+    @property
+    def first(self) -> bool:
+        """Return whether this process writes files and prints."""
+        return self.rank == 0
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        """Means over all processes. Raises GroupError when one of them is gone."""
+        if self.size == 1:
+            return list(values)
+        sums = torch.tensor(values, dtype=torch.float64, device=_device())
+        with self.talking():
+            dist.all_reduce(sums)
+        return [float(each) / self.size for each in sums]
+
+    def told_by_first(self, find: Callable[[], float]) -> float:
+        """Return what the first process finds; the others wait for it."""
+        if self.size == 1:
+            return find()
+        found = torch.tensor([find() if self.first else 0.0], dtype=torch.float64, device=_device())
+        with self.talking():
+            dist.broadcast(found, 0)
+        return float(found)
+
+    def wait(self) -> None:
+        """Until all are here."""
+        self.mean([0.0])
+
+    @contextmanager
+    def talking(self) -> Iterator[None]:
+        """Where others may be gone: raises GroupError then."""
+        try:
+            yield
+        except RuntimeError as error:  # gloo and NCCL raise this and its children
+            if self.size == 1 or isinstance(error, torch.cuda.OutOfMemoryError):
+                raise
+            said = f"process {self.rank} of {self.size} has lost another one: {_first_line(error)}"
+            raise GroupError(said) from error
+
+
+@contextmanager
+def joined(device: torch.device) -> Iterator[ProcessGroup]:
+    """The group that `torchrun` says this process is of, or this process alone. Raises ConfigError, GroupError."""
+    size = _number("WORLD_SIZE", 1)
+    if size == 1:
+        yield ProcessGroup(restarts=_number("TORCHELASTIC_RESTART_COUNT", 0))
+        return
+    group = ProcessGroup(_number("RANK", 0), size, local_rank(), _number("TORCHELASTIC_RESTART_COUNT", 0))
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    with group.talking():
+        store, _, _ = next(rendezvous("env://", timeout=PATIENCE))
+        # torchrun goes on with a store that holds addresses of the dead.
+        store = dist.PrefixStore(f"restart {group.restarts}", store)  # type: ignore[attr-defined]
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=PATIENCE, world_size=size, rank=group.rank, store=store)
+    try:
+        yield group
+    finally:
+        dist.destroy_process_group()
+
+
+def local_rank() -> int:
+    """Which of the processes on this machine this is: which GPU is its own."""
+    return _number("LOCAL_RANK", 0)
+
+
+def _number(name: str, otherwise: int) -> int:
+    text = os.environ.get(name, str(otherwise))
+    if not text.isdecimal():
+        raise ConfigError(f"{name}={text} in the environment: expected a number, as torchrun sets it")
+    return int(text)
+
+
+def _device() -> torch.device:
+    return torch.device("cuda", torch.cuda.current_device()) if dist.get_backend() == "nccl" else torch.device("cpu")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+# --- Trainer's side --------------------------------------------------------------------------------------------------
+#
+# A step's batch is cut into pieces, each drawn with a generator of its own; process r of W takes pieces r, r + W, ...
+# A piece is the same in every process, so the losses of a run do not depend on the number of processes, up to the order
+# of summation. One process with one piece computes what plain training does.
 
 LossOf = Callable[[int, torch.Generator, int], Tensor]
 
@@ -102,8 +203,12 @@ class Report:
     looked: bool
 
 
-def unwatched(report: Report) -> None:
-    """Shows nothing to anybody."""
+@dataclass(frozen=True)
+class Scratch:
+    """Folder of staged frames, and the processes that read them."""
+
+    folder: Path
+    group: ProcessGroup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +216,7 @@ class Run:
     """Settings of running a job that do not change its weights.
 
     Attributes:
+        watches: called after every step.
         group: the processes that run it together.
         accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
             The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
@@ -120,7 +226,7 @@ class Run:
 
     resume: bool = False
     device: torch.device = torch.device("cpu")
-    watch: Callable[[Report], None] = unwatched
+    watches: Sequence[Callable[[Report], None]] = ()
     group: ProcessGroup = ProcessGroup()
     accumulate: int | None = None
     scratch: Path | None = None
@@ -211,13 +317,3 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
     finally:
         for writer in writers.values():
             writer.close()
-
-
-def together(watches: Sequence[Watch]) -> Watch:
-    """One watcher that tells several."""
-
-    def watch(report: Report) -> None:
-        for one in watches:
-            one(report)
-
-    return watch

@@ -7,27 +7,30 @@ early stop, and checkpoints from which a run continues bit for bit (on a CPU). H
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import math
+import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError
-from sfms_robot.lab.learning import resume
-from sfms_robot.lab.learning.job import Job, LossOf, Position, Report, Run, TrainingOutcome
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.job import Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
 SPEED_SMOOTHING = 0.9
@@ -51,7 +54,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
     it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
     """
-    file = resume.checkpoint_file(out, job.name)
+    file = checkpoint_file(out, job.name)
     group, pieces = run.group, pieces_of(job, run, file)
     if pieces > 1:
         job = replace(job, identity={**job.identity, "pieces": pieces})
@@ -64,8 +67,8 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
     position, best = Position(), None
     if run.resume:
-        position, best = resume.load(file, job, generator)
-    elif group.first and (left := resume.peek(file)) is not None and not left.finished:
+        position, best = load_checkpoint(file, job, generator)
+    elif group.first and (left := peek(file)) is not None and not left.finished:
         log.warning("%s: was at step %d, starts again; --resume would have continued", file, left.step)
     began_at = position.step
 
@@ -82,27 +85,27 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             looked = _look_is_due(job, position.step)
             if looked:
                 position = _compared(position, group.told_by_first(partial(_held_out, job)))
-                best = resume.weights_of(job) if position.worse == 0 else best
+                best = weights_of(job) if position.worse == 0 else best
             position = replace(position, finished=_over(job.phase, position))
 
             now_s = clock()
             frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
             before_s = now_s
-            run.watch(
-                Report(
-                    name=job.name,
-                    steps=job.phase.steps,
-                    position=position,
-                    loss=loss,
-                    gradient_norm=norm,
-                    learning_rate=rate,
-                    frames_per_s=frames_per_s,
-                    looked=looked,
-                )
+            report = Report(
+                name=job.name,
+                steps=job.phase.steps,
+                position=position,
+                loss=loss,
+                gradient_norm=norm,
+                learning_rate=rate,
+                frames_per_s=frames_per_s,
+                looked=looked,
             )
+            for watch in run.watches:
+                watch(report)
             interrupted = interrupted or (group.size == 1 and pressed())
             if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
-                resume.save(file, job, position, generator, best)
+                save_checkpoint(file, job, position, generator, best)
                 saved_s = now_s
             if interrupted:
                 raise KeyboardInterrupt(
@@ -167,7 +170,7 @@ def make_step(
 
 
 def _kept(file: Path) -> str:
-    left = resume.peek(file)
+    left = peek(file)
     return f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
 
 
@@ -250,7 +253,7 @@ def pieces_of(job: Job, run: Run, file: Path) -> int:
     Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
     """
     size, batch = run.group.size, job.phase.batch
-    begun = resume.pieces(file) if run.resume else None
+    begun = pieces_in(file) if run.resume else None
     pieces = size * (run.accumulate or 1) if begun is None or run.accumulate else begun
     if begun is not None and pieces != begun:
         raise ConfigError(f"{file}: was begun with {begun} pieces a step, --accumulate {run.accumulate} makes {pieces}")
@@ -316,3 +319,140 @@ def multiplies_bf16(device: torch.device) -> bool:
 def _seed(seed: int, step: int, piece: int) -> int:
     digest = hashlib.blake2b(f"{seed} {step} {piece}".encode(), digest_size=7)
     return int.from_bytes(digest.digest(), "big")
+
+
+# --- Checkpoints -----------------------------------------------------------------------------------------------------
+#
+# `checkpoint-NAME.safetensors` holds tensors `model.*`, `optimizer.I.J.*` (optimizer I, its parameter J), `random.*`
+# (states of the run's own generator and of torch's) and `best.*` (weights of the best held-out loss); its metadata hold
+# the position and the identity of the job as JSON.
+
+Weights = dict[str, Tensor]
+
+
+def checkpoint_file(out: Path, name: str) -> Path:
+    """Where a job of this name keeps its checkpoint."""
+    return out / f"checkpoint-{name}.safetensors"
+
+
+def weights_of(job: Job) -> Weights:
+    """A copy of the model's state, on the CPU."""
+    return {name: value.detach().cpu().clone() for name, value in job.model.state_dict().items()}
+
+
+def digest_of(module: nn.Module) -> str:
+    """Return a digest of the weights, for the identity of a job that builds on them."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def save_checkpoint(file: Path, job: Job, position: Position, generator: torch.Generator, best: Weights | None) -> None:
+    """Write a checkpoint, replacing `file` in one move: a crash leaves the old one. Raises ConfigError."""
+    tensors = {f"model.{name}": value for name, value in weights_of(job).items()}
+    tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
+    for index, one in enumerate(job.optimizers):
+        for parameter, state in one.state_dict()["state"].items():
+            for key, value in state.items():
+                tensors[f"optimizer.{index}.{parameter}.{key}"] = value.detach().cpu().clone()
+    tensors |= {"random.data": generator.get_state(), "random.torch": torch.get_rng_state()}
+    if job.device.type == "cuda":
+        tensors["random.cuda"] = torch.cuda.get_rng_state(job.device)
+    metadata = {"position": json.dumps(asdict(position)), "identity": json.dumps(job.identity)}
+    part = file.with_suffix(".part")
+    try:
+        save_file(tensors, part, metadata)
+        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
+        part.replace(file)
+    except (SafetensorError, OSError) as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
+
+
+def load_checkpoint(file: Path, job: Job, generator: torch.Generator) -> tuple[Position, Weights | None]:
+    """Put model, optimizers and all random states where `file` left them.
+
+    Raises:
+        ConfigError: there is no checkpoint, or it is of another job; names the first key that differs.
+        ModelError: the file is corrupt or of another version of the model's code.
+    """
+    if not file.is_file():
+        raise ConfigError(f"{file}: no checkpoint to resume from; leave out --resume to start")
+    metadata, tensors = _read(file)
+    try:
+        position, identity = Position(**json.loads(metadata["position"])), json.loads(metadata["identity"])
+        _same(file, identity, json.loads(json.dumps(job.identity)))
+        job.model.load_state_dict(_under(tensors, "model."))
+        for index, one in enumerate(job.optimizers):
+            one.load_state_dict(_optimizer_state(one, _under(tensors, f"optimizer.{index}.")))
+        generator.set_state(tensors["random.data"])
+        torch.set_rng_state(tensors["random.torch"])
+        if job.device.type == "cuda" and "random.cuda" in tensors:
+            torch.cuda.set_rng_state(tensors["random.cuda"], job.device)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        first = str(error).splitlines()[0]
+        raise ModelError(f"{file}: does not fit this version of the model: {first}") from error
+    return position, _under(tensors, "best.") or None
+
+
+def peek(file: Path) -> Position | None:
+    """Return the step of the checkpoint in `file`; None where there is no readable one."""
+    try:
+        with safe_open(file, framework="pt") as opened:
+            return Position(**json.loads((opened.metadata() or {})["position"]))
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        return None
+
+
+def pieces_in(file: Path) -> int | None:
+    """Into how many pieces the batches of the checkpoint in `file` are cut; None where it cannot be read."""
+    try:
+        with safe_open(file, framework="pt") as opened:
+            return int(json.loads((opened.metadata() or {})["identity"]).get("pieces", 1))
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _read(file: Path) -> tuple[Mapping[str, str], Weights]:
+    try:
+        with safe_open(file, framework="pt") as opened:
+            return opened.metadata() or {}, {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"{file}: not a readable checkpoint: {error}") from error
+
+
+def _under(tensors: Weights, prefix: str) -> Weights:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _optimizer_state(one: torch.optim.Optimizer, tensors: Weights) -> dict[str, Any]:
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        parameter, key = name.split(".")
+        state.setdefault(int(parameter), {})[key] = value
+    return {"state": state, "param_groups": one.state_dict()["param_groups"]}
+
+
+def _same(file: Path, theirs: object, ours: object) -> None:
+    """Raises ConfigError naming the first key whose value differs."""
+    then, now = dict(_flat(theirs)), dict(_flat(ours))
+    for key in [*now, *then]:
+        if then.get(key, "not given") != now.get(key, "not given"):
+            was, is_now = (values.get(key, "not given") for values in (then, now))
+            raise ConfigError(
+                f"{file}: belongs to another run: {key} = {was!r} there, {is_now!r} now; "
+                "resume with the same, or leave out --resume"
+            )
+
+
+def _flat(value: object, key: str = "") -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict) and value:
+        for name, inner in value.items():
+            yield from _flat(inner, f"{key}.{name}" if key else name)
+    else:
+        yield key, value

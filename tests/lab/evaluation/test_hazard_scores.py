@@ -8,10 +8,10 @@ from sfms_robot.config import Calmness
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.lab.corpora.compose.ami import read_people
 from sfms_robot.lab.evaluation import timing
-from sfms_robot.lab.evaluation.hazard_scores import annotated, decisions, delayed, mute, sensed, spans_of
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
+from sfms_robot.lab.evaluation.meetings import annotated, decisions, delayed, mute, sensed
 from sfms_robot.lab.evaluation.rollout import speaker_frames
-from sfms_robot.lab.evaluation.whole_recordings import hazards_in
+from sfms_robot.lab.evaluation.whole_recordings import event_spans, hazards_in
 from sfms_robot.lab.learning.events.event_trainer import student
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
@@ -105,8 +105,8 @@ def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
     together = decisions(decides, heard, [1, 2, 3])
     assert together == [decisions(decides, heard, [seed])[0] for seed in (1, 2, 3)]
     assert together[0] != together[1]
-    nods = spans_of(together[0], "nod")
-    assert len(nods) > 3 and (np.diff(nods[:, 0]) > 0).all() and not len(spans_of(together[0], "blink"))
+    nods = event_spans(together[0], "nod")
+    assert len(nods) > 3 and (np.diff(nods[:, 0]) > 0).all() and not len(event_spans(together[0], "blink"))
 
 
 def test_what_is_decided_is_what_deciding_every_frame_decides(speaker):
@@ -144,7 +144,7 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     frames = len(voice) // FRAME_SAMPLES
     when = EventModel.load()
     _, heard = sensed(speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)))
-    counts = np.array([len(spans_of(events, "nod")) for events in decisions(when, heard, range(300))])
+    counts = np.array([len(event_spans(events, "nod")) for events in decisions(when, heard, range(300))])
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
     assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82
     assert 0.03 <= (counts == 0).mean() <= 0.15

@@ -11,7 +11,7 @@ from tiny_arig_training import dyad
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.evaluation import naturalness
-from sfms_robot.lab.evaluation.behaviour_stats import movement
+from sfms_robot.lab.evaluation.detection import movement
 from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, notes
 from sfms_robot.lab.evaluation.robustness import RANGES, UnseenSpeaker, cases
 

@@ -7,7 +7,7 @@ import torch
 from sfms_robot import config
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.evaluation.sampling_calibration import LEAST, coursed, placing
+from sfms_robot.lab.learning.train_runs import LEAST, coursed, placing
 from sfms_robot.listeners.sfms.model import SfmsModel
 
 

@@ -237,11 +237,10 @@ def test_nothing_is_ranked_of_few_nods_or_of_what_nobody_annotated():
 
 def test_the_nod_table_ranks_those_it_was_counted_on_and_not_random_people():
     others = talk(5)
-    person = someone(others=spans_of(others), nods=spans(answering(others)), until_s=float(MINUTES * 60))
+    person = someone(others=event_spans(others), nods=spans(answering(others)), until_s=float(MINUTES * 60))
     rates = timing.table_rates([person])
-    phase, random = (
-        timing.table_sums(meeting(nods), rates)["table_nod_auc"] for nods in (answering(talk()), anywhere(1500))
-    )
+    ones = [meeting(nods) for nods in (answering(talk()), anywhere(1500))]
+    phase, random = (timing.ranked(rates[timing.cells(times(one.others))], one) for one in ones)
     assert phase[0] / phase[1] > 0.8
     assert random[0] / random[1] == pytest.approx(0.5, abs=0.04)
 
@@ -260,7 +259,7 @@ def test_a_persons_auc_is_the_mean_over_his_nods_and_counts_once():
     assert found["nods_per_minute"] == pytest.approx(440 / 40)
 
 
-def spans_of(mask):
+def event_spans(mask):
     edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0])) / FRAME_HZ
     return edges.reshape(-1, 2)
 

@@ -22,17 +22,20 @@ from sfms_robot.lab.learning.arig.features import (
     open_scenes,
     reflection,
 )
-from sfms_robot.lab.learning.arig.losses import (
+from sfms_robot.lab.learning.arig.trainer import (
     GLIDE,
     Student,
     _glided,
     augment,
     channel_weights,
+    draw,
     group_of,
     loss_parts,
     previous_states,
+    starts_by_event,
+    train_arig,
+    weights_of,
 )
-from sfms_robot.lab.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.listeners import arig, audio_frontend, checkpoint
 from sfms_robot.listeners.arig.event_curves import features

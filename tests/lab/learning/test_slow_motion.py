@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sfms_robot.frames import ListenerEvent
-from sfms_robot.lab.learning.slow_motion import fit_sway, slow_part
+from sfms_robot.lab.learning.corpus import fit_sway, slow_part
 from sfms_robot.listeners.idle import BANDS_HZ, draw_sway, sway_at
 
 TIMES_S = np.arange(1500) * 0.04

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.lab.evaluation.metrics import dtw
-from sfms_robot.lab.learning.sfms.losses import keyframe_dtw, soft_dtw
+from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_dtw, soft_dtw
 
 
 def cost_of(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,6 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CH
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import rollouts
-from sfms_robot.lab.evaluation.sampling_calibration import calibrate
 from sfms_robot.lab.learning.corpus import GAZE, without_gaze
 from sfms_robot.lab.learning.sfms import predictor_trainer, tokenizer_trainer
 from sfms_robot.lab.learning.sfms.features import (
@@ -27,6 +26,7 @@ from sfms_robot.lab.learning.sfms.features import (
 )
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, starts_with_events
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import batches
+from sfms_robot.lab.learning.train_runs import calibrate
 from sfms_robot.listeners import sfms
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace

@@ -13,14 +13,14 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.evaluation.behaviour_stats import behaviour
+from sfms_robot.lab.evaluation.detection import behaviour
 from sfms_robot.lab.evaluation.rollout import rollouts
-from sfms_robot.lab.evaluation.sampling_calibration import calibrate
 from sfms_robot.lab.learning.corpus import windows
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
 from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather, place_all
+from sfms_robot.lab.learning.train_runs import calibrate
 from sfms_robot.listeners import checkpoint, sfms
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED

@@ -15,9 +15,8 @@ from torch import nn
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.lab.learning import resume
 from sfms_robot.lab.learning.job import Job, Run
-from sfms_robot.lab.learning.training_loop import fit, optimizer, schedule
+from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer, peek, schedule
 
 
 def toy(identity=None, loss=None, held_out=None, seed=3, **phase) -> Job:
@@ -105,7 +104,7 @@ def test_looking_at_the_held_out_loss_changes_no_weight(tmp_path):
     never, often = toy(evaluate_every=0), toy(evaluate_every=1)
     fit(never, tmp_path / "never")
     fit(often, tmp_path / "often")
-    last = load_file(resume.checkpoint_file(tmp_path / "often", "toy"))
+    last = load_file(checkpoint_file(tmp_path / "often", "toy"))
     assert same(weights(never), [last[f"model.{name}"] for name in often.model.state_dict()])
 
 
@@ -114,7 +113,7 @@ def test_minutes_alone_make_checkpoints(tmp_path):
     steps_saved = []
 
     def look(report):
-        at = resume.peek(resume.checkpoint_file(tmp_path, "toy"))
+        at = peek(checkpoint_file(tmp_path, "toy"))
         steps_saved.append(at.step if at else 0)
 
     fit(toy(checkpoint_minutes=2.0), tmp_path, Run(watch=look), clock=lambda: next(seconds))
@@ -155,7 +154,7 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_weights_and_the_last_checkpo
     with pytest.raises(ModelError, match=r"toy: loss .* at step 7: not finite \(.*checkpoint-toy.* holds step 5\)"):
         fit(job, tmp_path, Run(watch=remember))
     assert same(weights(job), before)
-    saved = load_file(resume.checkpoint_file(tmp_path, "toy"))
+    saved = load_file(checkpoint_file(tmp_path, "toy"))
     assert all(value.isfinite().all() for value in saved.values())
 
 
@@ -194,7 +193,7 @@ def test_nothing_to_resume_is_said(tmp_path):
 @pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[: len(whole) // 2], lambda whole: b"x" * 99])
 def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
     fit(toy(), tmp_path)
-    file = resume.checkpoint_file(tmp_path, "toy")
+    file = checkpoint_file(tmp_path, "toy")
     file.write_bytes(damage(file.read_bytes()))
     with pytest.raises(ModelError, match="checkpoint-toy.safetensors: not a readable checkpoint"):
         fit(toy(), tmp_path, Run(resume=True))

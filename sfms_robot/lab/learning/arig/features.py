@@ -24,9 +24,17 @@ from sfms_robot.lab.corpora.collection import Dataset
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.learning import corpus as dyads
-from sfms_robot.lab.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
-from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
-from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.lab.learning.corpus import (
+    Corpus,
+    Scratch,
+    fit_sway,
+    in_space,
+    motion_scales,
+    some_sound,
+    sound_scales,
+    without_gaze,
+    without_sway,
+)
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sfms_robot import config
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
-from sfms_robot.lab.learning.arig.losses import LossParts, Student, augment, loss_parts, previous_states
 from sfms_robot.lab.learning.job import Job, Run
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
+from sfms_robot.listeners.arig.stream import FIRST
+from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
+from sfms_robot.listeners.layers import weighted_mean
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals import mel
 from sfms_robot.signals.control import COLUMNS
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
@@ -163,3 +172,214 @@ def _loss_parts(
     """`losses.loss_parts` as the phase says, previous states drawn."""
     previous = previous_states(states, phase.state_noise, generator, len(student.model.settings.states))
     return loss_parts(student, told, states, truth, phase.draws, generator, previous, phase.group_weights)
+
+
+# --- Losses ----------------------------------------------------------------------------------------------------------
+#
+# loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - motion|^2 (3.4)
+#
+# Every frame gets the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
+# is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
+# sounds within fewer steps. So are weights of groups of channels: by number, (3) is about the mouth.
+
+RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
+COLOURS = 4  # waves over the bands that make up another microphone's colour
+JUMPS = 0.04  # of frames at which the slow part goes elsewhere
+GLIDE = 12  # frames that it takes for that, at most
+COLD = 0.5  # share of windows whose past is exact
+SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
+# Groups of channels, by how their names begin; the mouth has the rest.
+GROUPS: Final = {
+    "head": (*POSE_CHANNELS, "rotation", "translation", "head"),
+    "lids": ("eye",),
+    "brows": ("brow",),
+    "mouth": ("",),
+}
+
+
+class Student(nn.Module):
+    """The model, and the layer that reads motion off its coarse motion while it learns."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+        self.readout = nn.Linear(model.settings.width, model.channels)
+
+
+@dataclass(frozen=True)
+class LossParts:
+    """Means over frames: equation (3), cross-entropy of labelled frames, squared error of the coarse motion."""
+
+    motion: Tensor
+    state: Tensor
+    coarse: Tensor
+
+    def total(self, phase: config.ArigPhase) -> Tensor:
+        return self.motion + phase.state_weight * self.state + phase.coarse_weight * self.coarse
+
+
+def loss_parts(
+    student: Student,
+    told: ArigDyad,
+    states: Tensor,
+    truth: Tensor,
+    draws: int,
+    generator: torch.Generator,
+    previous: Tensor,
+    group_weights: config.GroupWeights | None = None,
+) -> LossParts:
+    """Return the losses of frames 1..N-1.
+
+    Args:
+        told: inputs of the model, the past possibly noisy.
+        states: (B, N) int64, -1 where not labelled.
+        truth: (B, N, C) motion to be predicted after this past.
+        draws: noise levels per frame.
+        previous: (B, N) the states given to the model; each frame gets the one before.
+        group_weights: of `GROUPS` in equation (3); None: every channel counts the same.
+    """
+    model = student.model
+    weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
+    found = model.condition(told, previous)
+    target = model.standardise(truth[:, 1:])
+    to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
+    motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
+    coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
+    known = states[:, 1:] >= 0
+    state = motion.new_zeros(())
+    if found.states is not None and bool(known.any()):
+        state = F.cross_entropy(found.states[known], states[:, 1:][known])
+    return LossParts(motion, state, coarse)
+
+
+def group_of(channel: str) -> str:
+    """Of `GROUPS`."""
+    return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
+
+
+def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
+    """(C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
+    drawn = set(settings.drawn_channels)
+    members = Counter(group_of(name) for name in drawn)
+    weights = torch.zeros(len(settings.channels))
+    for index, name in enumerate(settings.channels):
+        if name in drawn:
+            weights[index] = getattr(groups, group_of(name)) / members[group_of(name)]
+    return weights / weights.sum()
+
+
+def augment(
+    dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[ArigDyad, Tensor]:
+    """Missing modalities, other microphones, and a past that is not quite what it was.
+
+    Also the motion (B, N, C) that comes after such a past.
+    The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
+    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. A
+    head whose past is not told is as it was.
+    Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
+    in every window, and all of it is taken back at once.
+    """
+    b, n = dyad.user_heard.shape
+    device = dyad.agent_motion.device
+
+    def dropped(share: float) -> Tensor:
+        return (torch.rand(b, 1, generator=generator) < share).to(device)
+
+    deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
+    silent = dropped(phase.silent_user)
+    mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
+    voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf & ~silent], dim=-1)
+    user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
+    off = model.motion_std * model.is_recalled
+    slow, fast = (each.to(device) * off for each in _wander(b, n, model.channels, phase, generator))
+    lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
+    spoken = dyad.voiced[..., :1] & lips
+    missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
+    missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
+    told = replace(
+        dyad,
+        user_sound=_in_a_room(dyad.user_sound + user_off, voiced[..., 1:], silent, model, phase, generator),
+        agent_sound=dyad.agent_sound + agent_off,
+        user_heard=dyad.user_heard & ~deaf,
+        agent_heard=dyad.agent_heard & ~mute,
+        user_seen=dyad.user_seen & ~blind,
+        agent_motion=dyad.agent_motion + slow + fast * model.step_std + torch.where(spoken, missed, 0.0),
+        voiced=voiced,
+    )
+    carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
+    return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
+
+
+def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
+    """(B, N, A) what another microphone would add to logarithms of power; nothing to other features."""
+    off = torch.zeros(b, n, model.sound_width)
+    if model.settings.sound != "mel":
+        return off
+    size = torch.rand(b, 1, 2, generator=generator) * mel.LN_PER_DB
+    waves = torch.randn(b, 1, COLOURS, generator=generator) / COLOURS**0.5
+    place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
+    colour = waves @ torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
+    grain = torch.randn(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS, generator=generator)
+    gain = torch.rand(b, 1, 1, generator=generator) * 2 - 1
+    bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
+    off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
+    return off
+
+
+def _in_a_room(
+    sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> Tensor:
+    """Return sound (B, N, A) of the user with some non-speech (voiced (B, N, 1)) or all of it (silent (B, 1)) removed.
+
+    Silence has the features of a stream's start. Features other than logarithms of power are unchanged.
+    """
+    if model.settings.sound != "mel":
+        return sound
+    b, n = sound.shape[:2]
+    share = torch.rand(b, 1, 1, generator=generator) * (torch.rand(b, 1, 1, generator=generator) < phase.quiet_room)
+    bands = sound[..., :MEL_WIDTH]
+    less = share.to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
+    quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
+    silence = torch.from_numpy(track(np.zeros(n * FRAME_SAMPLES, np.float32))[0]).to(sound.device)
+    return torch.where(silent[..., None], silence, quieter)
+
+
+def _wander(
+    b: int, n: int, channels: int, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of
+    steps.
+
+    The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
+    the drift of a stream: its speed does not continue in the frames after it.
+    """
+    size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
+    size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
+    jumps = torch.randn(b, n, channels, generator=generator)
+    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS), generator)
+    fast = torch.randn(b, n, channels, generator=generator)
+    slow = jumps.clone()
+    for frame in range(1, n):
+        slow[:, frame] += (1 - RETURN) * slow[:, frame - 1]
+    return size * slow, size * fast
+
+
+def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
+    """Jumps (B, N, C), each spread evenly over the frames from it on: 1 to `GLIDE`, drawn for each window."""
+    b, n = jumps.shape[:2]
+    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator)
+    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
+    before = (torch.arange(1, n + 1) - frames).clamp(min=0)
+    ended = total.gather(1, before[..., None].expand(-1, -1, jumps.shape[2]))
+    return (total[:, 1:] - ended) / frames[..., None]
+
+
+def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int = len(STATES)) -> Tensor:
+    """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
+    `count`.
+    """
+    known = torch.where(states < 0, FIRST, states)
+    drawn = torch.randint(count, states.shape, generator=generator).to(states.device)
+    replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)
+    return torch.where(replaced, drawn, known)

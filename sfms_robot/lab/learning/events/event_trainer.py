@@ -12,14 +12,14 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
-from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
+from sfms_robot.lab.evaluation.intervals import Sums, added
+from sfms_robot.lab.evaluation.phrase_timing import phrase_end_counts, phrase_ends, rank_auc, ratio_of
+from sfms_robot.lab.evaluation.whole_recordings import Bools, done_at, event_spans, heard_in
 from sfms_robot.lab.learning.events.labels import (
     Lesson,
     Looks,
-    MeetingEvidence,
     lesson,
     looks_of,
     meeting_evidence,
@@ -27,8 +27,8 @@ from sfms_robot.lab.learning.events.labels import (
     spans_of,
     steps_of,
 )
-from sfms_robot.listeners.events.evidence import AT, NUMBERS
-from sfms_robot.listeners.events.model import STEP_FRAMES, Hazard
+from sfms_robot.listeners.events.evidence import AT, HEARD, NUMBERS
+from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S, EventModel, Hazard, HazardBank
 from sfms_robot.signals.phase import piecewise_linear_basis
 
 Knots = tuple[float, ...]
@@ -111,30 +111,23 @@ class EventStudent:
 def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     meeting = meeting_evidence(person)
-    scene = scene_of(meeting)
-    spans = spans_of(person, meeting, rng)
-    nods = _begun_in(spans["nod"], meeting.listening)
-    looks = looks_of(person, meeting, counts_in(scene)) if person.gaze is not None else None
-    own = {**spans, "nod": nods} | ({} if looks is None else {"gaze_shift": looks.shifts_s})
-    done = done_in(
-        own, len(meeting.listening), log_rate(nods, meeting.listening), None if looks is None else looks.aside
-    )
-    evidence = np.concatenate([heard_in(scene), done], axis=1)
-    lessons = {kind: lesson(spans[kind], meeting.listening) for kind in spans}
-    if looks is not None:
-        lessons["gaze_shift"] = _looking(looks)
+    listening, spans = meeting.listening, spans_of(person, meeting, rng)
+    nods = _begun_in(spans["nod"], listening)
+    lessons = {kind: lesson(each, listening) for kind, each in spans.items()}
+    own, aside = {**spans, "nod": nods}, None
+    if person.gaze is not None:
+        looks = looks_of(person, meeting)
+        lessons["gaze_shift"], own["gaze_shift"], aside = _looking(looks), looks.shifts_s, looks.aside
+    ends_s = (np.arange(len(listening)) + 1) * FRAME_S
+    rows = np.concatenate([heard_in(meeting.scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
+    before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
     return EventStudent(
         person=person,
-        evidence=_as_steps_begin(evidence),
-        listening=meeting.listening,
-        others=np.asarray(meeting.speaks[:, 1:].any(axis=1)),
+        evidence=before[: len(rows) // STEP_FRAMES],  # known as each step begins: before the first, nothing
+        listening=listening,
+        others=np.asarray(meeting.scene.speaks[:, 1:].any(axis=1)),
         lessons=lessons,
     )
-
-
-def scene_of(meeting: MeetingEvidence) -> Scene:
-    """Return the scene as annotated; smiles were not."""
-    return Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
@@ -151,18 +144,10 @@ def _begun_in(spans: Doubles, mask: Bools) -> Doubles:
     return spans[(at < len(mask)) & mask[np.minimum(at, len(mask) - 1)]]
 
 
-def _as_steps_begin(rows: Doubles) -> Doubles:
-    """(N, E) known after each frame -> (M, E) known as each step begins; before the first nothing is (NaN)."""
-    steps = len(rows) // STEP_FRAMES
-    before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
-    return before[:steps]
-
-
 def _looking(looks: Looks) -> Lesson:
-    at = steps_of(looks.at_speaker)
+    may = steps_of(looks.at_speaker)
     begins = np.floor(looks.away_s * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
-    onsets = np.unique(begins[(begins > 0) & (begins < len(at))])
-    may = at.copy()
+    onsets = np.unique(begins[(begins > 0) & (begins < len(may))])
     may[onsets] = True
     return Lesson(onsets, may)
 
@@ -189,8 +174,7 @@ def sampled(students: Iterable[EventStudent], kind: str, seed: int) -> tuple[Dou
         if kind not in one.lessons:
             continue
         given = one.lessons[kind]
-        onset = np.zeros(len(given.may), bool)
-        onset[given.onsets] = True
+        onset = np.isin(np.arange(len(given.may)), given.onsets)
         lot = np.random.default_rng([seed, number]).integers(KEPT, size=len(onset)) == 0
         kept = given.may & (onset | lot)
         rows.append(one.evidence[kept])
@@ -200,7 +184,7 @@ def sampled(students: Iterable[EventStudent], kind: str, seed: int) -> tuple[Dou
 
 
 def teach(students: Sequence[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
-    """The hazard of one kind."""
+    """Fit the hazard of one kind."""
     rows, happens, counts = sampled(students, kind, seed)
     return fit(inputs(rows, groups), happens, counts, ridge=ridge)
 
@@ -210,13 +194,9 @@ def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: flo
     weights: dict[str, float | dict[float, float]] = {}
     at = 0
     for name, knots in groups.items():
-        if name in NUMBERS:
-            weights[name] = round(float(learned.weights[at]), 3)
-            at += 1
-            continue
-        count = len(knots) - (name in FORGOTTEN)
+        count = 1 if name in NUMBERS else len(knots) - (name in FORGOTTEN)
         values = [round(float(value), 3) for value in learned.weights[at : at + count]]
-        weights[name] = dict(zip(knots, [*values, 0.0][: len(knots)], strict=True))
+        weights[name] = values[0] if name in NUMBERS else dict(zip(knots, [*values, 0.0], strict=False))
         at += count
     return Hazard(
         learned_from=learned_from,
@@ -229,29 +209,10 @@ def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: flo
 # --- ranking ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Ranked:
-    """AUC of each person (P,), by name."""
+def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles], Doubles]) -> Doubles:
+    """Return the AUC of each person (P,): how well `score`, (M, E) -> (M,), ranks onsets above other steps.
 
-    people: tuple[str, ...]
-    auc: Doubles
-
-    @property
-    def mean(self) -> float:
-        return float(self.auc.mean()) if len(self.auc) else float("nan")
-
-    def interval(self, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
-        """95 % of the mean, had other people been met."""
-        if len(self.auc) < 2:
-            return float("nan"), float("nan")
-        drawn = np.random.default_rng(seed).integers(len(self.auc), size=(draws, len(self.auc)))
-        low, high = np.quantile(self.auc[drawn].mean(axis=1), [0.025, 0.975])
-        return float(low), float(high)
-
-
-def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
-    """Return how well `score`, (M, E) -> (M,), ranks onsets above other steps; meetings of a person weighted by
-    onsets.
+    Meetings of a person are weighted by onsets.
     """
     found: dict[str, list[tuple[float, int]]] = {}
     for one in students:
@@ -263,14 +224,15 @@ def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles
         auc = rank_auc(score(one.evidence), given.onsets, others)
         if np.isfinite(auc):
             found.setdefault(one.person.participant, []).append((auc, len(given.onsets)))
-    means = [float(np.average([auc for auc, _ in each], weights=[n for _, n in each])) for each in found.values()]
-    return Ranked(tuple(found), np.array(means))
+    return np.array(
+        [np.average(aucs, weights=onsets) for aucs, onsets in (zip(*each, strict=True) for each in found.values())]
+    )
 
 
 def rate_per_minute(students: Iterable[EventStudent], kind: str) -> float:
-    """Of the time in which they might."""
-    pairs = [(len(one.lessons[kind].onsets), minutes(one.lessons[kind].may)) for one in students if kind in one.lessons]
-    onsets, time = np.sum(pairs, axis=0) if pairs else (0.0, 0.0)
+    """Return the onsets per minute of the time in which they may happen; 0 without any."""
+    lessons = [one.lessons[kind] for one in students if kind in one.lessons]
+    onsets, time = sum(len(one.onsets) for one in lessons), sum(minutes(one.may) for one in lessons)
     return float(onsets / time) if time else 0.0
 
 
@@ -330,3 +292,69 @@ def _at(
         slope += x.T @ (counts[part] * (happens[part] - chance))
         bend += x.T @ (x * (counts[part] * chance * (1 - chance))[:, None])
     return goodness, slope, bend
+
+
+# --- Roll-out --------------------------------------------------------------------------------------------------------
+#
+# Between two nods all inputs are known in advance, so a stretch is evaluated as a whole: the first step whose random
+# number falls below its probability is the next nod.
+
+STRETCH: Final = 400  # steps looked at together
+
+
+def roll_out(model: EventModel, one: EventStudent, per_minute: float, seed: int) -> list[ListenerEvent]:
+    """Return the nods (nothing else is decided) in one person's place at a rate."""
+    evidence = one.evidence.copy()
+    own = len(HEARD)
+    listening = steps_of(one.listening)[: len(evidence)]
+    draws = np.random.default_rng(seed).random(len(evidence))
+    at, nods = 1, list[ListenerEvent]()
+    bank = HazardBank({"nod": model.tables.hazards["nod"]})
+    while at < len(evidence):
+        steps = np.arange(at, min(at + STRETCH, len(evidence)))
+        rows = evidence[steps]
+        rows[:, own:] = done_at({"nod": event_spans(nods, "nod")}, steps * STEP_S, float(np.log(per_minute)))
+        odds = bank.log_odds(bank.contributions(rows))[:, 0]
+        happens = listening[steps] & (draws[steps] < 1 / (1 + np.exp(-odds)))
+        if not happens.any():
+            at = int(steps[-1]) + 1
+            continue
+        found = int(steps[np.argmax(happens)])
+        nod = model.shaped("nod", found, seed)
+        nods.append(ListenerEvent("nod", found * STEP_S, nod.duration_s, nod.size, nod.swings))
+        at = max(found + 1, int(np.ceil(nods[-1].end_s / STEP_S - 1e-6)))
+    return nods
+
+
+def people_did(one: EventStudent) -> Doubles:
+    """Return the onsets [s] of the person's nods while listening."""
+    return _begun_in(one.person.nods, one.listening)[:, 0]
+
+
+def count(one: EventStudent, onsets_s: Doubles) -> Sums:
+    """Return the counts of one person's nods: pairs (nods, minutes), and intervals [s] in listening time."""
+    listening = steps_of(one.listening)[: len(one.evidence)]
+    steps = np.minimum(np.floor(onsets_s / STEP_S + 1e-6).astype(np.int64), len(listening) - 1)
+    one_speaks, own_voice_s, known, looked_at = one.evidence[
+        :, [AT[name] for name in ("one_speaks", "own_voice_s", "gaze_known", "looked_at")]
+    ].T
+    spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
+    masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
+    ends = phrase_ends(one.others, FRAME_HZ)
+    return {
+        **{f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()},
+        "phrase_end": np.array(phrase_end_counts(onsets_s, ends, one.listening, FRAME_HZ)),
+        "intervals_s": np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S)),
+    }
+
+
+def total(parts: Sequence[Sums]) -> Sums:
+    """Return the counts of all people, and their intervals one after the other."""
+    intervals = np.concatenate([part["intervals_s"] for part in parts])
+    return added({**part, "intervals_s": np.zeros(0)} for part in parts) | {"intervals_s": intervals}
+
+
+def figures(found: Sums) -> dict[str, float]:
+    """Return the rates and the phrase-end ratio of counts; NaN where they are not defined."""
+    rates = {name: pair[0] / pair[1] if pair[1] else np.nan for name, pair in found.items() if "minute" in name}
+    return {**rates, "phrase_end_ratio": ratio_of(found["phrase_end"].tolist())}

@@ -10,7 +10,7 @@ A hazard is evaluated every 80 ms; an event belongs to the step in which it begi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,7 +20,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, near
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in
 from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S
 
 LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
@@ -71,9 +71,9 @@ def _spans(starts_s: Doubles, length_s: float) -> Doubles:
     return np.stack([starts, starts + length_s], axis=1)
 
 
-def lesson(spans_s: Doubles, listening: Bools, inside: Doubles | None = None) -> Lesson:
-    """Of events (K, 2); `inside` are the spans in which none can begin, their own if not said."""
-    taken = near((spans_s if inside is None else inside) + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
+def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
+    """Return the lesson of events (K, 2); none begins inside another."""
+    taken = near(spans_s + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
     begins = np.floor(spans_s[:, 0] / STEP_S + 1e-6).astype(np.int64)
     heard = steps_of(listening)
     onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
@@ -100,9 +100,10 @@ class Looks:
     away_s: Doubles
 
 
-def looks_of(person: MeetingPerson, meeting: MeetingEvidence, counts: Bools) -> Looks:
-    """Return the gaze of a person with annotations; `counts` (N, P) marks people who speak or have the floor."""
-    frames, gaze = len(counts), person.gaze or ()
+def looks_of(person: MeetingPerson, meeting: MeetingEvidence) -> Looks:
+    """Return the gaze of a person with annotations."""
+    counts, gaze = counts_in(meeting.scene), person.gaze or ()
+    frames = len(counts)
     target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
     columns = [max(0, meeting.agents.index(where)) if where in meeting.agents else 0 for _, _, where in gaze]
     first = [min(max(round(start * FRAME_HZ), 0), frames - 1) for start, _, _ in gaze]
@@ -121,12 +122,6 @@ def minutes(mask: Bools) -> float:
     return float(mask.sum()) * STEP_S / 60
 
 
-def per_minute(lessons: Mapping[str, Lesson]) -> float:
-    """Events a minute of the time in which they could happen."""
-    total = sum(minutes(one.may) for one in lessons.values())
-    return sum(len(one.onsets) for one in lessons.values()) / total if total else 0.0
-
-
 # --- A meeting as one of its people lived it, frame by frame: who spoke, who looked at him, who laughed and nodded
 #
 # What `listeners.events.evidence` makes its numbers of, from annotations where a head has a microphone and a camera.
@@ -138,19 +133,13 @@ class MeetingEvidence:
 
     Attributes:
         agents: letters of the P people.
-        speaks: (N, P) a word of each is under way.
-        looks: (N, P) each looks at the participant (1) or not (0); NaN where not annotated, and for the participant.
-        laughs: (N,) one of the others laughs. Smiles were not annotated.
-        nods: (N,) one of the others begins to nod.
+        scene: Looks are NaN where not annotated. Smiles were not annotated.
         listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
         spans_s: (K, 2) of the participant's events, by kind.
     """
 
     agents: tuple[str, ...]
-    speaks: Bools
-    looks: Doubles
-    laughs: Bools
-    nods: Bools
+    scene: Scene
     listening: Bools
     spans_s: Mapping[str, Doubles]
 
@@ -163,14 +152,15 @@ def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
     looks = np.full((whole.frames, len(others) + 1), np.nan)
     for column, agent in enumerate(others, start=1):
         if agent in person.gaze_known:
-            looks[:, column] = active(_of(person.looked_at, agent), whole)
+            looks[:, column] = active(spans_by(person.looked_at, agent), whole)
     own, talk = active(person.talk, whole), active(person.others, whole)
+    nods = np.zeros(whole.frames, bool)
+    at = np.floor(spans_by(person.others_nods)[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
+    nods[at[(at >= 0) & (at < whole.frames)]] = True
+    laughs = active(person.others_laughs, whole)
     return MeetingEvidence(
         agents=(person.agent, *others),
-        speaks=np.stack(speaks, axis=1),
-        looks=looks,
-        laughs=active(person.others_laughs, whole),
-        nods=_beginnings((start for start, _, _ in person.others_nods), whole.frames),
+        scene=Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros_like(laughs)),
         listening=listening_mask(talk, FRAME_HZ, own) & ~active(person.unseen, whole),
         spans_s={
             "nod": person.nods,
@@ -182,13 +172,6 @@ def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
     )
 
 
-def _of(spans: Iterable[tuple[float, float, str]], agent: str) -> Doubles:
-    return np.array([(start, end) for start, end, who in spans if who == agent], np.float64).reshape(-1, 2)
-
-
-def _beginnings(starts_s: Iterable[float], frames: int) -> Bools:
-    """(frames,) something begins in this frame."""
-    out = np.zeros(frames, bool)
-    at = np.floor(np.fromiter(starts_s, np.float64) * FRAME_HZ + 1e-6).astype(np.int64)
-    out[at[(at >= 0) & (at < frames)]] = True
-    return out
+def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """Return the spans (K, 2) of events (start, end, agent) of one agent, or of all."""
+    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)

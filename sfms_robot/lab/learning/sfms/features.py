@@ -18,15 +18,16 @@ from sfms_robot.lab.corpora.clips import Dyad, at_rate
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
     Corpus,
+    Scratch,
+    fit_sway,
     in_space,
     motion_scales,
     some_sound,
     sound_scales,
     windows,
     without_gaze,
+    without_sway,
 )
-from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
-from sfms_robot.lab.learning.staged_frames import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.sfms.draw import UNDECIDED

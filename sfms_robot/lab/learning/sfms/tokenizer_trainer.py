@@ -19,7 +19,7 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import first_frames, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
-from sfms_robot.lab.learning.sfms.losses import masking, reconstruction
+from sfms_robot.lab.learning.sfms.predictor_trainer import masking, reconstruction
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
