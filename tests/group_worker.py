@@ -30,7 +30,7 @@ def main() -> None:
         run = Run(
             resume=resume,
             device=torch.device("cpu"),
-            watch=watch,
+            watches=(watch,),
             group=group,
             accumulate=given.get("accumulate"),
             scratch=scratch,

@@ -70,12 +70,10 @@ def tokenizer(
             raise BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
-    from sfms_robot.lab.evaluation.tokenizer_tables import TableOptions, evaluate_table
+    from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options = TableOptions(
-        table=table, data=data, models=models, train=train, size=size.value, steps=steps, jobs=jobs, plots=plots
-    )
-    show(interruptible(lambda: evaluate_table(options)), json)
+    options: dict[str, Any] = {"train": train, "size": size.value, "steps": steps, "jobs": jobs, "plots": plots}
+    show(interruptible(lambda: evaluate_table(table, data, models, **options)), json)
 
 
 @app.command("listener")
@@ -110,11 +108,10 @@ def listener_(
     if of_arig:
         if order is not None or hop is not None:
             raise BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.lab.evaluation.arig_tables import AblationOptions, arig_table
+        from sfms_robot.lab.evaluation.arig_tables import arig_table
 
-        ablations = AblationOptions(models=models, training=config, steps=steps)
-        found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
-        show(found, json)
+        trained: dict[str, Any] = {"models": models, "training": config, "steps": steps}
+        show(interruptible(lambda: arig_table(table.value, listener, data, clips=clips, seed=seed, **trained)), json)
         return
     from sfms_robot.lab.evaluation.arig_tables import sfms_table
 
@@ -141,13 +138,11 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.lab.evaluation.arig_tables import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.lab.evaluation.arig_tables import EVERY, evaluate_papers
 
-    options = PapersOptions(
-        data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed
-    )
+    options: dict[str, Any] = {"clips": clips, "samples": samples, "steps": steps, "seed": seed}
     each = _quiet if json else _print_paper
-    show(interruptible(lambda: evaluate_papers(options, each)), json, _quiet)
+    show(interruptible(lambda: evaluate_papers(data, models, table or EVERY, each, **options)), json, _quiet)
 
 
 @app.command()
@@ -292,10 +287,7 @@ def people(
     if results is not None:
         show(people_study.table(results), json)
         return
-    options = people_study.StudyOptions(
-        conditions=tuple(listener), data=data, voices=voices, seconds=seconds, seed=seed, folder=out
-    )
-    study = people_study.prepare(options)
+    study = people_study.prepare(listener, data, voices=voices, seconds=seconds, seed=seed, folder=out)
 
     def ask(url: str, taken: int | None) -> None:
         note = "" if taken is None else f" (port {taken} is taken)"

@@ -86,22 +86,24 @@ class Sightings:
         """Return counts, recall, precision and lateness, and the recall by size; None where undefined."""
         edges = _SIZES[kind]
         place = np.digitize(self.sizes, edges)
-        by_size = [
-            {
-                "size": [round(float(edges[at - 1]), 4), round(float(edges[at]), 4)],
-                "asked": int((place == at).sum()),
-                "recall": round(float(self.in_time[place == at].mean()), 4),
-            }
-            for at in range(1, len(edges))
-            if (place == at).any()
-        ]
-        values = {"recall": self.recall, "precision": self.precision, "offset_s": self.offset_s}
         return {
             "asked": len(self.sizes),
             "seen": self.seen,
-            **{name: rounded(value) for name, value in values.items()},
-            "by_size": by_size,
+            **self.figures(self.recall),
+            "by_size": [
+                {
+                    "size": [round(float(edges[at - 1]), 4), round(float(edges[at]), 4)],
+                    "asked": int((place == at).sum()),
+                    "recall": round(float(self.in_time[place == at].mean()), 4),
+                }
+                for at in range(1, len(edges))
+                if (place == at).any()
+            ],
         }
+
+    def figures(self, recall: float) -> dict[str, float | None]:
+        """Return a recall beside the precision and lateness; None where undefined."""
+        return {"recall": rounded(recall), "precision": rounded(self.precision), "offset_s": rounded(self.offset_s)}
 
 
 def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
@@ -228,17 +230,14 @@ class DetectorCalibration:
 
     def report_of(self, sightings: Mapping[str, Sightings]) -> dict[str, Any]:
         """Return reports of sightings, with the recall of known events of the same sizes as "recorded"."""
-        found = {}
-        for kind, one in sightings.items():
-            if len(one.sizes):
-                known = self.known[kind]
-                recall = known.recall_at(one.sizes, _SIZES[kind])
-                recorded = {"recall": recall, "precision": known.precision, "offset_s": known.offset_s}
-                found[kind] = {
-                    **one.report(kind),
-                    "recorded": {name: rounded(value) for name, value in recorded.items()},
-                }
-        return found
+        return {
+            kind: {
+                **one.report(kind),
+                "recorded": self.known[kind].figures(self.known[kind].recall_at(one.sizes, _SIZES[kind])),
+            }
+            for kind, one in sightings.items()
+            if len(one.sizes)
+        }
 
 
 def busy_minute(rng: np.random.Generator) -> Score:

@@ -8,7 +8,6 @@ needs rendered pictures and is out of scope. The paper's rows come from other da
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,15 +27,15 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.corpora.learning2listen import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.detection import behaviour
-from sfms_robot.lab.evaluation.intervals import Chosen, jackknife, people_of
+from sfms_robot.lab.evaluation.intervals import Chosen, finite, jackknife, people_of
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import (
-    bar,
     frames_of_dyad,
     load_at_hop,
     offline_rollout,
     rollout,
     rollouts,
+    tracked,
     whole_clips,
 )
 from sfms_robot.lab.learning.corpus import in_space
@@ -127,10 +126,7 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
         "clips": len(clips.truth),
         "frames": clips.truth.shape[1],
         "samples": samples,
-        "rows": [
-            {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()}
-            for row in rows
-        ],
+        "rows": [finite(row) for row in rows],
     }
 
 
@@ -167,9 +163,6 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
     """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
-    most = max(CLUSTERS.values())
-    if (frames := truth.shape[0] * truth.shape[1]) < most:
-        raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
     centres = metrics.centres_of(truth, PARTS[clips.space], CLUSTERS)
 
     def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
@@ -235,7 +228,6 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
 # --- The commands ----------------------------------------------------------------------------------------------------
 
 _PLACEMENTS: tuple[Strategy, ...] = ("exact", "penalised", "static", "static_paper", "learned")
-_TRAIN_DYADS: Final = 200  # from which the heuristics take their means
 
 
 def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
@@ -268,8 +260,7 @@ def evaluate_listener(
     rows: list[dict[str, Any]] = []
     for name in names:
         listener = load_at_hop(name, hop)
-        with bar(name, len(dyads)) as advance:
-            motions = [one.motion[0] for one in rollouts(listener, dyads, seed, advance)]
+        motions = [one.motion[0] for one in rollouts(listener, tracked(dyads, name), seed)]
         figures = behaviour(motions, dyads)
         if isinstance(listener, SfmsListener):
             settings = listener.settings
@@ -280,39 +271,8 @@ def evaluate_listener(
     return {
         "listeners": list(names),
         "dyads": len(dyads),
-        "rows": [
-            {
-                key: None if isinstance(value, float) and not math.isfinite(value) else value
-                for key, value in row.items()
-            }
-            for row in rows
-        ],
+        "rows": [finite(row) for row in rows],
     }
-
-
-def listener_table(
-    number: int,
-    listeners: Mapping[str, Listener],
-    data: Path,
-    *,
-    samples: int,
-    limit: int | None,
-    seed: int,
-    order: Order | None = None,
-) -> dict[str, Any]:
-    """Return table 1 or 2 of the SFMS paper for listeners by name, on the validation split of any known data set.
-
-    At most `limit` dyads, spread evenly. Raises ConfigError when the listeners do not share a motion space.
-    """
-    space = shared_space(listeners)
-    heard = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
-    train, held_out = (
-        spread_clips(open_for(space.name, data, split, order, heard), most)
-        for split, most in (("train", _TRAIN_DYADS), ("validation", limit))
-    )
-    with bar("listening", len(held_out) * len(listeners)) as advance:
-        found, given = collect(number, listeners, space, train, held_out, range(seed, seed + samples), advance)
-    return table(number, found, given, samples, seed)
 
 
 def shared_space(listeners: Mapping[str, Listener]) -> MotionSpace:
@@ -350,12 +310,11 @@ def collect(
     train: Sequence[Dyad],
     held_out: Sequence[Dyad],
     seeds: Sequence[int],
-    each: Callable[[], None] = lambda: None,
 ) -> tuple[Clips, dict[str, Doubles]]:
     """Return the clips of a table, and the answers of every listener (N, K, T, D), K seeds.
 
-    A listener hears a dyad from its beginning; clips are cut out of its answer. Calls `each()` after every dyad of
-    every listener. Raises ConfigError when the dyads are too short for the table's metrics.
+    A listener hears a dyad from its beginning; clips are cut out of its answer. Raises ConfigError when the dyads are
+    too short for the table's metrics.
     """
     learned = [np.asarray(in_space(dyad, dyad.listener, space)) for dyad in train]
     heard = [frames_of(dyad, space) for dyad in held_out]
@@ -372,14 +331,10 @@ def collect(
         train=cut(learned, frames),
         people=people_of(held_out, [len(one.motion) for one in heard], frames),
     )
-    answered = {}
-    for name, listener in listeners.items():
-        motions = []
-        for dyad in held_out:
-            motions.append(_answered(listener, space, dyad, seeds, frames))
-            each()
-        answered[name] = cut(motions, frames)
-    return clips, answered
+    return clips, {
+        name: cut([_answered(listener, space, dyad, seeds, frames) for dyad in tracked(held_out, name)], frames)
+        for name, listener in listeners.items()
+    }
 
 
 def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:

@@ -48,7 +48,7 @@ from sfms_robot.lab.learning.events.event_trainer import (
     student,
     teach,
 )
-from sfms_robot.lab.learning.events.labels import meeting_evidence
+from sfms_robot.lab.learning.events.labels import meeting_scene
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
@@ -125,10 +125,10 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "seeds": options.seeds,
         "hop": None if isinstance(listener, EventModel) else listener.hop,
         "engine": None if isinstance(listener, EventModel) else engine_name(listener),
-        **{name: _rounded(one.value) for name, one in found.items()},
+        **{name: one.value if one.value is None else round(one.value, 4) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
-        "interval": {name: one.interval and [_rounded(end) for end in one.interval] for name, one in found.items()},
+        "interval": {name: one.interval and [round(end, 4) for end in one.interval] for name, one in found.items()},
         "interval_level": LEVEL,
         "detector": calibration.report(),
         "asked_and_seen": calibration.report_of(added_up(one.sightings for one in played)),
@@ -259,10 +259,6 @@ def _motions(split: Split) -> Motions:
 # --- the report -----------------------------------------------------------------------------------------------------
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)
-
-
 def _notes(found: Mapping[str, Estimate], own_voice: bool) -> Iterator[str]:
     """Yield what a reader of the figures has to know."""
     yield "people's smiles and blinks were not annotated; laughs are compared with laughs only"
@@ -329,7 +325,7 @@ def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Dou
 
     With the listener's own voice, without it, and without it while the others are a minute off.
     """
-    own, alone = (heard_in(meeting_evidence(each).scene) for each in (person, mute(person)))
+    own, alone = (heard_in(meeting_scene(each)[0]) for each in (person, mute(person)))
     at = np.minimum(np.arange(frames), len(own) - 1)
     return own[at], alone[at], np.roll(alone, round(SHIFT_S * FRAME_HZ), axis=0)[at]
 

@@ -105,18 +105,11 @@ def window_after(
     return mask
 
 
-def phrase_end_ratio(
-    onsets_s: Sequence[float] | NDArray[np.float64],
-    ends_s: Sequence[float] | NDArray[np.float64],
-    listening: ArrayLike,
-    rate_hz: float,
-) -> float:
-    """Return nod onsets per minute 0 to 0.8 s after a phrase end over those 1.5 to 3 s after it; NaN if undefined."""
-    return ratio_of(phrase_end_counts(onsets_s, ends_s, listening, rate_hz))
-
-
 def ratio_of(counts: Sequence[float]) -> float:
-    """Return the ratio of rates of (onsets after, minutes after, onsets later, minutes later), summed over people."""
+    """Return the phrase-end ratio of (onsets after, minutes after, onsets later, minutes later), summed over people.
+
+    It is the rate of onsets 0 to 0.8 s after a phrase end over that 1.5 to 3 s after it; NaN if undefined.
+    """
     after, after_min, later, later_min = counts
     if not later or not after_min or not later_min:
         return float("nan")

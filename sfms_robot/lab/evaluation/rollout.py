@@ -11,18 +11,16 @@ A listener that follows events receives the given ones, each `LEAD_FRAMES` befor
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import track
 from torch import Tensor
 
 from sfms_robot.config import find
@@ -67,30 +65,20 @@ def run_in_processes(
 
     Shows a progress bar. An exception of a task is raised here and ends the others. `work` is a module's function.
     """
-    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
     workers = min(jobs or os.cpu_count() or 1, len(tasks))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task(title, total=len(tasks))
-        if workers <= 1:
-            one_thread()
-            results = []
-            for task in tasks:
-                results.append(work(task))
-                progress.advance(bar)
-            return results
-        with process_pool(workers) as pool:
-            waiting = [pool.submit(work, task) for task in tasks]
-            for done in as_completed(waiting):
-                done.result()
-                progress.advance(bar)
-            return [one.result() for one in waiting]
+    if workers <= 1:
+        one_thread()
+        return [work(task) for task in tracked(tasks, title)]
+    with process_pool(workers) as pool:
+        waiting = [pool.submit(work, task) for task in tasks]
+        for done in tracked(as_completed(waiting), title, len(tasks)):
+            done.result()
+        return [one.result() for one in waiting]
 
 
-@contextmanager
-def bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on stderr; yield the function that advances it."""
-    with Progress(console=Console(stderr=True)) as progress:
-        yield partial(progress.advance, progress.add_task(title, total=total))
+def tracked(items: Iterable[_Task], title: str, total: int | None = None) -> Iterable[_Task]:
+    """Yield the items, with a progress bar on stderr."""
+    return track(items, title, total, console=Console(stderr=True))
 
 
 def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
@@ -201,23 +189,15 @@ def _step(
     return [plan for plan, _ in stepped], [memory for _, memory in stepped]
 
 
-def rollouts(
-    listener: Listener,
-    dyads: Sequence[Dyad],
-    seed: int,
-    each: Callable[[], object] = lambda: None,
-    clip_frames: int = 1,
-) -> list[Rollout]:
-    """Play one stream through every dyad from its beginning, with seeds from `seed` on; call `each()` after every one.
+def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: int = 1) -> list[Rollout]:
+    """Play one stream through every dyad from its beginning, with seeds from `seed` on.
 
     A listener that follows events receives those of the dyad's listener. `clip_frames`: see `whole_clips`.
     """
-    found = []
-    for number, dyad in enumerate(dyads):
-        heard = whole_clips(frames_of_dyad(dyad), clip_frames)
-        found.append(rollout(listener, heard, [seed + number], dyad.events or ()))
-        each()
-    return found
+    return [
+        rollout(listener, whole_clips(frames_of_dyad(dyad), clip_frames), [seed + number], dyad.events or ())
+        for number, dyad in enumerate(dyads)
+    ]
 
 
 # --- from arrays ----------------------------------------------------------------------------------------------------

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.app.output_paths import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain, save
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import CHANNELS, FRAME_S, Doubles, Floats
-from sfms_robot.lab.evaluation.rollout import bar
+from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Doubles, Floats
+from sfms_robot.lab.evaluation.rollout import run_in_processes
 from sfms_robot.lab.evaluation.table_tokenizers import (
     DenseTokenizer,
     SizeName,
@@ -34,7 +34,7 @@ from sfms_robot.lab.learning.train_runs import device_of
 from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, place, tracks
-from sfms_robot.processes import process_pool
+from sfms_robot.signals.events import Bools
 from sfms_robot.signals.tracks import Take
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ def train_all(
     size: SizeName,
     steps: int | None,
     jobs: int,
-    device: str,
     anew: bool,
 ) -> None:
     """Train tokenizers and keep them in `out`; interrupted ones are resumed, or all trained again with `anew`.
@@ -64,76 +63,84 @@ def train_all(
     `examples` (W, T, 58) are windows of which some get a history.
     """
     known = recipes(size, steps)
-    order = examples[..., 6:].var(1).mean(1).argsort(descending=True)
+    order = examples[..., SHAPES].var(1).mean(1).argsort(descending=True)
     watched = examples[order[[round(share * (len(order) - 1)) for share in _WATCHED]]]
-    runs = {
-        name: Run(resume=not anew and checkpoint_file(out / name, name).is_file(), device=device_of(device))
+    tasks = [
+        (
+            known[name],
+            Run(resume=not anew and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
+            name,
+        )
         for name in names
-    }
+    ]
     try:
-        if jobs == 1:
-            with progress_bar() as watch:
-                for name, run in runs.items():
-                    train(name, known[name], takes, out, replace(run, watches=(watch,)), watched)
-        else:
-            with bar(f"training {len(runs)} tokenizers", len(runs)) as advance, process_pool(jobs) as pool:
-                trained = [
-                    pool.submit(train, name, known[name], takes, out, run, watched) for name, run in runs.items()
-                ]
-                for done in as_completed(trained):
-                    done.result()
-                    advance()
+        if jobs > 1:
+            run_in_processes(partial(_train_one, takes, out, watched), tasks, jobs, "tokenizers trained")
+            return
+        with progress_bar() as watch:
+            for recipe, run, name in tasks:
+                train(name, recipe, takes, out, replace(run, watches=(watch,)), watched)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted; {out} keeps the trained tokenizers: without --train the command resumes"
         ) from None
 
 
+def _train_one(takes: Sequence[Take], out: Path, watched: Tensor, task: tuple[config.Recipe, Run, str]) -> None:
+    recipe, run, name = task
+    train(name, recipe, takes, out, run, watched)
+
+
 def train(
     name: str, recipe: config.Recipe, takes: Sequence[Take], out: Path, run: Run, watched: Tensor | None = None
 ) -> None:
-    """Train one tokenizer and keep it in `out`/`name`, resuming from its checkpoints if `run` says so.
+    """Train one tokenizer and keep it in `out`/`name`, resuming from its checkpoint if `run` says so.
 
     `watched` (W, T, 58): windows whose keyframes and errors are recorded while it learns.
     """
     folder = out / name
     torch.manual_seed(recipe.seed)
     model = TableModel(recipe)
-    model.fit_scales(torch.cat([torch.from_numpy(take.motion) for take in takes]))
-    history = ScoreHistory(model, watched) if watched is not None and not run.resume else None
-    fit(job(name, model.to(run.device), takes, history), folder, run)
+    motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
+    model.fit_scales(motion)
+    history: list[Snapshot] = []
+    job = _job(name, model.to(run.device), motion, [len(take.motion) for take in takes])
+    if watched is not None and not run.resume:
+        due = {min(recipe.training.steps - 1, round(share * recipe.training.steps)) for share in _SNAPSHOTS_AT}
+        windows, loss_of = model.standardise(watched.to(run.device)), job.loss_of
+
+        def recorded(step: int, generator: torch.Generator, samples: int) -> Tensor:
+            if step in due:
+                history.extend(snapshots(model.tokenizer, windows, step))
+            return loss_of(step, generator, samples)
+
+        job = replace(job, loss_of=recorded)
+    fit(job, folder, run)
     save_tokenizer(folder, model.cpu().eval())
     checkpoint_file(folder, name).unlink(missing_ok=True)
-    if history is not None and history.snapshots:
-        plain = [asdict(snapshot) for snapshot in history.snapshots]
-        (folder / _HISTORY).write_text(json.dumps(plain), encoding="utf-8")
+    if history:
+        (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
 
 
-def job(name: str, model: TableModel, takes: Sequence[Take], history: ScoreHistory | None = None) -> Job:
+def _job(name: str, model: TableModel, motion: Tensor, lengths: Sequence[int]) -> Job:
     """Return the job of the training loop. It holds nothing out: the tables compare the last weights."""
-    recipe = model.recipe
-    phase = recipe.training
-    motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
-    standard, lengths = model.standardise(motion.to(model.motion_mean.device)), [len(take.motion) for take in takes]
-    tokenizer, starts = model.tokenizer, first_frames(lengths, model.window)
-    sparse = loss_of_steps(tokenizer, standard, lengths, phase, _GAIN) if isinstance(tokenizer, Tokenizer) else None
+    recipe, tokenizer, phase = model.recipe, model.tokenizer, model.recipe.training
+    standard, starts = model.standardise(motion.to(model.motion_mean.device)), first_frames(lengths, model.window)
+    if isinstance(tokenizer, Tokenizer):
+        loss_of, optimizers = loss_of_steps(tokenizer, standard, lengths, phase, _GAIN), optimizers_of(tokenizer, phase)
+    else:
+        baseline = tokenizer
+        optimizers = [optimizer(baseline.parameters(), phase.learning_rate, phase.weight_decay)]
 
-    def loss_of(step: int, generator: torch.Generator, samples: int) -> Tensor:
-        if history is not None:
-            history.take(step, phase.steps)
-        if not isinstance(tokenizer, DenseTokenizer):
-            assert sparse is not None
-            return sparse(step, generator, samples)
-        chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
-        batch = amplified(windows(standard, chosen, model.window), _GAIN, generator)
-        return baseline_loss(tokenizer, batch, phase.commitment, generator)
+        def loss_of(step: int, generator: torch.Generator, samples: int) -> Tensor:
+            chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
+            batch = amplified(windows(standard, chosen, model.window), _GAIN, generator)
+            return baseline_loss(baseline, batch, phase.commitment, generator)
 
     return Job(
         name=name,
         model=model,
-        optimizers=optimizers_of(tokenizer, phase)
-        if isinstance(tokenizer, Tokenizer)
-        else [optimizer(tokenizer.parameters(), phase.learning_rate, phase.weight_decay)],
+        optimizers=optimizers,
         loss_of=loss_of,
         held_out=None,
         frames_per_step=phase.batch * model.window,
@@ -168,38 +175,30 @@ class Snapshot:
     errors: list[float]
 
 
-class ScoreHistory:
-    """Recorder of a model's scores for some windows (W, T, C) in our units, one busy group of each."""
+_SNAPSHOTS: Final = TypeAdapter(list[Snapshot])
 
-    def __init__(self, model: TableModel, watched: Tensor) -> None:
-        self.model = model
-        self.watched = watched
-        self.snapshots: list[Snapshot] = []
 
-    @torch.no_grad()
-    def take(self, step: int, steps: int) -> None:
-        """Take snapshots before this step if it is one of `_SNAPSHOTS_AT`."""
-        tokenizer = self.model.tokenizer
-        watched = self.model.standardise(self.watched.to(self.model.motion_mean.device))
-        due = {min(steps - 1, round(share * steps)) for share in _SNAPSHOTS_AT}
-        if step not in due or isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
-            return
-        # Keyframes by the scores alone, without the corrections of `sweeps`.
-        mask = place(watched, tokenizer.keyframes, tokenizer.strategy, member=tokenizer.member, score=tokenizer.score)
-        scores = _first_choice(tokenizer, watched)
-        errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)
-        busy = (watched.var(1) @ tokenizer.member.T / tokenizer.member.sum(1)).argmax(1)
-        self.snapshots += [
-            Snapshot(
-                step=step,
-                window=window,
-                group=group,
-                scores=_rounded(scores[window, :, group]),
-                keyframes=mask[window, :, group].nonzero()[:, 0].tolist(),
-                errors=_rounded(errors[window]),
-            )
-            for window, group in enumerate(busy.tolist())
-        ]
+@torch.no_grad()
+def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int) -> list[Snapshot]:
+    """Return the scores of a tokenizer before a step, for windows (W, T, C) in our units, one busy group of each."""
+    if isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
+        return []
+    # Keyframes by the scores alone, without the corrections of `sweeps`.
+    mask = place(watched, tokenizer.keyframes, tokenizer.strategy, member=tokenizer.member, score=tokenizer.score)
+    scores = _first_choice(tokenizer, watched)
+    errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)
+    busy = (watched.var(1) @ tokenizer.member.T / tokenizer.member.sum(1)).argmax(1)
+    return [
+        Snapshot(
+            step=step,
+            window=window,
+            group=group,
+            scores=_rounded(scores[window, :, group]),
+            keyframes=mask[window, :, group].nonzero()[:, 0].tolist(),
+            errors=_rounded(errors[window]),
+        )
+        for window, group in enumerate(busy.tolist())
+    ]
 
 
 def load_history(folder: Path) -> list[Snapshot]:
@@ -208,8 +207,8 @@ def load_history(folder: Path) -> list[Snapshot]:
     if not file.is_file():
         return []
     try:
-        return [Snapshot(**snapshot) for snapshot in json.loads(file.read_text(encoding="utf-8"))]
-    except (ValueError, TypeError) as error:
+        return _SNAPSHOTS.validate_json(file.read_bytes())
+    except ValueError as error:
         raise ModelError(f"{file}: not the history of a tokenizer: {error}") from error
 
 
@@ -259,9 +258,8 @@ def draw(
     for file, name in _TRAJECTORIES_OF.items():
         if name in models:
             save(cases(models[name], motion, takes), folder / file)
-    snapshots = load_history(trained / _HISTORY_OF) if _HISTORY_OF in models else []
-    if snapshots:
-        save(scores_over_steps(snapshots), folder / "scores.png")
+    if _HISTORY_OF in models and (history := load_history(trained / _HISTORY_OF)):
+        save(scores_over_steps(history), folder / "scores.png")
     if errors:
         save(_quantiles(errors), folder / "quantiles.png")
 
@@ -274,8 +272,7 @@ def _quantiles(errors: Mapping[str, Doubles]) -> Figure:
     for (label, values), color in zip(errors.items(), SERIES, strict=False):
         axes.plot(share, np.percentile(values, share), color=color, linewidth=1.8, label=label)
     axes.axvspan(90, 100, color=RULE, alpha=0.5, linewidth=0)
-    axes.set_yscale("log")
-    axes.set_xlim(0, 100)
+    axes.set(yscale="log", xlim=(0, 100))
     axes.set_xlabel("% of windows with less error; shaded: the worst tenth", color=INK)
     axes.set_ylabel("MSE, deviations²", color=INK)
     axes.set_title("Error of windows, sorted (unequal bits)", color=INK, fontsize=10, loc="left")
@@ -286,51 +283,40 @@ def _quantiles(errors: Mapping[str, Doubles]) -> Figure:
 
 def cases(model: TableModel, windows: Tensor, takes: Sequence[str]) -> Figure:
     """Draw figures 4 and 8: the window with the largest error and one with the median error, side by side."""
-    motion = model.standardise(windows)
+    motion, tokenizer = model.standardise(windows), model.sparse()
     with torch.inference_mode():
-        mask = model.mask(motion)
-        restored = model.restore(motion)
-    error = (restored - motion).square().mean((1, 2))
-    order = error.argsort()
-    shown = {"worst": int(order[-1]), "normal (median error)": int(order[len(order) // 2])}
-    owner = model.sparse().quantizer.owner
+        keyframes, restored = model.mask(motion) > 0.5, model.restore(motion)
+    wrong = (restored - motion).square().mean(1).numpy()  # (W, C)
+    error = wrong.mean(axis=1)
+    order = error.argsort().tolist()
     figure = new_figure(10.0, 8.4)
-    columns = figure.subplots(_CURVES + 1, len(shown), squeeze=False, height_ratios=[1.5] + [1.0] * _CURVES)
-    for column, (title, at) in enumerate(shown.items()):
-        wrong = (restored[at] - motion[at]).square().mean(0).numpy()
-        _bars(columns[0, column], wrong)
-        columns[0, column].set_title(
-            f"{title}: {takes[at]}, MSE {float(error[at]):.3f}", color=INK, fontsize=10, loc="left"
-        )
-        moving = motion[at].var(0).argsort(descending=True)[:_CURVES]
-        for row, channel in enumerate(moving.tolist(), start=1):
-            keys = mask[at, :, int(owner[channel])].numpy() > 0.5
+    columns = figure.subplots(_CURVES + 1, 2, squeeze=False, height_ratios=[1.5] + [1.0] * _CURVES)
+    shown = (("worst", order[-1]), ("normal (median error)", order[len(order) // 2]))
+    for (title, at), (bars, *curves) in zip(shown, columns.T, strict=True):
+        worst = np.argsort(wrong[at])[::-1][:_BARS]
+        bars.bar(range(_BARS), wrong[at, worst], color=SERIES[0], width=0.7)
+        bars.set_xticks(range(_BARS), [CHANNELS[channel] for channel in worst], rotation=35, ha="right")
+        bars.set_ylabel("MSE", color=INK, fontsize=8)
+        plain(bars, 7)
+        bars.grid(visible=False, axis="x")
+        bars.set_title(f"{title}: {takes[at]}, MSE {error[at]:.3f}", color=INK, fontsize=10, loc="left")
+        moving = motion[at].var(0).argsort(descending=True)[:_CURVES].tolist()
+        for axes, channel in zip(curves, moving, strict=True):
+            keys = keyframes[at, :, int(tokenizer.quantizer.owner[channel])].numpy()
             truth, ours = motion[at, :, channel].numpy(), restored[at, :, channel].numpy()
-            _trajectory(columns[row, column], CHANNELS[channel], truth, ours, keys)
-        columns[_CURVES, column].set_xlabel("s", color=INK, fontsize=8)
+            _trajectory(axes, CHANNELS[channel], truth, ours, keys)
+        curves[-1].set_xlabel("s", color=INK, fontsize=8)
     columns[1, 0].legend(frameon=False, fontsize=7, labelcolor=INK)
-    kind = model.recipe.model
-    count = len(model.sparse().keyframes)
+    count = len(tokenizer.keyframes)
     figure.suptitle(
-        f"{count} keyframe set{'s' if count > 1 else ''}, {model.sparse().keyframes[0]} keyframes in "
-        f"{kind.window_frames} frames each; deviations of the training motion",
+        f"{count} keyframe set{'s' if count > 1 else ''}, {tokenizer.keyframes[0]} keyframes in "
+        f"{model.window} frames each; deviations of the training motion",
         color=INK, fontsize=10,
     )  # fmt: skip
     return figure
 
 
-def _bars(axes: Axes, wrong: Floats) -> None:
-    worst = np.argsort(wrong)[::-1][:_BARS]
-    axes.bar(range(_BARS), wrong[worst], color=SERIES[0], width=0.7)
-    axes.set_xticks(range(_BARS), [CHANNELS[channel] for channel in worst], rotation=35, ha="right")
-    axes.set_ylabel("MSE", color=INK, fontsize=8)
-    plain(axes, 7)
-    axes.grid(visible=False, axis="x")
-
-
-def _trajectory(
-    axes: Axes, name: str, truth: Floats, ours: Floats, keys: np.ndarray[tuple[int], np.dtype[np.bool_]]
-) -> None:
+def _trajectory(axes: Axes, name: str, truth: Floats, ours: Floats, keys: Bools) -> None:
     times_s = np.arange(len(truth)) * FRAME_S
     axes.plot(times_s, truth, color=TRUTH, linewidth=3.2, label="recorded")
     axes.plot(times_s, ours, color=SERIES[0], linewidth=1.4, label="from its code")

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot import config
 from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, ListenerEvent
@@ -30,6 +31,7 @@ from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import control_track
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -114,21 +116,10 @@ def gather(
 
     Raises ConfigError when none is left, and whatever `frames_of` raises.
     """
-    if scratch is None:
-        return _read(scenes, window, frames_of, None)
-    if scratch.group.local_rank == 0:
-        corpus = _read(scenes, window, frames_of, scratch.folder)
-    scratch.group.wait()
-    if scratch.group.local_rank == 0:
-        return corpus
-    return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), scratch.folder)
-
-
-def _read(
-    scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames], folder: Path | None
-) -> Corpus[Frames]:
+    if scratch is not None and scratch.group.local_rank:
+        scratch.group.wait()
+        return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), scratch.folder)
     parts: list[Frames] = []
-    files = None if folder is None else StagedFrames(folder)
     lengths: list[int] = []
     named: list[str] = []
     short = 0
@@ -138,11 +129,10 @@ def _read(
                 short += 1
                 continue
             one = frames_of(dyad)
-            if files is None:
+            if scratch is None:
                 parts.append(one)
             else:
-                files.add(one)
-                parts = [one]
+                _stage(one, scratch.folder, first=not lengths)
             lengths.append(len(dyad.listener))
             named.append(scene)
     total = sum(map(len, scenes.values()))
@@ -151,11 +141,13 @@ def _read(
         raise ConfigError(f"none of {total} dyads can be used: {left_out}")
     if len(lengths) < total:
         log.warning("%d of %d dyads are used: %s", len(lengths), total, left_out)
-    if files is not None and folder is not None:
-        files.close(lengths, named)
-        return read_staged(parts[0], folder)
-    joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(parts[0])}
-    return Corpus(replace(parts[0], **joined), tuple(lengths), tuple(named))
+    if scratch is not None:
+        with _writing(scratch.folder):
+            (scratch.folder / _INDEX).write_text(json.dumps({"lengths": lengths, "scenes": named}), encoding="utf-8")
+        scratch.group.wait()
+        return read_staged(one, scratch.folder)
+    joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(one)}
+    return Corpus(replace(one, **joined), tuple(lengths), tuple(named))
 
 
 def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
@@ -200,6 +192,34 @@ def without_gaze(dyad: Dyad) -> Dyad:
     if dyad.head_of_gaze_rad is not None:
         motion[:, :3] -= dyad.head_of_gaze_rad
     return replace(dyad, listener=motion, head_of_gaze_rad=None)
+
+
+def shared_frames(
+    dyad: Dyad, space: MotionSpace, settings: config.Sfms | config.Arig | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return what every family takes of a dyad of N frames.
+
+    The speaker's face (N, C), 0 where unknown, and where it is known (N,); the listener's motion (N, C), its sway
+    (N, S), where that is not in the motion, and the control rows (N, K) of its events. S and K are 0 without.
+
+    `settings`: of the listener; None: one without events and sway. Raises ConfigError for a motion space that cannot be
+    converted, and for a listener with events where the dyad has none, or not at our rate.
+    """
+    frames = len(dyad.listener)
+    control, sway = torch.zeros(frames, 0), torch.zeros(frames, 0)
+    if settings is not None and settings.events:
+        if dyad.events is None:
+            raise ConfigError(f"dyad {dyad.name}: expected events of its listener, which a listener with events needs")
+        if dyad.fps != FRAME_HZ:
+            raise ConfigError(
+                f"dyad {dyad.name}: {dyad.fps:g} frames a second; a listener with events needs {FRAME_HZ}"
+            )
+        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
+    face, motion = in_space(dyad, dyad.speaker, space), in_space(dyad, dyad.listener, space)
+    known = face.isfinite().all(-1)
+    if settings is not None and settings.sway:
+        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
+    return torch.where(known[:, None], face, 0.0), known, motion, sway, control
 
 
 def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -254,46 +274,28 @@ def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
 _INDEX = "index.json"
 
 
-class StagedFrames:
-    """Frames that are added dyad by dyad and then read as tensors that lie in files. Raises ConfigError."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._rows, self._shapes = folder, 0, dict[str, tuple[str, list[int]]]()
-        with _writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            for left in [*folder.glob("*.frames"), folder / _INDEX]:
-                left.unlink(missing_ok=True)
-
-    def add(self, frames: DataclassInstance) -> None:
-        """Append tensors (N, ...) of one dyad."""
+def _stage(frames: DataclassInstance, folder: Path, first: bool) -> None:
+    """Append the tensors (N, ...) of one dyad to the files of a folder; `first`: in place of what they hold."""
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
         for name, tensor in vars(frames).items():
-            array = tensor.contiguous().numpy()
-            self._shapes[name] = (str(array.dtype), list(array.shape[1:]))
-            file = self._folder / f"{name}.frames"
-            with _writing(file), file.open("ab") as opened:
-                opened.write(array.tobytes())
-        self._rows += len(array)
-
-    def close(self, lengths: Sequence[int], scenes: Sequence[str]) -> None:
-        """Write what the other processes need to read them."""
-        index = {"rows": self._rows, "shapes": self._shapes, "lengths": list(lengths), "scenes": list(scenes)}
-        with _writing(self._folder):
-            (self._folder / _INDEX).write_text(json.dumps(index), encoding="utf-8")
+            with (folder / f"{name}.frames").open("wb" if first else "ab") as opened:
+                opened.write(tensor.contiguous().numpy().tobytes())
 
 
 def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
-    """Return the corpus whose frames lie in a folder, with the fields of `like`. Raises ConfigError."""
+    """Return the corpus whose frames lie in a folder, with the fields and types of `like`. Raises ConfigError."""
     try:
         index: dict[str, Any] = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{folder}: the first process of this machine has staged no frames ({error})") from error
-    found, rows = {}, index["rows"]
-    for name, (dtype, shape) in index["shapes"].items():
-        kind, count = torch.from_numpy(np.zeros(0, dtype)).dtype, rows * math.prod(shape)
-        flat = torch.zeros(0, dtype=kind)
-        if count:
-            flat = torch.from_file(str(folder / f"{name}.frames"), shared=False, size=count, dtype=kind)
-        found[name] = flat.view(rows, *shape)
+    rows, found = sum(index["lengths"]), {}
+    for name, tensor in vars(like).items():
+        shape = (rows, *tensor.shape[1:])
+        flat, size = torch.zeros(0, dtype=tensor.dtype), math.prod(shape)
+        if size:
+            flat = torch.from_file(str(folder / f"{name}.frames"), shared=False, size=size, dtype=tensor.dtype)
+        found[name] = flat.view(shape)
     return Corpus(replace(like, **found), tuple(index["lengths"]), tuple(index["scenes"]), staged=True)
 
 

@@ -254,11 +254,12 @@ class TrainingOutcome:
 
 Watch = Callable[[Report], None]
 CURVES_EVERY = 10  # steps
+_CURVES = ("loss", "gradient_norm", "learning_rate", "frames_per_s")
 
 
 @contextmanager
 def progress_bar() -> Iterator[Watch]:
-    """A bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
+    """Show a bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
     tasks: dict[str, TaskID] = {}
     with Progress(
         TextColumn("{task.description}"),
@@ -271,20 +272,13 @@ def progress_bar() -> Iterator[Watch]:
 
         def watch(report: Report) -> None:
             at = report.position
-            if report.name not in tasks:  # a resumed run begins where it was, so that the time left counts from there
-                tasks[report.name] = bar.add_task(
-                    report.name, total=report.steps, completed=at.step - 1, figures="", start=True
-                )
-            bar.update(tasks[report.name], completed=at.step, figures=figures(report))
+            if report.name not in tasks:  # of a resumed run the time left counts from its checkpoint
+                tasks[report.name] = bar.add_task(report.name, total=report.steps, completed=at.step - 1, figures="")
+            held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
+            figures = f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
+            bar.update(tasks[report.name], completed=at.step, figures=figures)
 
         yield watch
-
-
-def figures(report: Report) -> str:
-    """Loss, held-out loss once there is one, and speed."""
-    at = report.position
-    held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
-    return f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
 
 
 @contextmanager
@@ -297,15 +291,12 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
     def watch(report: Report) -> None:
         step = report.position.step
         if report.name not in writers:
-            # Whatever an interrupted run drew past its checkpoint is drawn again.
+            # An interrupted run's curves past its checkpoint are drawn again.
             writers[report.name] = SummaryWriter(str(folder / report.name), purge_step=step)
         curves = {}
         if step % CURVES_EVERY == 0 or report.position.finished:
             curves = {
-                "loss": report.loss,
-                "gradient_norm": report.gradient_norm,
-                "learning_rate": report.learning_rate,
-                "frames_per_s": report.frames_per_s,
+                name: getattr(report, name) for name in ("loss", "gradient_norm", "learning_rate", "frames_per_s")
             }
         if report.looked and report.position.held_out is not None:
             curves["held_out_loss"] = report.position.held_out

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import bar, offline_rollout
+from sfms_robot.lab.evaluation.rollout import offline_rollout, tracked
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.corpus import without_gaze
 from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
@@ -43,10 +43,11 @@ DEVICES = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """Options of the command line. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
+    """Options of the command line.
 
-    `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an earlier training left in
-    `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
+    `steps`, and `changes` of the listener, replace the file's; `tensorboard` None: if installed. `order` is that of the
+    channels in the data, if not its layout's own. `overwrite`: what an earlier training left in `out` may be lost.
+    `accumulate` and `scratch`: of `learning.job.Run`.
 
     Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
     starts again after one of them died resumes from the checkpoint.
@@ -58,7 +59,7 @@ class TrainOptions:
     resume: bool = False
     device: str = "auto"
     steps: int | None = None
-    placement: str | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
     tensorboard: bool | None = None
     order: Order | None = None
     overwrite: bool = False
@@ -131,8 +132,7 @@ def train_settings(options: TrainOptions, phase: str = "training") -> config.Tra
     raw = settings.model_dump(mode="json")
     if isinstance(settings, config.ArigTraining):
         phase = "training"
-    if options.placement is not None:
-        raw["listener"]["placement"] = options.placement
+    raw["listener"] |= options.changes
     if options.steps is not None:
         raw[phase]["steps"] = options.steps
     return parse_training(raw, options.file)
@@ -186,14 +186,10 @@ def calibrate(training: config.Training, data: Path, out: Path, order: Order | N
     every = open_for(space.name, data, "train", order, [settings.audio])
     some, rounds = _some(every, settings.window_frames), training.predictor.calibration_rounds
     found = corrected(training)
-    fits_course = bool(rounds and found.events)
-    with bar("calibrating by roll-outs", rounds + fits_course) as advance:
-        for _ in range(rounds):
-            found = placing(found, model, some)
-            advance()
-        if fits_course:
-            found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
-            advance()
+    for _ in tracked(range(rounds), "calibrating by roll-outs"):
+        found = placing(found, model, some)
+    if rounds and found.events:
+        found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
     checkpoint.save_config(out, found)
 
 

@@ -33,7 +33,6 @@ from sfms_robot.errors import ConfigError, GroupError, ModelError
 from sfms_robot.lab.learning.job import Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
-SPEED_SMOOTHING = 0.9
 
 log = logging.getLogger(__name__)
 
@@ -54,26 +53,20 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
     it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
     """
-    file = checkpoint_file(out, job.name)
+    file, phase = checkpoint_file(out, job.name), job.phase
     group, pieces = run.group, pieces_of(job, run, file)
-    if pieces > 1:
-        job = replace(job, identity={**job.identity, "pieces": pieces})
-    try:
-        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+    job = replace(job, identity={**job.identity, **({"pieces": pieces} if pieces > 1 else {})})
+    _make_folder(out)  # hours before it is needed
     generator = torch.Generator().manual_seed(job.seed)
     torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
     base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
     position, best = Position(), None
     if run.resume:
         position, best = load_checkpoint(file, job, generator)
-    elif group.first and (left := peek(file)) is not None and not left.finished:
-        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left.step)
+    elif group.first and (left := peek(file)) and not left[0].finished:
+        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left[0].step)
     began_at = position.step
-
-    saved_s = before_s = clock()
-    frames_per_s = 0.0
+    saved_s = began_s = clock()
     job.model.train()
     gradients = Gradients(job, group, pieces, file)
     with _interruptions(patient=group.size > 1) as pressed:
@@ -82,51 +75,51 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             loss, norm, interrupted = make_step(gradients, position.step, generator, pressed())
             smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
             position = replace(position, step=position.step + 1, loss=smooth)
-            looked = _look_is_due(job, position.step)
+            every = phase.evaluate_every if job.held_out else 0
+            looked = every > 0 and (position.step % every == 0 or position.step == phase.steps)
             if looked:
                 position = _compared(position, group.told_by_first(partial(_held_out, job)))
                 best = weights_of(job) if position.worse == 0 else best
-            position = replace(position, finished=_over(job.phase, position))
-
+            impatient = phase.patience is not None and position.worse >= phase.patience
+            position = replace(position, finished=impatient or position.step >= phase.steps)
             now_s = clock()
-            frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
-            before_s = now_s
             report = Report(
                 name=job.name,
-                steps=job.phase.steps,
+                steps=phase.steps,
                 position=position,
                 loss=loss,
                 gradient_norm=norm,
                 learning_rate=rate,
-                frames_per_s=frames_per_s,
+                frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
                 looked=looked,
             )
             for watch in run.watches:
                 watch(report)
-            interrupted = interrupted or (group.size == 1 and pressed())
-            if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
+            interrupted |= group.size == 1 and pressed()
+            due = position.step % phase.checkpoint_every == 0 or now_s - saved_s >= 60 * phase.checkpoint_minutes
+            if group.first and (interrupted or position.finished or due):
                 save_checkpoint(file, job, position, generator, best)
                 saved_s = now_s
             if interrupted:
-                raise KeyboardInterrupt(
-                    f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
-                    "the same command with --resume continues"
-                )
+                at = f"{job.name}: interrupted after step {position.step} of {phase.steps}, saved in {file}"
+                raise KeyboardInterrupt(f"{at}; the same command with --resume continues")
     if best is not None:
         job.model.load_state_dict(best)
-    return _outcome(job, position, best is not None, began_at if run.resume else None)
-
-
-def _outcome(job: Job, position: Position, restored: bool, resumed_at: int | None) -> TrainingOutcome:
-    """Return the result of a run; `restored`: the model holds the weights of its best held-out loss."""
     return TrainingOutcome(
         loss=math.nan if position.loss is None else position.loss,
         held_out=position.best,
         steps=position.step,
-        best_step=position.best_step if restored else position.step,
-        stopped="steps" if position.step == job.phase.steps else "patience",
-        resumed_at=resumed_at,
+        best_step=position.step if best is None else position.best_step,
+        stopped="steps" if position.step == phase.steps else "patience",
+        resumed_at=began_at if run.resume else None,
     )
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
 
 
 def schedule(step: int, phase: config.Phase) -> float:
@@ -171,18 +164,12 @@ def make_step(
 
 def _kept(file: Path) -> str:
     left = peek(file)
-    return f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
+    return f"{file} holds step {left[0].step}" if left else "there is no checkpoint yet"
 
 
 def _clip(one: torch.optim.Optimizer, norm: float) -> float:
     parameters = [p for group in one.param_groups for p in group["params"] if p.grad is not None]
     return float(nn.utils.clip_grad_norm_(parameters, norm)) if parameters else 0.0
-
-
-def _look_is_due(job: Job, step: int) -> bool:
-    if job.held_out is None or job.phase.evaluate_every == 0:
-        return False
-    return step % job.phase.evaluate_every == 0 or step == job.phase.steps
 
 
 def _held_out(job: Job) -> float:
@@ -203,21 +190,6 @@ def _compared(position: Position, held_out: float) -> Position:
     if position.best is None or held_out < position.best:
         return replace(position, held_out=held_out, best=held_out, best_step=position.step, worse=0)
     return replace(position, held_out=held_out, worse=position.worse + 1)
-
-
-def _over(phase: config.Phase, position: Position) -> bool:
-    return position.step >= phase.steps or (phase.patience is not None and position.worse >= phase.patience)
-
-
-def _save_is_due(phase: config.Phase, position: Position, since_s: float) -> bool:
-    return position.finished or position.step % phase.checkpoint_every == 0 or since_s >= 60 * phase.checkpoint_minutes
-
-
-def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
-    if took_s <= 0:
-        return frames_per_s
-    now = frames / took_s
-    return now if frames_per_s == 0 else SPEED_SMOOTHING * frames_per_s + (1 - SPEED_SMOOTHING) * now
 
 
 @contextmanager
@@ -253,10 +225,13 @@ def pieces_of(job: Job, run: Run, file: Path) -> int:
     Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
     """
     size, batch = run.group.size, job.phase.batch
-    begun = pieces_in(file) if run.resume else None
-    pieces = size * (run.accumulate or 1) if begun is None or run.accumulate else begun
-    if begun is not None and pieces != begun:
-        raise ConfigError(f"{file}: was begun with {begun} pieces a step, --accumulate {run.accumulate} makes {pieces}")
+    pieces = size * (run.accumulate or 1)
+    if run.resume and (left := peek(file)):
+        pieces = pieces if run.accumulate else left[1]
+        if pieces != left[1]:
+            raise ConfigError(
+                f"{file}: was begun with {left[1]} pieces a step, --accumulate {run.accumulate} makes {pieces}"
+            )
     if pieces % size:
         shares = ", ".join(str(count) for count in range(1, pieces + 1) if pieces % count == 0)
         raise ConfigError(f"{file}: a step has {pieces} pieces; {size} processes cannot share them ({shares} can)")
@@ -400,28 +375,24 @@ def load_checkpoint(file: Path, job: Job, generator: torch.Generator) -> tuple[P
     return position, _under(tensors, "best.") or None
 
 
-def peek(file: Path) -> Position | None:
-    """Return the step of the checkpoint in `file`; None where there is no readable one."""
+def peek(file: Path) -> tuple[Position, int] | None:
+    """Return the position of the checkpoint in `file`, and into how many pieces its batches are cut.
+
+    None if there is no readable one.
+    """
     try:
-        with safe_open(file, framework="pt") as opened:
-            return Position(**json.loads((opened.metadata() or {})["position"]))
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        metadata, _ = _read(file, tensors=False)
+        identity = json.loads(metadata["identity"])
+        return Position(**json.loads(metadata["position"])), int(identity.get("pieces", 1))
+    except (ModelError, KeyError, TypeError, ValueError):
         return None
 
 
-def pieces_in(file: Path) -> int | None:
-    """Into how many pieces the batches of the checkpoint in `file` are cut; None where it cannot be read."""
+def _read(file: Path, tensors: bool = True) -> tuple[Mapping[str, str], Weights]:
     try:
         with safe_open(file, framework="pt") as opened:
-            return int(json.loads((opened.metadata() or {})["identity"]).get("pieces", 1))
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
-        return None
-
-
-def _read(file: Path) -> tuple[Mapping[str, str], Weights]:
-    try:
-        with safe_open(file, framework="pt") as opened:
-            return opened.metadata() or {}, {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+            names = list(opened.keys()) if tensors else []
+            return opened.metadata() or {}, {name: opened.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise ModelError(f"{file}: not a readable checkpoint: {error}") from error
 

@@ -14,7 +14,7 @@ from sfms_robot.lab.evaluation.intervals import estimates
 from sfms_robot.lab.evaluation.listener_meetings import ListenerMeeting
 from sfms_robot.lab.evaluation.meetings import middle, people_of
 from sfms_robot.lab.evaluation.rollout import rollout, speaker_frames, spread
-from sfms_robot.lab.evaluation.timing import CELLS, cell_counts, cells, smoothed_rates
+from sfms_robot.lab.evaluation.timing import CELLS, cells
 from sfms_robot.signals.phase import times
 
 NONE = np.zeros((0, 2))
@@ -334,14 +334,6 @@ def test_streams_one_by_one_and_side_by_side_are_rolled_out_alike():
     assert not alone[:, 0].any()  # nothing is planned yet while the first frame is heard
 
 
-MINUTE = 60 * 25
-
-
-def counts(nods, minutes):
-    """The given numbers in the first cells, nothing in the others."""
-    return np.stack([np.pad(np.array(v, float), (0, CELLS - len(v))) for v in (nods, minutes)])
-
-
 @given(st.floats(0, 100), st.floats(0, 100), st.floats(0, 100))
 def test_every_phase_has_one_cell(speech_s, silence_s, last_s):
     cell = cells(np.array([[speech_s, silence_s, last_s]]))
@@ -355,23 +347,10 @@ def test_every_cell_has_a_phase():
     assert sorted(cells(phases)) == list(range(CELLS))
 
 
-def test_counts_are_onsets_and_minutes_within_listening():
-    cell = np.r_[np.zeros(MINUTE, int), np.ones(2 * MINUTE, int)]
-    listening = np.r_[np.ones(2 * MINUTE, bool), np.zeros(MINUTE, bool)]
-    nods, minutes = cell_counts(cell, np.array([5, 10, MINUTE, 3 * MINUTE - 1, 10 * MINUTE]), listening)
-    assert nods[:3].tolist() == [2, 1, 0]
-    assert minutes[:3].tolist() == [1, 1, 0]
-
-
-def test_a_busy_cell_has_the_higher_rate_and_an_unknown_one_the_mean():
-    rates = smoothed_rates(counts([40, 10], [10, 10]))
-    assert rates[0] > rates[2] > rates[1]
-    assert rates[2] == pytest.approx(2.5)
-
-
-def test_rates_with_much_data_are_the_plain_ones():
-    assert smoothed_rates(counts([4000, 1000], [1000, 1000]))[:2] == pytest.approx([4, 1], rel=0.02)
-
-
-def test_without_nods_all_rates_are_nought():
-    assert not smoothed_rates(counts([0], [10])).any()
+def test_a_cell_without_nods_gets_fewer_than_one_with_many_and_without_any_all_are_nought():
+    others = talk(5)
+    spoken = {"others": event_spans(others), "until_s": float(MINUTES * 60)}
+    rates = timing.table_rates([someone(nods=spans(answering(others)), **spoken)])
+    pause, phrase = (rates[cells(np.array([now]))[0]] for now in ((0.0, 0.3, 2.0), (6.0, 0.0, 2.0)))
+    assert pause > 2 * phrase > 0
+    assert not timing.table_rates([someone(**spoken)]).any()

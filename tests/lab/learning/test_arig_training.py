@@ -115,7 +115,7 @@ def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path
 
     train_arig(settings(steps=6), data, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt, match="--resume continues"):
-        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watch=stop))
+        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watches=(stop,)))
     train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
     whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
     assert whole == parts
@@ -309,19 +309,16 @@ def test_a_step_never_leads_out_of_the_range_of_the_motion():
 
 def test_lost_states_are_drawn_and_unknown_ones_wait():
     states = torch.tensor([[3, -1] * 500])
-    assert torch.equal(previous_states(states, 0, torch.Generator())[0, :2], torch.tensor([3, FIRST]))
-    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0))[:, ::2] == 3
+    assert torch.equal(previous_states(states, 0, torch.Generator(), 7)[0, :2], torch.tensor([3, FIRST]))
+    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0), 7)[:, ::2] == 3
     assert float(kept.float().mean()) == pytest.approx(0.3 + 0.7 / 7, abs=0.05)
 
 
 def test_unlabelled_frames_have_no_state_loss(corpus):
     student = a_student()
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:3], WINDOW)
-    states = told.states
-    unknown = torch.full_like(states, -1)
-    parts = loss_parts(
-        student, told, unknown, told.agent_motion, 1, torch.Generator().manual_seed(0), states.clamp(min=0)
-    )
+    unknown = torch.full_like(told.states, -1)
+    parts = loss_parts(student, told, unknown, told.agent_motion, settings().training, torch.Generator().manual_seed(0))
     assert float(parts.state) == 0
 
 
@@ -363,7 +360,7 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
 
 def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
     blank = replace(dyad("blank", "listening", 0), events=None)
-    with pytest.raises(ConfigError, match="blank: what the listener did is not known"):
+    with pytest.raises(ConfigError, match="blank: expected events of its listener"):
         gather({"listening": [blank]}, WINDOW, ARKIT, A_TOLD)
     assert gather({"listening": [blank]}, WINDOW, ARKIT, A_LISTENER).frames.control.shape[-1] == 0
 

@@ -17,7 +17,7 @@ import sfms_robot
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.job import ProcessGroup, Run
-from sfms_robot.lab.learning.training_loop import checkpoint_file, peek, pieces_in
+from sfms_robot.lab.learning.training_loop import checkpoint_file, peek
 
 TESTS = Path(tiny_arig_training.__file__).parent
 ENVIRONMENT = {
@@ -70,7 +70,7 @@ def test_a_run_of_two_processes_goes_on_in_one_and_staged_on_disk(data, tmp_path
     half = tmp_path / "half"
     done = train(2, data=data, out=half, every=4, dies_at=5)
     assert done.returncode != 0
-    assert peek(checkpoint_file(half, "arig")).step == 4, "the last checkpoint stands"
+    assert peek(checkpoint_file(half, "arig"))[0].step == 4, "the last checkpoint stands"
     rest = trained(1, data=data, out=half, resume=True)
     assert rest["resumed_at"] == 4
     np.testing.assert_allclose(rest["losses"], alone["losses"][4:], rtol=SAME)
@@ -99,7 +99,7 @@ def test_a_batch_that_cannot_be_shared_is_refused(data, tmp_path, size, accumula
 def test_pieces_are_part_of_a_run_and_processes_that_cannot_share_them_are_told_who_can(data, tmp_path):
     train_arig(settings(), data, tmp_path, Run(accumulate=4))
     file = checkpoint_file(tmp_path, "arig")
-    assert pieces_in(file) == 4
+    assert peek(file)[1] == 4
     with pytest.raises(ConfigError, match=r"4 pieces; 3 processes cannot share them \(1, 2, 4 can\)"):
         train_arig(settings(), data, tmp_path, Run(resume=True, group=ProcessGroup(size=3)))
     with pytest.raises(ConfigError, match="begun with 4 pieces a step, --accumulate 2 makes 2"):

@@ -118,7 +118,7 @@ def test_motion_and_sway_of_a_dyad_are_its_motion_without_gaze():
 @pytest.mark.parametrize(
     "changes, text",
     [
-        ({"events": None}, "does not say when its listener nods"),
+        ({"events": None}, "expected events of its listener"),
         ({"fps": 30.0, "audio": None}, "has 30 frames a second"),
     ],
 )

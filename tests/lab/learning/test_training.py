@@ -135,7 +135,7 @@ def test_a_phase_interrupted_and_resumed_writes_the_same_bytes(data, tmp_path, p
         shutil.copytree(alone, broken)
     figures = trained(phase, chosen, data, alone)
     with pytest.raises(KeyboardInterrupt, match=f"{phase}: interrupted after step {stop} of"):
-        trained(phase, chosen, data, broken, Run(watch=interrupt_after(stop)))
+        trained(phase, chosen, data, broken, Run(watches=(interrupt_after(stop),)))
     assert not (broken / WRITTEN[phase]).exists()  # half trained weights never pass for trained ones
     resumed = trained(phase, chosen, data, broken, Run(resume=True))
     for name in (WRITTEN[phase], "config.yaml"):
@@ -146,7 +146,7 @@ def test_a_phase_interrupted_and_resumed_writes_the_same_bytes(data, tmp_path, p
 def test_a_listener_is_not_resumed_on_another_tokenizer_or_other_data(data, tmp_path):
     tokenizer.train_tokenizer(settings(), data, tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        listener.train_listener(settings(), data, tmp_path, Run(watch=interrupt_after(2)))
+        listener.train_listener(settings(), data, tmp_path, Run(watches=(interrupt_after(2),)))
     clips.save(tmp_path / "other" / "train", [dyad("a", seed=5)])
     clips.save(tmp_path / "other" / "validation", [dyad("c", 160, seed=2)])
     with pytest.raises(ConfigError, match=r"data\.dyads = 2 there, 1 now"):

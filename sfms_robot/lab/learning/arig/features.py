@@ -26,15 +26,13 @@ from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
     Corpus,
-    Scratch,
     fit_sway,
-    in_space,
     motion_scales,
+    shared_frames,
     some_sound,
     sound_scales,
-    without_gaze,
-    without_sway,
 )
+from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
@@ -44,7 +42,6 @@ from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANT
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
-from sfms_robot.signals.control import control_track
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.voice_activity import levels_db
 
@@ -105,30 +102,21 @@ def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
 
 
 def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> LabelledDyad:
-    """One conversation (N, ...). Raises ConfigError for a motion space, sound or events that do not fit."""
+    """Return the frames of one conversation. Raises ConfigError for a motion space, sound or events that do not fit."""
     frames, width = len(dyad.listener), audio_frontend.WIDTHS[settings.sound]
-    control = torch.zeros(frames, 0)
-    if settings.events:
-        if dyad.events is None:
-            raise ConfigError(f"{dyad.name}: what the listener did is not known, which events: true needs")
-        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
-    face = in_space(dyad, dyad.speaker, space)
-    seen = face.isfinite().all(-1)
+    face, seen, motion, sway, control = shared_frames(dyad, space, settings)
     user, user_voiced, heard = _audio_features(dyad, "user", width)
     agent, agent_voiced, says = _audio_features(dyad, "agent", width)
     states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
     if settings.events:
         quiet = torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states)
         states = torch.from_numpy(with_feedback(quiet.numpy(), control.numpy()))
-    motion, sway = in_space(dyad, dyad.listener, space), torch.zeros(frames, 0)
-    if settings.sway:
-        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
     return LabelledDyad(
         user_sound=user,
         user_heard=torch.full((frames,), heard),
         agent_sound=agent,
         agent_heard=torch.full((frames,), says),
-        user_motion=torch.where(seen[:, None], face, 0.0),
+        user_motion=face,
         user_seen=seen,
         agent_motion=motion,
         voiced=torch.stack([agent_voiced, user_voiced], dim=-1),

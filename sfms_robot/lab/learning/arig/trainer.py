@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
@@ -86,7 +85,7 @@ def arig_job(
         chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
         dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, student.model, phase, generator)
-        return _loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
+        return loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
 
     return Job(
         name="arig",
@@ -161,17 +160,9 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
         dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
-        found.append(_loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
+        found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return LossParts(**mean)
-
-
-def _loss_parts(
-    student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
-) -> LossParts:
-    """`losses.loss_parts` as the phase says, previous states drawn."""
-    previous = previous_states(states, phase.state_noise, generator, len(student.model.settings.states))
-    return loss_parts(student, told, states, truth, phase.draws, generator, previous, phase.group_weights)
 
 
 # --- Losses ----------------------------------------------------------------------------------------------------------
@@ -219,31 +210,24 @@ class LossParts:
 
 
 def loss_parts(
-    student: Student,
-    told: ArigDyad,
-    states: Tensor,
-    truth: Tensor,
-    draws: int,
-    generator: torch.Generator,
-    previous: Tensor,
-    group_weights: config.GroupWeights | None = None,
+    student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
 ) -> LossParts:
     """Return the losses of frames 1..N-1.
 
     Args:
-        told: inputs of the model, the past possibly noisy.
+        student: The model and its readout.
+        told: Inputs of the model, the past possibly noisy.
         states: (B, N) int64, -1 where not labelled.
         truth: (B, N, C) motion to be predicted after this past.
-        draws: noise levels per frame.
-        previous: (B, N) the states given to the model; each frame gets the one before.
-        group_weights: of `GROUPS` in equation (3); None: every channel counts the same.
+        phase: Its `group_weights` are of `GROUPS` in equation (3); None: every channel counts the same.
+        generator: Of noise levels and of the previous states.
     """
     model = student.model
-    weights = channel_weights(model.settings, group_weights).to(truth.device) if group_weights else None
-    found = model.condition(told, previous)
+    weights = channel_weights(model.settings, phase.group_weights).to(truth.device) if phase.group_weights else None
+    found = model.condition(told, previous_states(states, phase.state_noise, generator, len(model.settings.states)))
     target = model.standardise(truth[:, 1:])
     to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
-    motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), draws, generator, weights).mean()
+    motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), phase.draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
     known = states[:, 1:] >= 0
     state = motion.new_zeros(())
@@ -375,7 +359,7 @@ def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
     return (total[:, 1:] - ended) / frames[..., None]
 
 
-def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int = len(STATES)) -> Tensor:
+def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int) -> Tensor:
     """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
     `count`.
     """

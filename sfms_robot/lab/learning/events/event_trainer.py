@@ -1,12 +1,12 @@
-"""Teaches hazards from meetings: evidence of every step, onsets against the steps in which nothing began.
+"""Fits of hazards on meetings: evidence of every step, onsets against the steps in which nothing began.
 
-Of the steps without an onset one in six is kept and counts six times. How good a hazard is: does it rank the onsets of
-a person above the other steps in which he might have, his own history as it was (AUC, mean over people).
+Of the steps without an onset one in six is kept and counts six times. A hazard is judged by how it ranks the onsets of
+a person above the other steps in which they were possible, given the person's history (AUC, mean over people).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,15 +14,14 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
-from sfms_robot.lab.evaluation.intervals import Sums, added
+from sfms_robot.lab.evaluation.intervals import Sums
 from sfms_robot.lab.evaluation.phrase_timing import phrase_end_counts, phrase_ends, rank_auc, ratio_of
 from sfms_robot.lab.evaluation.whole_recordings import Bools, done_at, event_spans, heard_in
 from sfms_robot.lab.learning.events.labels import (
     Lesson,
-    Looks,
     lesson,
     looks_of,
-    meeting_evidence,
+    meeting_scene,
     minutes,
     spans_of,
     steps_of,
@@ -110,22 +109,21 @@ class EventStudent:
 
 def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
-    meeting = meeting_evidence(person)
-    listening, spans = meeting.listening, spans_of(person, meeting, rng)
+    scene, listening = meeting_scene(person)
+    spans = spans_of(person, rng)
     nods = _begun_in(spans["nod"], listening)
     lessons = {kind: lesson(each, listening) for kind, each in spans.items()}
     own, aside = {**spans, "nod": nods}, None
     if person.gaze is not None:
-        looks = looks_of(person, meeting)
-        lessons["gaze_shift"], own["gaze_shift"], aside = _looking(looks), looks.shifts_s, looks.aside
-    ends_s = (np.arange(len(listening)) + 1) * FRAME_S
-    rows = np.concatenate([heard_in(meeting.scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
+        own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
+    ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
+    rows = np.concatenate([heard_in(scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
     before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
     return EventStudent(
         person=person,
         evidence=before[: len(rows) // STEP_FRAMES],  # known as each step begins: before the first, nothing
         listening=listening,
-        others=np.asarray(meeting.scene.speaks[:, 1:].any(axis=1)),
+        others=np.asarray(scene.speaks[:, 1:].any(axis=1)),
         lessons=lessons,
     )
 
@@ -144,14 +142,6 @@ def _begun_in(spans: Doubles, mask: Bools) -> Doubles:
     return spans[(at < len(mask)) & mask[np.minimum(at, len(mask) - 1)]]
 
 
-def _looking(looks: Looks) -> Lesson:
-    may = steps_of(looks.at_speaker)
-    begins = np.floor(looks.away_s * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
-    onsets = np.unique(begins[(begins > 0) & (begins < len(may))])
-    may[onsets] = True
-    return Lesson(onsets, may)
-
-
 # --- fitting ----------------------------------------------------------------------------------------------------
 
 
@@ -167,26 +157,19 @@ def inputs(evidence: Doubles, groups: Groups) -> Floats:
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
-def sampled(students: Iterable[EventStudent], kind: str, seed: int) -> tuple[Doubles, Doubles, Doubles]:
-    """Evidence (R, E) of all onsets and of a sixth of the other steps, whether it happens (R,), how often it counts."""
+def teach(students: Iterable[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
+    """Fit the hazard of one kind on all onsets and a sixth of the other steps."""
     rows, happens, counts = [], [], []
     for number, one in enumerate(students):
-        if kind not in one.lessons:
-            continue
-        given = one.lessons[kind]
-        onset = np.isin(np.arange(len(given.may)), given.onsets)
-        lot = np.random.default_rng([seed, number]).integers(KEPT, size=len(onset)) == 0
-        kept = given.may & (onset | lot)
-        rows.append(one.evidence[kept])
-        happens.append(onset[kept])
-        counts.append(np.where(onset[kept], 1.0, KEPT))
-    return np.concatenate(rows), np.concatenate(happens).astype(np.float64), np.concatenate(counts)
-
-
-def teach(students: Sequence[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
-    """Fit the hazard of one kind."""
-    rows, happens, counts = sampled(students, kind, seed)
-    return fit(inputs(rows, groups), happens, counts, ridge=ridge)
+        if (given := one.lessons.get(kind)) is not None:
+            onset = np.isin(np.arange(len(given.may)), given.onsets)
+            lot = np.random.default_rng([seed, number]).integers(KEPT, size=len(onset)) == 0
+            kept = given.may & (onset | lot)
+            rows.append(one.evidence[kept])
+            happens.append(onset[kept])
+            counts.append(np.where(onset[kept], 1.0, KEPT))
+    happened = np.concatenate(happens).astype(np.float64)
+    return fit(inputs(np.concatenate(rows), groups), happened, np.concatenate(counts), ridge)
 
 
 def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: float) -> Hazard:
@@ -254,39 +237,36 @@ class Logistic:
         return np.asarray(self.intercept + inputs @ self.weights, np.float64)
 
 
-def fit(
-    inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles | None = None, ridge: float = 10.0
-) -> Logistic:
-    """Maximum likelihood of `happens` (N,) 0 or 1, each row counting `counts` (N,) times, less ridge / 2 * |weights|^2.
+def fit(inputs: Floats, happens: Doubles, counts: Doubles, ridge: float = 10.0) -> Logistic:
+    """Maximise the likelihood of `happens` (N,) 0 or 1, less ridge / 2 * |weights|^2; the intercept is free.
 
-    `offset` (N,) is added to the log-odds and not fitted. The intercept is free.
+    Each row of the inputs (N, K) counts `counts` (N,) times.
     """
-    rows, columns = inputs.shape
+    columns = inputs.shape[1]
     share = float((happens * counts).sum() / counts.sum())
     at = np.r_[np.log(share / (1 - share)), np.zeros(columns)]
-    given = np.zeros(rows) if offset is None else offset
     penalty = np.r_[0.0, np.full(columns, ridge)]
     before, fit_before = at, -np.inf
     for _ in range(NEWTON_STEPS):
-        goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
-        while not goodness >= fit_before:  # too far: whoever starts at the mean may overshoot
+        goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
+        while not goodness >= fit_before:  # too far: a start at the mean may overshoot
             at = (at + before) / 2
-            goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
+            goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
         before, fit_before = at, goodness - 1e-9 * abs(goodness)
         at = at + np.linalg.solve(bend, slope)
     return Logistic(float(at[0]), at[1:])
 
 
 def _at(
-    at: Doubles, inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles, penalty: Doubles
+    at: Doubles, inputs: Floats, happens: Doubles, counts: Doubles, penalty: Doubles
 ) -> tuple[float, Doubles, Doubles]:
-    """Penalised log-likelihood, its gradient and its negative curvature."""
+    """Return the penalised log-likelihood, its gradient and its negative curvature."""
     goodness = -0.5 * float(penalty @ at**2)
     slope, bend = -penalty * at, np.diag(penalty + 1e-9)
     for start in range(0, len(inputs), _ROWS):
         part = slice(start, start + _ROWS)
         x = np.concatenate([np.ones((len(inputs[part]), 1)), inputs[part]], axis=1)
-        odds = np.clip(x @ at + offset[part], -40, 40)
+        odds = np.clip(x @ at, -40, 40)
         chance = 1.0 / (1.0 + np.exp(-odds))
         goodness += float(counts[part] @ (happens[part] * odds - np.log1p(np.exp(odds))))
         slope += x.T @ (counts[part] * (happens[part] - chance))
@@ -313,7 +293,8 @@ def roll_out(model: EventModel, one: EventStudent, per_minute: float, seed: int)
     while at < len(evidence):
         steps = np.arange(at, min(at + STRETCH, len(evidence)))
         rows = evidence[steps]
-        rows[:, own:] = done_at({"nod": event_spans(nods, "nod")}, steps * STEP_S, float(np.log(per_minute)))
+        now_s = np.asarray(steps * STEP_S, np.float64)
+        rows[:, own:] = done_at({"nod": event_spans(nods, "nod")}, now_s, float(np.log(per_minute)))
         odds = bank.log_odds(bank.contributions(rows))[:, 0]
         happens = listening[steps] & (draws[steps] < 1 / (1 + np.exp(-odds)))
         if not happens.any():
@@ -331,8 +312,8 @@ def people_did(one: EventStudent) -> Doubles:
     return _begun_in(one.person.nods, one.listening)[:, 0]
 
 
-def count(one: EventStudent, onsets_s: Doubles) -> Sums:
-    """Return the counts of one person's nods: pairs (nods, minutes), and intervals [s] in listening time."""
+def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
+    """Return the counts of one person's nods: pairs (nods, minutes); and the intervals [s] in listening time."""
     listening = steps_of(one.listening)[: len(one.evidence)]
     steps = np.minimum(np.floor(onsets_s / STEP_S + 1e-6).astype(np.int64), len(listening) - 1)
     one_speaks, own_voice_s, known, looked_at = one.evidence[
@@ -340,18 +321,9 @@ def count(one: EventStudent, onsets_s: Doubles) -> Sums:
     ].T
     spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
     masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
-    ends = phrase_ends(one.others, FRAME_HZ)
-    return {
-        **{f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()},
-        "phrase_end": np.array(phrase_end_counts(onsets_s, ends, one.listening, FRAME_HZ)),
-        "intervals_s": np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S)),
-    }
-
-
-def total(parts: Sequence[Sums]) -> Sums:
-    """Return the counts of all people, and their intervals one after the other."""
-    intervals = np.concatenate([part["intervals_s"] for part in parts])
-    return added({**part, "intervals_s": np.zeros(0)} for part in parts) | {"intervals_s": intervals}
+    counts = phrase_end_counts(onsets_s, phrase_ends(one.others, FRAME_HZ), one.listening, FRAME_HZ)
+    rates = {f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()}
+    return {**rates, "phrase_end": np.array(counts)}, np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S))
 
 
 def figures(found: Sums) -> dict[str, float]:

@@ -21,9 +21,9 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
-from sfms_robot.lab.evaluation.intervals import DRAWS, Sums, ends, rounded
+from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
 from sfms_robot.lab.evaluation.meetings import tables
-from sfms_robot.lab.evaluation.rollout import bar
+from sfms_robot.lab.evaluation.rollout import tracked
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
@@ -77,32 +77,23 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
     people = read_people(tables(data))
     split = split_series(people)
     parts = {"train": people if all_series else split["train"], "validation": [] if all_series else split["validation"]}
-    with bar("people and kinds", len(parts["train"]) + len(parts["validation"]) + len(LEARNED)) as step:
 
-        def student(person: MeetingPerson) -> EventStudent:
-            rng = np.random.default_rng([seed, *person.meeting.encode(), ord(person.agent)])
-            made = event_trainer.student(person, rng)
-            step()
-            return made
+    def student(person: MeetingPerson) -> EventStudent:
+        return event_trainer.student(person, np.random.default_rng([seed, *person.meeting.encode(), ord(person.agent)]))
 
-        taught, judged = ([student(person) for person in parts[name]] for name in ("train", "validation"))
-        for kind in LEARNED:
-            if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
-                raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
-        groups, ridge = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
-        hazards = {}
-        for kind in LEARNED:
-            learned = event_trainer.teach(taught, kind, groups[kind], seed, ridge)
-            rate = event_trainer.rate_per_minute(taught, kind)
-            hazards[kind] = hazard(learned, groups[kind], FROM[kind], rate)
-            step()
-        motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
-        hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
-        hazards["blink"] = blink_hazard(motions.gaps)
-        found = EventTables(
-            hazards={kind: hazards[kind] for kind in EVENT_KINDS},
-            shapes=shapes(taught, motions),
-        )
+    taught, judged = ([student(person) for person in tracked(some, name)] for name, some in parts.items())
+    for kind in LEARNED:
+        if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
+            raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
+    groups, ridge = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
+    hazards = {}
+    for kind in tracked(LEARNED, "kinds of events"):
+        learned = event_trainer.teach(taught, kind, groups[kind], seed, ridge)
+        hazards[kind] = hazard(learned, groups[kind], FROM[kind], event_trainer.rate_per_minute(taught, kind))
+    motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
+    hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
+    hazards["blink"] = blink_hazard(motions.gaps)
+    found = EventTables(hazards={kind: hazards[kind] for kind in EVENT_KINDS}, shapes=shapes(taught, motions))
     if out is not None:
         save(out, found)
     figures: dict[str, Any] = {
@@ -144,12 +135,10 @@ def _judged(given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Se
         return found
 
     def ranked(*left_out: str) -> Doubles:
-        bank, columns = HazardBank({kind: given}), [AT[name] for name in left_out]
-
         def score(evidence: Doubles) -> Doubles:
             rows = evidence.copy()
-            rows[:, columns] = np.nan
-            return _log_odds(bank, rows)
+            rows[:, [AT[name] for name in left_out]] = np.nan
+            return _log_odds(given, rows)
 
         return event_trainer.ranked(judged, kind, score)
 
@@ -173,25 +162,26 @@ def _mean(auc: Doubles) -> float | None:
     return rounded(float(auc.mean())) if len(auc) else None
 
 
-def _log_odds(bank: HazardBank, rows: Doubles) -> Doubles:
-    """Return the log-odds (M,) of a single kind for evidence (M, E), in parts that stay in a cache."""
-    parts = np.array_split(rows, max(1, len(rows) // 4096))
+def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
+    """Return the log-odds (M,) of a hazard for evidence (M, E), in parts that stay in a cache."""
+    bank, parts = HazardBank({"": given}), np.array_split(rows, max(1, len(rows) // 4096))
     return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
 
 def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
     """Return the figures of the people's nods, and of nods drawn in their places at each rate of `KNOBS`."""
 
-    def counted(onsets_s: Iterable[Doubles]) -> Sums:
-        return event_trainer.total([event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)])
+    def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
+        counts = [event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)]
+        total = added(sums for sums, _ in counts)
+        return event_trainer.figures(total), np.concatenate([intervals_s for _, intervals_s in counts])
 
-    theirs = counted(map(event_trainer.people_did, judged))
-    found: dict[str, Any] = {"people": event_trainer.figures(theirs)}
+    figures, theirs_s = counted(map(event_trainer.people_did, judged))
+    found = {"people": figures}
     for knob in KNOBS:
         nods = (event_trainer.roll_out(model, one, knob, at + 1000 * seed) for at, one in enumerate(judged))
-        ours = counted(event_spans(each, "nod")[:, 0] for each in nods)
-        distance = ks_2samp(ours["intervals_s"], theirs["intervals_s"]).statistic
-        found[f"{knob:g}"] = {**event_trainer.figures(ours), "interval_ks": float(distance)}
+        figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in nods)
+        found[f"{knob:g}"] = {**figures, "interval_ks": float(ks_2samp(ours_s, theirs_s).statistic)}
     return {key: {name: rounded(value) for name, value in figures.items()} for key, figures in found.items()}
 
 
@@ -221,41 +211,31 @@ _INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # a tail has no end
 
 
 def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shape]:
-    """Of every kind, durations from these people."""
+    """Return the shape of every kind, with durations from these people."""
+
+    def lasts(spans: str, least_s: float = 0.0, longer_s: float = 0.0) -> tuple[float, ...]:
+        return _quantiles(_lengths(getattr(one.person, spans) for one in students).clip(least_s, LONGEST_S) + longer_s)
+
     least, usual, most = sizes.NOD_DEG
     nod_deg = np.clip(usual * np.exp(sizes.NOD_SPREAD * ndtri(_INNER)), least, most)
     nod_deg[[0, -1]] = least, most
     habit = _thousandths(np.clip(1 + sizes.HABIT_SPREAD * ndtri(_INNER), 0.4, 1.6))
     laughs_s = _lengths(one.person.laughs for one in students).clip(0, LONGEST_S)
     rng = np.random.default_rng(0)
+    laughs_s += rng.uniform(*sizes.LAUGH_LONGER_S, len(laughs_s))
+    laugh, smile = (
+        Shape(duration_s=_quantiles(_smiles_s(seen_s, motions, rng)), size=size)
+        for seen_s, size in ((laughs_s, sizes.LAUGH), ((smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
+    )
     slight, whole = sizes.BLINK
+    swings: dict[str, Any] = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
     return {
-        "nod": Shape(
-            duration_s=_quantiles(_lengths(one.person.nods for one in students).clip(0.2, LONGEST_S)),
-            size=_thousandths(nod_deg),
-            habit=habit,
-            swings_hz=sizes.SWINGS_HZ,
-        ),
-        "shake": Shape(
-            duration_s=_quantiles(_lengths(one.person.shakes for one in students).clip(0.2, LONGEST_S)),
-            size=_thousandths(sizes.SHAKE * nod_deg),
-            habit=habit,
-            swings_hz=sizes.SWINGS_HZ,
-        ),
-        "tilt": Shape(
-            duration_s=_quantiles(_lengths(one.person.tilts for one in students).clip(0, LONGEST_S) + 12 * FRAME_S),
-            size=sizes.TILT_DEG,
-        ),
-        "laugh": Shape(
-            duration_s=_quantiles(
-                _smiles_s(laughs_s + rng.uniform(*sizes.LAUGH_LONGER_S, len(laughs_s)), motions, rng)
-            ),
-            size=sizes.LAUGH,
-        ),
-        "smile": Shape(
-            duration_s=_quantiles(_smiles_s([smile_s(rng) for _ in range(DRAWN)], motions, rng)), size=sizes.SMILE
-        ),
-        "mm_hm": Shape(duration_s=_quantiles(_lengths(one.person.mm_hms for one in students)), size=sizes.MM_HM),
+        "nod": Shape(duration_s=lasts("nods", 0.2), size=_thousandths(nod_deg), **swings),
+        "shake": Shape(duration_s=lasts("shakes", 0.2), size=_thousandths(sizes.SHAKE * nod_deg), **swings),
+        "tilt": Shape(duration_s=lasts("tilts", longer_s=12 * FRAME_S), size=sizes.TILT_DEG),
+        "laugh": laugh,
+        "smile": smile,
+        "mm_hm": Shape(duration_s=lasts("mm_hms"), size=sizes.MM_HM),
         "brow_raise": Shape(
             duration_s=_quantiles(np.outer(_recorded(motions.brows), (*sizes.BROW_STRETCH, 1.0)).ravel()),
             size=sizes.BROW_RAISE,
@@ -335,7 +315,7 @@ def at_rate(given: Hazard, kind: str, students: Iterable[EventStudent], per_minu
         [one.evidence[one.lessons[kind].may & (one.evidence[:, AT["own_voice_s"]] > 1.0)] for one in students
          if kind in one.lessons]
     )  # fmt: skip
-    odds = _log_odds(HazardBank({kind: given}), rows)
+    odds = _log_odds(given, rows)
     more = brentq(lambda by: expit(odds + by).mean() * 60 / STEP_S - per_minute, -20.0, 20.0)
     update = {"intercept": round(given.intercept + more, 3), "per_minute": round(per_minute, 3)}
     return given.model_copy(update=update)

@@ -10,7 +10,7 @@ A hazard is evaluated every 80 ms; an event belongs to the step in which it begi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -36,7 +36,7 @@ class Lesson:
 
     Attributes:
         onsets: (K,) steps in which one begins that could.
-        may: (M,) steps in which it could begin: he listens and is not inside one.
+        may: (M,) steps in which it could begin: the person listens and is not inside one.
     """
 
     onsets: Ints
@@ -44,19 +44,22 @@ class Lesson:
 
 
 def steps_of(mask: Bools) -> Bools:
-    """(N,) frames -> (N // 2,) steps, by the last frame before each; nothing holds before the first."""
+    """Map frames (N,) to steps (N // 2,), by the last frame before each; nothing holds before the first."""
     before: Bools = np.r_[False, mask[STEP_FRAMES - 1 :: STEP_FRAMES]]
     return before[: len(mask) // STEP_FRAMES]
 
 
-def spans_of(person: MeetingPerson, meeting: MeetingEvidence, rng: np.random.Generator) -> dict[str, Doubles]:
+def spans_of(person: MeetingPerson, rng: np.random.Generator) -> dict[str, Doubles]:
     """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
-    others = person.others_laughs[:, 0]
+    others, nods = person.others_laughs[:, 0], person.nods[:, 0]
     smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
     brows = _some(person.asked, BROWS["question"], rng)
-    nods = person.nods[:, 0]
     return {
-        **meeting.spans_s,
+        "nod": person.nods,
+        "shake": person.shakes,
+        "tilt": person.tilts,
+        "laugh": person.laughs,
+        "mm_hm": person.mm_hms,
         "smile": _spans(np.r_[smiles[0] + REACTION_S, smiles[1], _some(nods, SMILES["nod"], rng)], SMILE_S),
         "brow_raise": _spans(np.r_[brows + REACTION_S, _some(nods, BROWS["nod"], rng)], BROW_S),
     }
@@ -83,29 +86,15 @@ def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
     return Lesson(onsets, may)
 
 
-@dataclass(frozen=True)
-class Looks:
-    """Gaze of one person.
+def looks_of(person: MeetingPerson, scene: Scene) -> tuple[Doubles, Bools, Lesson]:
+    """Return the gaze of a person with annotations: the spans (K, 2) from each shift to the next, aside (K,), a lesson.
 
-    Attributes:
-        shifts_s: (K, 2) from each shift to the next.
-        aside: (K,) True where the target neither speaks nor has the floor.
-        at_speaker: (N,) frames with gaze at a person who speaks or has the floor.
-        away_s: (J,) instants at which the gaze leaves such a person.
+    A look goes aside if its target neither speaks nor has the floor. In the lesson the gaze leaves such a person.
     """
-
-    shifts_s: Doubles
-    aside: Bools
-    at_speaker: Bools
-    away_s: Doubles
-
-
-def looks_of(person: MeetingPerson, meeting: MeetingEvidence) -> Looks:
-    """Return the gaze of a person with annotations."""
-    counts, gaze = counts_in(meeting.scene), person.gaze or ()
+    counts, gaze, agents = counts_in(scene), person.gaze or (), agents_of(person)
     frames = len(counts)
-    target = np.zeros(frames, np.int64)  # column of whom he looks at; 0, himself, for anything else
-    columns = [max(0, meeting.agents.index(where)) if where in meeting.agents else 0 for _, _, where in gaze]
+    target = np.zeros(frames, np.int64)  # column of the person looked at; 0, oneself, for anything else
+    columns = [agents.index(where) if where in agents else 0 for _, _, where in gaze]
     first = [min(max(round(start * FRAME_HZ), 0), frames - 1) for start, _, _ in gaze]
     for column, begin, (_, end, _) in zip(columns, first, gaze, strict=True):
         target[begin : max(begin, round(end * FRAME_HZ))] = column
@@ -115,61 +104,52 @@ def looks_of(person: MeetingPerson, meeting: MeetingEvidence) -> Looks:
     )
     away = [start for (start, _, _), begin, goes in zip(gaze, first, aside, strict=True)
             if goes and begin and at_speaker[begin - 1]]  # fmt: skip
-    return Looks(np.array([look[:2] for look in gaze], np.float64).reshape(-1, 2), aside, at_speaker, np.array(away))
+    may = steps_of(at_speaker)
+    begins = np.floor(np.array(away) * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
+    onsets = np.unique(begins[(begins > 0) & (begins < len(may))])
+    may[onsets] = True
+    return np.array([look[:2] for look in gaze], np.float64).reshape(-1, 2), aside, Lesson(onsets, may)
 
 
 def minutes(mask: Bools) -> float:
+    """Return the minutes of steps in which a mask is True."""
     return float(mask.sum()) * STEP_S / 60
 
 
-# --- A meeting as one of its people lived it, frame by frame: who spoke, who looked at him, who laughed and nodded
+# --- A meeting from the place of one of its people, frame by frame: who speaks, who looks at them, who laughs and nods
 #
-# What `listeners.events.evidence` makes its numbers of, from annotations where a head has a microphone and a camera.
+# `listeners.events.evidence` makes its numbers of that; annotations take the place of a microphone and a camera.
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeetingEvidence:
-    """N frames of a meeting; the people are the participant, then the others by letter.
+def agents_of(person: MeetingPerson) -> tuple[str, ...]:
+    """Return the letters of the people of a meeting: the participant, then the others by letter."""
+    return (person.agent, *sorted(set(person.words) - {person.agent}))
 
-    Attributes:
-        agents: letters of the P people.
-        scene: Looks are NaN where not annotated. Smiles were not annotated.
-        listening: (N,) others spoke in the last 2 s, the participant is silent and in view.
-        spans_s: (K, 2) of the participant's events, by kind.
+
+def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
+    """Return the scene of the whole time in which a person's head was annotated, by `agents_of`, and listening (N,).
+
+    Looks are NaN where not annotated; smiles were not annotated.
     """
-
-    agents: tuple[str, ...]
-    scene: Scene
-    listening: Bools
-    spans_s: Mapping[str, Doubles]
-
-
-def meeting_evidence(person: MeetingPerson) -> MeetingEvidence:
-    """Of the whole time in which his head was annotated."""
     whole = Stretch(person=person, start_s=0.0, end_s=int(person.until_s * FRAME_HZ) / FRAME_HZ)
-    others = sorted(set(person.words) - {person.agent})
-    speaks = [active(person.words.get(agent, np.zeros((0, 2))), whole) for agent in (person.agent, *others)]
-    looks = np.full((whole.frames, len(others) + 1), np.nan)
-    for column, agent in enumerate(others, start=1):
+    agents = agents_of(person)
+    speaks = [active(person.words.get(agent, np.zeros((0, 2))), whole) for agent in agents]
+    looks = np.full((whole.frames, len(agents)), np.nan)
+    for column, agent in enumerate(agents[1:], start=1):
         if agent in person.gaze_known:
             looks[:, column] = active(spans_by(person.looked_at, agent), whole)
-    own, talk = active(person.talk, whole), active(person.others, whole)
     nods = np.zeros(whole.frames, bool)
     at = np.floor(spans_by(person.others_nods)[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
     nods[at[(at >= 0) & (at < whole.frames)]] = True
     laughs = active(person.others_laughs, whole)
-    return MeetingEvidence(
-        agents=(person.agent, *others),
-        scene=Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros_like(laughs)),
-        listening=listening_mask(talk, FRAME_HZ, own) & ~active(person.unseen, whole),
-        spans_s={
-            "nod": person.nods,
-            "shake": person.shakes,
-            "tilt": person.tilts,
-            "laugh": person.laughs,
-            "mm_hm": person.mm_hms,
-        },
-    )
+    scene = Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros_like(laughs))
+    return scene, listening_in(person, whole)
+
+
+def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
+    """Return (N,): others spoke in the last 2 s, the participant is silent and in view."""
+    others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
+    return listening_mask(others, FRAME_HZ, own) & ~unseen
 
 
 def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:

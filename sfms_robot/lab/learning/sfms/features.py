@@ -12,22 +12,19 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.lab.corpora.clips import Dyad, at_rate
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
     Corpus,
-    Scratch,
     fit_sway,
-    in_space,
     motion_scales,
+    shared_frames,
     some_sound,
     sound_scales,
     windows,
-    without_gaze,
-    without_sway,
 )
+from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.sfms.draw import UNDECIDED
@@ -36,7 +33,6 @@ from sfms_robot.listeners.sfms.predictor import Context, last_keyframes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
-from sfms_robot.signals.control import control_track
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
 LEAST_SPEED = 0.05  # deviations a frame
@@ -88,41 +84,19 @@ def gather(
 def frames_of(
     dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
 ) -> SfmsFrames:
-    """Return the frames of one dyad. Raises ConfigError for a motion space that cannot be converted, and for a listener
-    with events where the dyad has none.
-    """
-    control = np.zeros((len(dyad.listener), 0), np.float32)
-    if settings is not None and settings.events:
-        control = _control(dyad)
-        dyad = without_gaze(dyad)
-    face = in_space(dyad, dyad.speaker, space)
-    known = face.isfinite().all(-1)
+    """Return the frames of one dyad. Raises ConfigError (`corpus.shared_frames`)."""
+    face, known, motion, sway, control = shared_frames(dyad, space, settings)
     sound, phase = _audio_features(dyad, frontend)
-    motion = in_space(dyad, dyad.listener, space)
-    sway = torch.zeros(len(motion), 0)
-    if settings is not None and settings.sway:
-        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
     return SfmsFrames(
         motion=motion,
-        face=torch.where(known[:, None], face, 0.0),
+        face=face,
         face_known=known,
         sound=sound,
         heard=torch.full((len(sound),), bool(sound.any())),
         phase=phase,
-        control=torch.from_numpy(control),
+        control=control,
         sway=sway,
     )
-
-
-def _control(dyad: Dyad) -> Floats:
-    """(N, K). Raises ConfigError where the dyad does not say its events, or not at our rate."""
-    if dyad.events is None:
-        raise ConfigError(
-            f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it"
-        )
-    if dyad.fps != FRAME_HZ:
-        raise ConfigError(f"dyad {dyad.name} has {dyad.fps:g} frames a second; a listener with events takes {FRAME_HZ}")
-    return control_track(dyad.events, 0, len(dyad.listener))
 
 
 def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:

@@ -289,33 +289,6 @@ def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms)
     return {"keyframe_recall": hit / max(1, true), "keyframe_precision": hit / max(1, said)}
 
 
-# --- Losses of both phases, with the paper's equation numbers --------------------------------------------------------
-
-
-def reconstruction(
-    motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor, velocity: float
-) -> Tensor:
-    """L2 + the first part of L2^Q of equation (13), and, beyond the paper, `velocity` times the error of the steps.
-
-    The velocity term keeps movement between coarse codes from having corners. ||z^kf - z^kf^|| is taken in motion
-    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are the codebook's
-    (`Grid.commitment`, `Codebook.commitment`), since only it knows whether anything can move.
-
-    Args:
-        motion, restored, at_keyframes: (B, T, C); the last decoded from each frame's own code.
-        mask: (B, T, G); member: (G, C).
-    """
-    weight = mask.detach() @ member  # (B, T, C)
-    keyframes = ((motion - at_keyframes) ** 2 * weight).sum() / weight.sum().clamp(min=1.0)
-    steps = F.mse_loss(restored.diff(dim=1), motion.diff(dim=1))
-    return F.mse_loss(restored, motion) + keyframes + velocity * steps
-
-
-def masking(relaxed: Tensor, best: Tensor) -> Tensor:
-    """L1^mask of equation (13): relaxed k-hot (B, T, G) against the mask of the best reconstruction drawn."""
-    return (relaxed - best.detach()).abs().sum(1).mean()
-
-
 def next_tokens(
     logits: Sequence[Tensor],
     target: Tensor,

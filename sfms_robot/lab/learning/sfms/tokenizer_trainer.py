@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
@@ -19,7 +20,6 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import first_frames, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
-from sfms_robot.lab.learning.sfms.predictor_trainer import masking, reconstruction
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -161,6 +161,30 @@ def loss_of_steps(
     return beside
 
 
+def reconstruction(
+    motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor, velocity: float
+) -> Tensor:
+    """L2 + the first part of L2^Q of equation (13), and, beyond the paper, `velocity` times the error of the steps.
+
+    The velocity term keeps movement between coarse codes from having corners. ||z^kf - z^kf^|| is taken in motion
+    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are the codebook's
+    (`Grid.commitment`, `Codebook.commitment`), since only it knows whether anything can move.
+
+    Args:
+        motion, restored, at_keyframes: (B, T, C); the last decoded from each frame's own code.
+        mask: (B, T, G); member: (G, C).
+    """
+    weight = mask.detach() @ member  # (B, T, C)
+    keyframes = ((motion - at_keyframes) ** 2 * weight).sum() / weight.sum().clamp(min=1.0)
+    steps = F.mse_loss(restored.diff(dim=1), motion.diff(dim=1))
+    return F.mse_loss(restored, motion) + keyframes + velocity * steps
+
+
+def masking(relaxed: Tensor, best: Tensor) -> Tensor:
+    """L1^mask of equation (13): relaxed k-hot (B, T, G) against the mask of the best reconstruction drawn."""
+    return (relaxed - best.detach()).abs().sum(1).mean()
+
+
 def tokenizer_loss(
     tokenizer: Tokenizer,
     batch: Tensor,
@@ -192,8 +216,7 @@ def learned_loss(
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
-    if not isinstance(tokenizer.score, ScoreNetwork):
-        raise ValueError("this tokenizer does not learn its placement the paper's way")
+    assert isinstance(tokenizer.score, ScoreNetwork)
     scores = tokenizer.score(batch)
     draws = [place_learned(scores, tokenizer.keyframes, temperature, generator) for _ in range(DRAWS)]
     scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
@@ -235,13 +258,11 @@ def window_errors(tokenizer: Tokenizer, motion: Tensor, mask: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def reconstruction_error(
-    model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None, keyframes: Sequence[int] | None = None
-) -> float:
-    """Mean squared error on consecutive windows, in standardised units; another placement may be asked for."""
+def reconstruction_error(model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None) -> float:
+    """Return the mean squared error on consecutive windows, in standardised units, perhaps with another placement."""
     tokenizer = model.tokenizer
     motion = held_out_windows(model, corpus)
-    masks = [tokenizer.place(some, keyframes or tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
+    masks = [tokenizer.place(some, tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
     return float(window_errors(tokenizer, motion, torch.cat(masks)).mean())
 
 
@@ -343,29 +364,9 @@ def teacher(strategy: Strategy) -> Strategy:
     return "exact" if strategy == "learned" else strategy
 
 
-@dataclass(frozen=True)
-class MaskBank:
-    """Masks (W, T, G) bool of the windows at `starts` (W,)."""
-
-    starts: Tensor
-    masks: Tensor
-
-    def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """First frames (B,) and masks (B, T, G) of some windows."""
-        window = torch.randint(len(self.starts), (size,), generator=generator)
-        return self.starts[window], self.masks[window].float()
-
-
 @torch.no_grad()
-def mask_bank(tokenizer: Tokenizer, motion: Tensor, starts: Tensor, most: int = MOST_WINDOWS) -> MaskBank:
-    """Masks of at most `most` of the windows at `starts`, evenly spread."""
-    kept = starts[:: max(1, -(-len(starts) // min(most, MOST_WINDOWS)))]
-    parts = [_masks(tokenizer, windows(motion, some, tokenizer.window)) > 0.5 for some in torch.split(kept, CHUNK)]
-    return MaskBank(kept, torch.cat(parts))
-
-
 def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
-    """(B, T, G)."""
+    """Return the masks (B, T, G) of windows by the teacher's placement."""
     gap = tokenizer.max_gap if tokenizer.strategy == "exact" else None
     return place(batch, tokenizer.keyframes, teacher(tokenizer.strategy), member=tokenizer.member, max_gap=gap)
 
@@ -377,11 +378,13 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
     """
     starts = first_frames(lengths, tokenizer.window)
     if teacher(tokenizer.strategy) == "exact" and len(tokenizer.member) > FEW_GROUPS:
-        bank = mask_bank(tokenizer, motion, starts, drawn)
+        kept = starts[:: max(1, -(-len(starts) // min(drawn, MOST_WINDOWS)))]  # spread evenly
+        parts = torch.split(kept, CHUNK)
+        masks = torch.cat([_masks(tokenizer, windows(motion, some, tokenizer.window)) > 0.5 for some in parts])
 
         def look_up(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-            first, mask = bank.draw(size, generator)
-            return windows(motion, first, tokenizer.window), mask
+            chosen = torch.randint(len(kept), (size,), generator=generator)
+            return windows(motion, kept[chosen], tokenizer.window), masks[chosen].float()
 
         return look_up
 

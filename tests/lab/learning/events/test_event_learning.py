@@ -16,9 +16,9 @@ from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, phrases
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import GROUPS, hazard, inputs, ranked, student, teach
-from sfms_robot.lab.learning.events.labels import lesson, looks_of, meeting_evidence
+from sfms_robot.lab.learning.events.labels import lesson, looks_of, meeting_scene
 from sfms_robot.listeners.events.evidence import AT
-from sfms_robot.listeners.events.model import EventModel, HazardBank, load_tables
+from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, HazardBank, load_tables
 
 NONE = np.zeros((0, 2))
 
@@ -73,11 +73,11 @@ def test_a_lesson_holds_the_onsets_within_listening_and_no_step_inside():
 
 
 def test_evidence_of_a_meeting_is_what_was_said():
-    meeting = meeting_evidence(person())
+    scene, listening = meeting_scene(person())
     share = np.diff(words(0), axis=1).sum() / UNTIL_S
-    assert meeting.scene.speaks[:, 1].mean() == pytest.approx(share, rel=0.03)
-    assert not meeting.scene.speaks[:, 0].any() and np.isnan(meeting.scene.looks).all()
-    assert meeting.listening[meeting.scene.speaks[:, 1]].all()
+    assert scene.speaks[:, 1].mean() == pytest.approx(share, rel=0.03)
+    assert not scene.speaks[:, 0].any() and np.isnan(scene.looks).all()
+    assert listening[scene.speaks[:, 1]].all()
 
 
 def test_who_nods_behind_phrases_is_learned_to_and_a_random_one_is_not():
@@ -114,11 +114,10 @@ def test_nothing_later_is_known_as_a_step_begins():
 def test_a_look_away_is_from_somebody_who_speaks():
     gaze = ((0.0, 50.0, "B"), (50.0, 52.0, "table"), (52.0, 60.0, "slide-screen"), (60.0, 600.0, "B"))
     one = person(gaze=gaze)
-    meeting = meeting_evidence(one)
-    looks = looks_of(one, meeting)
-    assert looks.away_s.tolist() == [50.0]
-    assert looks.aside.tolist()[1:3] == [True, True]
-    assert looks.at_speaker[40 * FRAME_HZ] and not looks.at_speaker[55 * FRAME_HZ]
+    _, aside, looking = looks_of(one, meeting_scene(one)[0])
+    assert looking.onsets.tolist() == [50 * FRAME_HZ // STEP_FRAMES]
+    assert aside.tolist()[1:3] == [True, True]
+    assert looking.may[40 * FRAME_HZ // STEP_FRAMES] and not looking.may[55 * FRAME_HZ // STEP_FRAMES]
 
 
 def test_a_roll_out_nods_while_listening_only_and_more_with_the_knob():
@@ -136,7 +135,7 @@ def test_a_roll_out_nods_while_listening_only_and_more_with_the_knob():
 
 def test_counts_of_a_person_are_his_own():
     one = student(person(answering()), np.random.default_rng(0))
-    found = event_trainer.count(one, event_trainer.people_did(one))
+    found, _ = event_trainer.count(one, event_trainer.people_did(one))
     assert found["nods_per_minute"][0] == len(answering())
     ratio = event_trainer.figures(found)["phrase_end_ratio"]
     assert ratio > 3 or np.isnan(ratio)
