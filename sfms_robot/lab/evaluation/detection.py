@@ -125,12 +125,6 @@ def gaze_rad(motion: Floats) -> Doubles:
     return np.asarray(motion[:, YAW_PITCH] + directions(motion, _EYES_RAD).mean(axis=1), np.float64)
 
 
-def gaze_shifts(motion: Floats) -> list[float]:
-    """Return the seconds at which the gaze of motion (N, 58) moves elsewhere."""
-    gaze = gaze_rad(motion)
-    return find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ)
-
-
 @dataclass(frozen=True)
 class Detected:
     """Events detected in motion of some frames, by kind of `MOTION_EVENTS`: (start_s, end_s, size)."""
@@ -283,8 +277,7 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
     after phrase ends over those later on. still_share: share of seconds in which the head turns less than 0.1 degree.
     speed, acceleration and jerk: 99.9th percentiles of the head's rotation.
     """
-    onsets, listened, sizes = 0, 0.0, []
-    counts = np.zeros(4)
+    onsets, listened, sizes, counts = 0, 0.0, [], np.zeros(4)
     for motion, dyad in zip(motions, dyads, strict=True):
         nods = events.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
         starts = [start for start, _, _ in nods]
@@ -296,13 +289,18 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
             starts, phrase_timing.phrase_ends(spoke, FRAME_HZ), dyad.listening, FRAME_HZ
         )
     minutes = sum(len(motion) / FRAME_HZ / 60 for motion in motions)
+    still = []
+    for motion in motions:
+        if seconds := len(motion) // FRAME_HZ:
+            turns = np.degrees(motion[: seconds * FRAME_HZ, _ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
+            still.append((np.ptp(turns, axis=1).max(axis=1) < _STILL_DEG).mean())
     return {
         "nods": onsets / listened if listened else float("nan"),
         "nod_deg": float(np.degrees(middle(sizes))),
         "phrase_end_ratio": phrase_timing.ratio_of(counts.tolist()),
         "blinks": len(_spans(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
         "smiles": len(_spans(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
-        "still_share": _still_share(motions),
+        "still_share": float(np.mean(still)) if still else float("nan"),
         "speed_deg_s": _fastest(motions, 1),
         "acceleration_deg_s2": _fastest(motions, 2),
         "jerk_deg_s3": _fastest(motions, 3),
@@ -316,16 +314,6 @@ def middle(values: Sequence[float] | Doubles) -> float:
 
 def _spans(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[events.Event]:
     return [event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ)]
-
-
-def _still_share(motions: Sequence[Floats]) -> float:
-    """Return the mean over the motions; NaN when none lasts a second."""
-    shares = []
-    for motion in motions:
-        if seconds := len(motion) // FRAME_HZ:
-            turns = np.degrees(motion[: seconds * FRAME_HZ, _ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
-            shares.append((np.ptp(turns, axis=1).max(axis=1) < _STILL_DEG).mean())
-    return float(np.mean(shares)) if shares else float("nan")
 
 
 def _fastest(motions: Sequence[Floats], order: int) -> float:
@@ -394,7 +382,7 @@ def looks_s(gaze: Doubles) -> list[float]:
 
 def shifts(gaze: Doubles) -> int:
     """Return how often gaze (N, 2) moves by 5 degrees or more within 0.2 s."""
-    return len(phrase_timing.find_gaze_shifts(gaze[:, 0], gaze[:, 1], FRAME_HZ, _SHIFT_RAD))
+    return len(find_gaze_shifts(gaze, FRAME_HZ, _SHIFT_RAD))
 
 
 def sway_db(motions: Sequence[Floats]) -> Doubles:

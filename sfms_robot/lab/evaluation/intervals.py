@@ -44,9 +44,9 @@ def ends(values: Doubles) -> Doubles:
     return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
-def rounded(value: float, digits: int = 4) -> float | None:
+def rounded(value: float) -> float | None:
     """Return a figure as reports have it; None if it is not finite."""
-    return round(float(value), digits) if np.isfinite(value) else None
+    return round(float(value), 4) if np.isfinite(value) else None
 
 
 def finite(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -312,9 +312,9 @@ _SILENT: Final = {
 }
 
 
-def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness | None = None) -> tuple[Doubles, Doubles]:
+def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles, Doubles]:
     """Return the evidence (N, len(HEARD)) of the person in the frames: with the listener's own voice, and without."""
-    scene = scene_in(speaker, (calmness or Calmness()).addressed)
+    scene = scene_in(speaker, calmness.addressed)
     alone = scene.speaks.copy()
     alone[:, 0] = False
     return heard_in(scene), heard_in(replace(scene, speaks=alone))
@@ -336,11 +336,11 @@ def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
 
 
 def decisions(
-    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness | None = None
+    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness
 ) -> list[tuple[ListenerEvent, ...]]:
     """Return the decisions for each seed without a given history, skipping steps at which no event can begin."""
     steps = steps_in(len(heard))
-    most = most_in(model, heard[steps], calmness or Calmness())
+    most = most_in(model, heard[steps], calmness)
     found = []
     for seed in seeds:
         draws = uniforms_of(seed, steps, Use.EVENT, len(EVENT_KINDS))[:, model.draws]

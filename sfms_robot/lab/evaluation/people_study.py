@@ -321,7 +321,7 @@ def append_answers(file: Path, answers: Sequence[Preference]) -> None:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def summary(answers: Sequence[Preference], seed: int = 0) -> dict[str, Any]:
+def summary(answers: Sequence[Preference]) -> dict[str, Any]:
     """Return per question and pair of conditions: counts, share of the first, interval, p; and strengths."""
     conditions = sorted({name for answer in answers for name in (answer.left, answer.right)})
     rows, strengths = [], {}
@@ -329,7 +329,7 @@ def summary(answers: Sequence[Preference], seed: int = 0) -> dict[str, Any]:
         asked = [answer for answer in answers if answer.question == question]
         rows += [_pair(question, first, second, asked) for first, second in combinations(conditions, 2)]
         if len(conditions) > 2 and asked:
-            strengths[question] = _strengths(conditions, asked, seed)
+            strengths[question] = _strengths(conditions, asked)
     chosen = [answer for answer in answers if answer.chosen != NEITHER]
     left = sum(answer.chosen == answer.left for answer in chosen)
     return {
@@ -356,7 +356,7 @@ def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -
     return row
 
 
-def _strengths(conditions: Sequence[str], asked: Sequence[Preference], seed: int) -> dict[str, dict[str, Any]]:
+def _strengths(conditions: Sequence[str], asked: Sequence[Preference]) -> dict[str, dict[str, Any]]:
     people = sorted({answer.participant for answer in asked})
     wins = np.zeros((len(people), len(conditions), len(conditions)))
     for answer in asked:
@@ -366,7 +366,7 @@ def _strengths(conditions: Sequence[str], asked: Sequence[Preference], seed: int
             wins[place, conditions.index(better), conditions.index(worse)] += share
     value, interval = bradley_terry(wins.sum(axis=0)), None
     if len(people) > 1:
-        drawn = draw_people(len(people), seed)
+        drawn = draw_people(len(people), 0)
         interval = ends(np.array([bradley_terry(np.tensordot(counts, wins, axes=1)) for counts in drawn])).T.tolist()
     return {
         name: {"strength": float(value[place]), "interval": interval and interval[place]}

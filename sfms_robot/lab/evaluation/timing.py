@@ -22,9 +22,10 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
-from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_shifts
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_rad
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
+from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.lab.learning.events.labels import listening_in
 from sfms_robot.signals import phase
@@ -170,7 +171,9 @@ def motion_sums(
         "nod_deg_sizes": np.histogram(sizes, _SIZES_DEG)[0].astype(np.float64),
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
-        "gaze_shifts_per_minute": np.array([sum(len(gaze_shifts(motion)) for motion in motions), minutes]),
+        "gaze_shifts_per_minute": np.array(
+            [sum(len(find_gaze_shifts(gaze_rad(motion), FRAME_HZ)) for motion in motions), minutes]
+        ),
     }
 
 

@@ -36,6 +36,9 @@ from sfms_robot.signals.control import control_track
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from sfms_robot.listeners.arig.model import ArigModel
+    from sfms_robot.listeners.sfms.model import SfmsModel
+
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
 GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
@@ -68,9 +71,13 @@ class Corpus(Generic[Frames]):
         firsts[torch.tensor([0, *self.lengths[:-1]]).cumsum(0)] = True
         return firsts.to(getattr(self.frames, fields(self.frames)[0].name).device)
 
+    def by_dyad(self, values: Tensor) -> list[Tensor]:
+        """Split values (N, ...) of all frames into those of each dyad."""
+        return list(torch.split(values, list(self.lengths)))
+
     def steps(self, values: Tensor) -> Tensor:
-        """Differences (N - dyads, C) of values (N, C) from each frame to the next of the same dyad."""
-        return torch.cat([dyad.diff(dim=0) for dyad in torch.split(values, list(self.lengths))])
+        """Return the differences (N - dyads, C) of values (N, C) from each frame to the next of the same dyad."""
+        return torch.cat([dyad.diff(dim=0) for dyad in self.by_dyad(values)])
 
     def starts(self, window: int) -> Tensor:
         """First frames of every window that lies in one dyad."""
@@ -232,22 +239,23 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
     return motion.mean(0), motion.std(0).clamp(min=least, max=most)
 
 
-def some_sound(*tracks: tuple[Tensor, Tensor]) -> Tensor:
-    """Rows (M, ...) of sounds (N, ...) where they are heard (N,), as many as `sound_scales` looks at and as evenly."""
+def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> None:
+    """Set the means and deviations of the sound of tracks: sound (N, ..., A) where it is heard (N,).
+
+    A feature that hardly moves is not amplified. Without any sound the model's stay.
+    """
     at = [heard.nonzero()[:, 0] for _, heard in tracks]
-    step = max(1, sum(map(len, at)) // SOUND_SAMPLE)
-    found, before = [], 0
+    total = sum(map(len, at))
+    if not total:
+        return
+    step, some, before = max(1, total // SOUND_SAMPLE), [], 0
     for (sound, _), index in zip(tracks, at, strict=True):
-        found.append(sound[index[-before % step :: step]])
+        some.append(sound[index[-before % step :: step]])
         before += len(index)
-    return torch.cat(found)
-
-
-def sound_scales(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (A,) of sound features (M, ..., A), M > 0; a feature that hardly moves is not blown up."""
-    some = rows[:: max(1, len(rows) // SOUND_SAMPLE)].float().flatten(0, -2)
-    spread = some.std(0)
-    return some.mean(0), spread.clamp(min=max(LEAST_SOUND_SPREAD, 0.2 * float(spread.median())))
+    rows = torch.cat(some).float().flatten(0, -2)
+    spread = rows.std(0)
+    model.sound_mean.copy_(rows.mean(0))
+    model.sound_std.copy_(spread.clamp(min=max(LEAST_SOUND_SPREAD, 0.2 * float(spread.median()))))
 
 
 def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -358,7 +366,14 @@ def without_sway(
     return fast, sway
 
 
-def fit_sway(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+def fit_sway(model: SfmsModel | ArigModel, slow: Sequence[Tensor], lateral: Sequence[int]) -> None:
+    """Set a model's sway by `sway_of` slow motion (N, S) of people."""
+    mixture, spread = sway_of(slow, lateral)
+    model.sway_mixture.copy_(mixture)
+    model.sway_spread.copy_(spread)
+
+
+def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
     """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
 
     Each person is scaled to the mean size before powers are taken; `spread` holds the sizes. Of a person and the mirror

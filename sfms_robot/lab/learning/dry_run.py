@@ -27,6 +27,7 @@ from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.learning.arig import features as arig
 from sfms_robot.lab.learning.arig.trainer import Student, arig_job
+from sfms_robot.lab.learning.corpus import fit_sound
 from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.sfms import features as sfms
 from sfms_robot.lab.learning.sfms.predictor_trainer import listener_job
@@ -96,7 +97,7 @@ def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[s
     sfms.fit_scales(model, plain, settings.listener.channels)
     yield "tokenizer", tokenizer_job(settings, model, plain, plain, cpu), settings.tokenizer.steps
     heard = sfms.gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
-    sfms.fit_sound_scales(model, heard)
+    fit_sound(model, (heard.frames.sound, heard.frames.heard))
     yield "listener", listener_job(settings, model, heard, heard, cpu), settings.predictor.steps
 
 
@@ -109,22 +110,18 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
         motion, face = (rng.normal(rest, 0.05, (frames, len(rest))).astype(np.float32) for _ in range(2))
         voice, own = (rng.normal(0, 0.05, samples_of(frames, FRAME_HZ)).astype(np.float32) for _ in range(2))
         sizes = {"wav2vec2": 768, "agent_wav2vec2": 768, "mfcc78": 78}
-        made = Dyad(
-            name=f"made up {index}",
-            audio=voice,
-            speaker=face,
-            listener=motion,
-            listening=np.ones(frames, bool),
-            space=name,
-            agent_audio=own,
-        )
-        events = tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS))
         found.append(
-            replace(
-                made,
+            Dyad(
+                name=f"made up {index}",
+                audio=voice,
+                speaker=face,
+                listener=motion,
+                listening=np.ones(frames, bool),
+                space=name,
+                agent_audio=own,
                 features={key: rng.normal(size=(frames, size)).astype(np.float32) for key, size in sizes.items()},
                 states=rng.integers(0, len(STATES), frames).astype(np.int8),
-                events=events,
+                events=tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS)),
                 head_of_gaze_rad=np.zeros((frames, 3), np.float32),
             )
         )

@@ -200,7 +200,7 @@ def _some(dyads: Dataset, window: int, count: int = DYADS) -> list[Dyad]:
     return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
 
 
-def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed: int = 1) -> config.Sfms:
+def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad]) -> config.Sfms:
     """Return `settings` with biases that would have given a roll-out the keyframe rates of the data.
 
     The model is left in evaluation mode.
@@ -208,7 +208,7 @@ def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], seed
     listener = SfmsListener(settings, torch_engine(settings, model.eval()))
     wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
     rolled = [
-        offline_rollout(listener, dyad, range(seed + STREAMS * index, seed + STREAMS * (index + 1)))
+        offline_rollout(listener, dyad, range(1 + STREAMS * index, 1 + STREAMS * (index + 1)))
         for index, dyad in enumerate(dyads)
     ]
     rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in rolled]))

@@ -111,11 +111,6 @@ def test_a_minute_of_nods_is_one_of_listening():
     assert [found[f"{kind}s_per_minute"] for kind in ("nod", "decided_nod", "blink")] == [8.0, 4.0, 4.0]
 
 
-def test_counts_by_lot_scatter_by_their_mean():
-    counts = np.random.default_rng(1).poisson(5, 4000).tolist()
-    assert rates({"nod": counts}, 1.0, 1.0)["nods_variance_over_mean"] == pytest.approx(1, abs=0.1)
-
-
 def test_what_people_do_not_do_is_named():
     row = {"nods_per_minute": 21.0, "blinks_per_minute": 15.0, "smiles_per_minute": 0.0}
     assert outside(row) == ["nods_per_minute", "smiles_per_minute"]

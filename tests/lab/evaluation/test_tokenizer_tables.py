@@ -15,7 +15,6 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora import takes
 from sfms_robot.lab.evaluation import tokenizer_tables
-from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
     TableModel,
     keyframe_bits,
@@ -24,7 +23,7 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     save_tokenizer,
 )
 from sfms_robot.lab.evaluation.table_training import load_history, train
-from sfms_robot.lab.evaluation.tokenizer_tables import Windows, cluster, integrity, restoration_errors, warped
+from sfms_robot.lab.evaluation.tokenizer_tables import Windows, cluster, integrity, restoration_errors
 from sfms_robot.lab.learning.corpus import first_frames
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified
@@ -217,12 +216,6 @@ def kinds(each: int = 5, seed: int = 0) -> np.ndarray:
     return np.stack(out)
 
 
-def test_distances_are_those_of_the_metric():
-    motion = kinds(2)
-    found = warped(motion[:2], motion[2:5])
-    assert found == pytest.approx(np.array([dtw(a, motion[2:5]) for a in motion[:2]]))
-
-
 def test_kinds_are_found():
     _, labels = cluster(kinds(), 3)
     assert [len(set(labels[rows])) for rows in np.split(np.arange(15), 3)] == [1, 1, 1] and len(set(labels)) == 3
@@ -244,7 +237,3 @@ def test_codes_that_pull_kinds_together_are_seen():
         mean + 0.3 * (motion - mean) + rng.normal(0, 0.3, motion.shape), motion, clusters
     )
     assert separation < 0.7 and silhouette < kept - 0.2
-
-
-def test_few_windows_make_few_clusters():
-    assert len(cluster(kinds(2))[0]) == 3

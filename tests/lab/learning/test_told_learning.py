@@ -93,11 +93,6 @@ def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them()
     np.testing.assert_array_equal(without_gaze(one).listener, one.listener)
 
 
-def test_a_head_that_is_not_known_apart_stays():
-    one = replace(dyad(), head_of_gaze_rad=None)
-    np.testing.assert_array_equal(without_gaze(one).listener[:, :6], one.listener[:, :6])
-
-
 def test_gaze_is_taken_out_of_our_motion_alone():
     with pytest.raises(ConfigError, match="dyad a is in deca56: gaze can be taken out of arkit58 alone"):
         without_gaze(replace(dyad(), space="deca56", speaker=np.zeros((500, 56), np.float32),
@@ -119,7 +114,7 @@ def test_motion_and_sway_of_a_dyad_are_its_motion_without_gaze():
     "changes, text",
     [
         ({"events": None}, "expected events of its listener"),
-        ({"fps": 30.0, "audio": None}, "has 30 frames a second"),
+        ({"fps": 30.0, "audio": None}, "dyad a: 30 frames a second"),
     ],
 )
 def test_a_dyad_without_events_at_our_rate_is_refused(changes, text):

@@ -85,13 +85,6 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0
 
 
-def test_training_repeats_bit_for_bit(data, tmp_path):
-    for out in ("one", "two"):
-        tokenizer.train_tokenizer(settings(), data, tmp_path / out)
-    one, two = (tmp_path / out / tokenizer.WEIGHTS for out in ("one", "two"))
-    assert one.read_bytes() == two.read_bytes()
-
-
 def test_more_training_reconstructs_better(data, tmp_path):
     few = settings(tokenizer={"steps": 1, "batch": 8, "learning_rate": 5e-3})
     many = settings(tokenizer={"steps": 120, "batch": 8, "learning_rate": 5e-3})
@@ -218,8 +211,7 @@ def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement
 def test_a_perturbed_history_moves_keyframes_by_one_level_and_nothing_else():
     levels = as_levels([[5, 3]])
     tokens = torch.randint(0, 16, (4, 40, 1))
-    torch.manual_seed(0)
-    moved = listener.perturb(tokens, levels, 1.0)
+    moved = listener.perturb(tokens, levels, 1.0, torch.Generator().manual_seed(0))
     assert torch.equal(moved > 0, tokens > 0)
     key = (tokens > 0)[..., 0]
     before, after = (indices_to_codes((t - 1).clamp(min=0), levels)[key] for t in (tokens, moved))

@@ -217,11 +217,6 @@ def test_beginning_anew_over_an_unfinished_run_is_warned_of(tmp_path, caplog):
     assert not caplog.text
 
 
-def test_no_unfinished_file_is_left_beside_the_checkpoint(tmp_path):
-    fit(toy(checkpoint_every=1), tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["checkpoint-toy.safetensors"]
-
-
 def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
     (tmp_path / "out").write_text("a file")
     with pytest.raises(ConfigError, match="out: cannot be made a folder"):

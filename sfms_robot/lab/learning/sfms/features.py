@@ -20,8 +20,6 @@ from sfms_robot.lab.learning.corpus import (
     fit_sway,
     motion_scales,
     shared_frames,
-    some_sound,
-    sound_scales,
     windows,
 )
 from sfms_robot.lab.learning.job import Scratch
@@ -136,19 +134,7 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
     if model.head:
-        slow = torch.split(corpus.frames.sway, list(corpus.lengths))
-        mixture, sizes = fit_sway(slow, lateral_channels(channels))
-        model.sway_mixture.copy_(mixture)
-        model.sway_spread.copy_(sizes)
-
-
-def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
-    """Set the means and deviations of the sound; without any they stay."""
-    rows = some_sound((corpus.frames.sound, corpus.frames.heard))
-    if len(rows):
-        mean, spread = sound_scales(rows)
-        model.sound_mean.copy_(mean)
-        model.sound_std.copy_(spread)
+        fit_sway(model, corpus.by_dyad(corpus.frames.sway), lateral_channels(channels))
 
 
 def context(

@@ -16,12 +16,11 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import windows
+from sfms_robot.lab.learning.corpus import fit_sound, windows
 from sfms_robot.lab.learning.job import Job, Run
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
     context,
-    fit_sound_scales,
     gather,
     held_tokens,
     keyframe_tokens,
@@ -69,7 +68,7 @@ def train_listener(
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    fit_sound_scales(model, corpus)
+    fit_sound(model, (corpus.frames.sound, corpus.frames.heard))
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
@@ -204,7 +203,7 @@ def augment(
     levels: Tensor | None,
     neutral: Tensor,
     training: config.PredictorTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> Context:
     """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
     b, p = seen.heard.shape
@@ -229,7 +228,7 @@ def augment(
     return replace(seen, heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
-def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
+def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator) -> Tensor:
     """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own.
 
     Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.

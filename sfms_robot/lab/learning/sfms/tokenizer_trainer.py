@@ -190,15 +190,15 @@ def tokenizer_loss(
     batch: Tensor,
     mask: Tensor,
     phase: config.TokenizerTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Loss (13) without its masking term, and the squared error of each window (B,).
+    """Return loss (13) without its masking term, and the squared error of each window (B,).
 
-    With a `generator` a learned codebook takes its own step: it has no gradient.
+    A learned codebook, which has no gradient, takes a step of its own.
     """
     quantizer = tokenizer.quantizer
     latent = quantizer.latent(batch)
-    if generator is not None and isinstance(quantizer.codebook, Codebook):
+    if isinstance(quantizer.codebook, Codebook):
         quantizer.codebook.learn(latent, mask, generator)
     codes = quantizer.codebook.nearest(latent)
     restored = tokenizer.inpaint(codes, mask)
@@ -213,7 +213,7 @@ def learned_loss(
     batch: Tensor,
     temperature: float,
     phase: config.TokenizerTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> Tensor:
     """Loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
     assert isinstance(tokenizer.score, ScoreNetwork)
