@@ -238,14 +238,9 @@ def metrics_(
     json: bool = JSON,
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
-    from sfms_robot.lab.evaluation.motion_metrics import MetricFiles, evaluate_metrics
+    from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 
-    show(
-        evaluate_metrics(
-            MetricFiles(truth=truth, prediction=prediction, speaker=speaker, space=space, frames=frames), seed
-        ),
-        json,
-    )
+    show(evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed), json)
 
 
 @app.command()
@@ -285,7 +280,7 @@ def people(
     from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
-        show(people_study.table(results), json)
+        show(people_study.summary(people_study.read_answers(results)), json)
         return
     study = people_study.prepare(listener, data, voices=voices, seconds=seconds, seed=seed, folder=out)
 

@@ -22,7 +22,7 @@ from sfms_robot.lab.corpora.compose.speaking import sent
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, laugh, lay, mouth_over
 from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.rollout import speaker_frames
-from sfms_robot.lab.learning.events.labels import spans_by
+from sfms_robot.lab.learning.events.event_trainer import spans_by
 from sfms_robot.signals import events
 from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions
@@ -147,8 +147,9 @@ def listener_meeting(
     own, said = own_voice(voices, voice, rng), None
     if own is not None:
         said = sent(lay(_spoken(person.talk, whole), whole.frames, own, rng)[0], rng)
-    alone = _speakers(person, whole) == 1
-    floor = _floor(person, whole, alone)
+    talks = {agent: active(spans_by(person.floor, agent), whole) for agent in {agent for _, _, agent in person.floor}}
+    alone = np.sum([np.zeros(whole.frames, np.int64), *talks.values()], axis=0) == 1
+    floor = _floor(person, talks, alone)
     attention = np.full(whole.frames, np.nan)
     for agent in person.gaze_known:
         theirs = floor == agent
@@ -181,21 +182,14 @@ def _spoken(spans: Doubles, stretch: Stretch) -> Doubles:
     return np.asarray(spoken[spoken[:, 1] > spoken[:, 0]])
 
 
-def _speakers(person: MeetingPerson, stretch: Stretch) -> Ints:
-    """Return (N,) how many of the others speak."""
-    agents = sorted({agent for _, _, agent in person.floor})
-    masks = [active(spans_by(person.floor, agent), stretch) for agent in agents]
-    return np.asarray(np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0), np.int64)
-
-
-def _floor(person: MeetingPerson, stretch: Stretch, alone: Bools) -> NDArray[np.str_]:
+def _floor(person: MeetingPerson, talks: Mapping[str, Bools], alone: Bools) -> NDArray[np.str_]:
     """Return (N,) the only other who speaks, else the last of them who spoke for a second; "" before the first."""
-    floor = np.full(stretch.frames, "", dtype="<U1")
+    floor = np.full(len(alone), "", dtype="<U1")
     taken = sorted((start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S)
     for taken_s, agent in taken:
         floor[int(np.ceil(taken_s * FRAME_HZ)) :] = agent
-    for agent in {agent for _, _, agent in person.floor}:
-        floor[alone & active(spans_by(person.floor, agent), stretch)] = agent
+    for agent, talk in talks.items():
+        floor[alone & talk] = agent
     return floor
 
 

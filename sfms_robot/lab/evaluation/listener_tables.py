@@ -149,18 +149,19 @@ def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
     low = np.where(shapes, 0.0, clips.train.min(axis=(0, 1)))
     high = np.where(shapes, 1.0, clips.train.max(axis=(0, 1)))
     n, t, d = clips.speaker.shape
-    still = {"Median": np.median(clips.train, axis=(0, 1)), "MeanFr": clips.train.mean(axis=(0, 1))}
-    return {
-        "Random": np.random.default_rng(seed).uniform(low, high, (n, samples, t, d)),
-        **{
-            name: np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
-            for name, motion in (("Median", still["Median"]), ("Mime", clips.speaker), ("MeanFr", still["MeanFr"]))
-        },
+    still = {
+        "Median": np.median(clips.train, axis=(0, 1)),
+        "Mime": clips.speaker,
+        "MeanFr": clips.train.mean(axis=(0, 1)),
     }
+    answers = {"Random": np.random.default_rng(seed).uniform(low, high, (n, samples, t, d))}
+    for name, motion in still.items():
+        answers[name] = np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
+    return answers
 
 
 def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
-    """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
+    """Return the score of table 1: means over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
     centres = metrics.centres_of(truth, PARTS[clips.space], CLUSTERS)
@@ -203,7 +204,7 @@ def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
 
 
 def _table_2(clips: Clips, pred: Doubles) -> Score:
-    """FRCorr is the challenge's sum over the samples, with a column for the mean; FRSyn skips constant channels.
+    """Return the score of table 2. FRCorr is the challenge's sum over the samples; FRSyn skips constant channels.
 
     All but FRDvs are means over the clips: the numbers of each clip are computed once for any choice of clips.
     """

@@ -45,10 +45,10 @@ from sfms_robot.lab.learning.events.event_trainer import (
     PHASE,
     Logistic,
     inputs,
+    meeting_scene,
     student,
     teach,
 )
-from sfms_robot.lab.learning.events.labels import meeting_scene
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
@@ -236,13 +236,10 @@ def _by_events(
     return sums | timing.decided_sums(one, streams, own_voice)
 
 
-def _listener(options: TimingOptions) -> Listener | EventModel:
-    return _load(options.listener, options.hop, options.engine)
-
-
 @cache
-def _load(name: str, hop: int | None, engine: EngineName) -> Listener | EventModel:
-    return EventModel.load(Path(name)) if name.endswith(".yaml") else load_at_hop(name, hop, engine)
+def _listener(options: TimingOptions) -> Listener | EventModel:
+    name = options.listener
+    return EventModel.load(Path(name)) if name.endswith(".yaml") else load_at_hop(name, options.hop, options.engine)
 
 
 @cache

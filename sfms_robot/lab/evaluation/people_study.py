@@ -39,6 +39,8 @@ from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
 from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread, tracked
 from sfms_robot.listeners.registry import load_listener, one_thread
+from sfms_robot.viewer.page_process import Address
+from sfms_robot.viewer.study_server import serve_study
 
 QUESTIONS: Final = {
     "person": "Which listens more like a person?",
@@ -161,9 +163,6 @@ def trials(conditions: Sequence[str], voices: int, seed: int, participant: str) 
 
 def serve(study: Study, view: str, ready: Callable[[str, int | None], None]) -> None:
     """Serve the page until interrupted. Calls `ready(url, taken port or None)` once. Raises ConfigError, PortError."""
-    from sfms_robot.viewer.page_process import Address
-    from sfms_robot.viewer.study_server import serve_study
-
     serve_study(study, Address.parsed(view), ready)
 
 
@@ -383,8 +382,3 @@ def bradley_terry(wins: Doubles) -> Doubles:
         strength = won / (met / (strength[:, None] + strength[None, :])).sum(axis=1)
         strength /= np.exp(np.log(strength).mean())
     return np.asarray(np.log(strength))
-
-
-def table(answers: Path) -> dict[str, Any]:
-    """Return the summary of the answers in a CSV file. Raises ConfigError."""
-    return summary(read_answers(answers))

@@ -41,7 +41,7 @@ def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.0
     loud_db = np.percentile(level_db, 97)
     floor_db = ndimage.percentile_filter(level_db, 5, size=max(3, int(8 / frame_s)), mode="nearest")
     threshold_db = np.clip(floor_db + 8, loud_db - 34, loud_db - 16)
-    active = (level_db > threshold_db) & (level_db > QUIET_DB)
+    active: Bools = (level_db > threshold_db) & (level_db > QUIET_DB)
     for start, end in runs(active):
         active[start:end] = end - start > 1  # one frame is no speech
     return active

@@ -10,6 +10,7 @@ A listener that follows events receives the given ones, each `LEAD_FRAMES` befor
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
@@ -26,7 +27,7 @@ from torch import Tensor
 from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.learning.sfms.features import frames_of
@@ -100,19 +101,16 @@ def speaker_frames(
     stays. Without any sound there is no microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
+    said = None if agent_audio is None else np.pad(agent_audio, (0, FRAME_SAMPLES))[FRAME_SAMPLES:]
     shown = np.asarray(np.isfinite(face).all(axis=1))
     frames = []
     for index, row in enumerate(face):
-        time_s = (index + 1) * FRAME_S
-        now, following = (slice(at * FRAME_SAMPLES, (at + 1) * FRAME_SAMPLES) for at in (index, index + 1))
-        said = None if agent_audio is None else agent_audio[following]
-        if said is not None and len(said) < FRAME_SAMPLES:
-            said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
-        seen = FaceFrame.of(time_s, row) if shown[index] else None
+        time_s, now = (index + 1) * FRAME_S, slice(index * FRAME_SAMPLES, (index + 1) * FRAME_SAMPLES)
         looks = None if attention is None else float(attention[index])
-        if looks is not None and seen is None and not np.isnan(looks):
+        if looks is not None and not shown[index] and not math.isnan(looks):
             looks = None
-        frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
+        seen = FaceFrame.of(time_s, row) if shown[index] else None
+        frames.append(SpeakerFrame(time_s, heard[now], seen, None if said is None else said[now], looks))
     return frames
 
 
@@ -161,12 +159,18 @@ def rollout(
 
     `events`: for a listener that follows events.
     """
+    playing: Any = listener  # listeners that follow events take a control, some listeners take all streams together
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
     decided: list[list[ListenerEvent]] = [[] for _ in seeds]
     for index, frame in enumerate(speaker):
-        plans, memories = _step(listener, frame, memories, control_at(listener, events, index))
+        control = control_at(listener, events, index)
+        given = () if control is None else (control,)
+        if hasattr(playing, "step_many"):
+            plans, memories = playing.step_many(frame, memories, *([one] * len(memories) for one in given))
+        else:
+            plans, memories = zip(*(playing.step(frame, memory, *given) for memory in memories), strict=True)
         for row, plan in enumerate(plans):
             if plan is not None:
                 motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
@@ -176,17 +180,6 @@ def rollout(
             if isinstance(how, ArigMemory):
                 states[row, index + 1] = paper_state(how.state)
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
-
-
-def _step(
-    listener: Any, frame: SpeakerFrame, memories: Sequence[Any], control: Floats | None
-) -> tuple[Sequence[Plan | None], Sequence[Any]]:
-    given = () if control is None else (control,)
-    if hasattr(listener, "step_many"):
-        plans, after = listener.step_many(frame, memories, *([one] * len(memories) for one in given))
-        return plans, after
-    stepped = [listener.step(frame, memory, *given) for memory in memories]
-    return [plan for plan, _ in stepped], [memory for _, memory in stepped]
 
 
 def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: int = 1) -> list[Rollout]:

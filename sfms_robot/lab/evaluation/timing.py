@@ -27,7 +27,7 @@ from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, m
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
 from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
-from sfms_robot.lab.learning.events.labels import listening_in
+from sfms_robot.lab.learning.events.event_trainer import listening_in
 from sfms_robot.signals import phase
 from sfms_robot.signals.events import MOTION_EVENTS, Bools
 

@@ -264,12 +264,8 @@ def hazards_in(
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
     spans_s = {kind: event_spans(own, kind) for kind in EVENT_KINDS}
     away = np.array([event.target_rad != AT_PERSON for event in own if event.kind == "gaze_shift"], bool)
-    log_rate = _log_rate(model, calmness)
-    odds = [
-        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done_at(spans_s, at_s, log_rate, away)], 1)))
-        for rows, at_s in zip(_blocks(heard[steps]), _blocks(now_s), strict=True)
-    ]
-    asked_hz = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness))) / STEP_S
+    done = done_at(spans_s, now_s, _log_rate(model, calmness), away)
+    asked_hz = _chances(model, heard[steps], done, calmness) / STEP_S
     may = _may_happen(heard[steps], spans_s, away, now_s)
     hazards_hz = {kind: np.zeros(len(heard)) for kind in EVENT_KINDS}
     for at, kind in enumerate(model.bank.kinds):
@@ -285,17 +281,29 @@ def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
     Over all that the stream may have done before: each term is taken at its greatest knot.
     """
     nothing = np.full((len(heard), len(DONE)), np.nan)
-    odds = [
-        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done], 1)) + _most_by_doing(model, calmness))
-        for rows, done in zip(_blocks(heard), _blocks(nothing), strict=True)
-    ]
-    most = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness) - _MARGIN))
+    most = _chances(model, heard, nothing, calmness, _most_by_doing(model, calmness), _MARGIN)
     listening = _listening(heard)
     for at, kind in enumerate(model.bank.kinds):
         most[:, at] *= calmness.per_minute(kind) != 0
         if kind not in ALWAYS:
             most[~listening, at] = 0.0
-    return np.asarray(most)
+    return most
+
+
+def _chances(
+    model: EventModel,
+    heard: Doubles,
+    done: Doubles,
+    calmness: Calmness,
+    terms: Doubles | float = 0.0,
+    odds: float = 0.0,
+) -> Doubles:
+    """Return the probabilities (M, kinds) of evidence of the others and of own events; `terms` and `odds` are added."""
+    found = []
+    for rows in np.array_split(np.concatenate([heard, done], axis=1), len(heard) // _TOGETHER + 1):
+        log_odds = model.bank.log_odds(model.bank.contributions(rows) + terms)
+        found.append(1 / (1 + np.exp(-log_odds - model.asked_odds(calmness) - odds)))
+    return np.concatenate(found)
 
 
 def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
@@ -312,10 +320,6 @@ def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
 
 def _log_rate(model: EventModel, calmness: Calmness) -> float:
     return math.log(calmness.nod or model.tables.hazards["nod"].per_minute)
-
-
-def _blocks(rows: Doubles) -> list[Doubles]:
-    return np.array_split(rows, len(rows) // _TOGETHER + 1)
 
 
 def event_spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:

@@ -56,7 +56,7 @@ class Corpus(Generic[Frames]):
         frames: tensors (N, ...).
         lengths: frames of each dyad.
         scenes: the kind of conversation each dyad is of.
-        staged: they lie on disk, and only what is cut out of them goes to another device.
+        staged: The frames lie on disk, and only windows of them go to another device.
     """
 
     frames: Frames
@@ -66,7 +66,7 @@ class Corpus(Generic[Frames]):
 
     @cached_property
     def begins(self) -> Tensor:
-        """(N,) bool, the first frame of a dyad."""
+        """Return (N,) bool, True in the first frame of a dyad."""
         firsts = torch.zeros(sum(self.lengths), dtype=torch.bool)
         firsts[torch.tensor([0, *self.lengths[:-1]]).cumsum(0)] = True
         return firsts.to(getattr(self.frames, fields(self.frames)[0].name).device)
@@ -80,21 +80,21 @@ class Corpus(Generic[Frames]):
         return torch.cat([dyad.diff(dim=0) for dyad in self.by_dyad(values)])
 
     def starts(self, window: int) -> Tensor:
-        """First frames of every window that lies in one dyad."""
+        """Return the first frame of every window that lies in one dyad."""
         return first_frames(self.lengths, window)
 
     def starts_by_scene(self, window: int) -> dict[str, Tensor]:
-        """`starts`, those of each scene apart; scenes without any are left out."""
+        """Return `starts` by scene; scenes without any are left out."""
         starts = self.starts(window)
         scene = np.repeat(np.array(self.scenes), self.lengths)[starts.numpy()]
         return {name: starts[torch.from_numpy(scene == name)] for name in dict.fromkeys(scene.tolist())}
 
     def cut(self, starts: Tensor, window: int) -> Frames:
-        """The windows (B, window, ...) at (B,) starts, on their device."""
+        """Return the windows (B, window, ...) at (B,) starts, on the device of the starts."""
         return _each(self.frames, lambda part: windows(part, starts.to(part.device), window).to(starts.device))
 
     def to(self, device: torch.device) -> Corpus[Frames]:
-        """The same frames on another device; staged ones stay where they are."""
+        """Return the same frames on another device; staged ones stay on disk."""
         if self.staged:
             return self
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
@@ -158,7 +158,7 @@ def gather(
 
 
 def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
-    """First frames of the windows that lie in one dyad, dyads of those lengths one after another."""
+    """Return the first frames of the windows that lie in one dyad, dyads of these lengths one after another."""
     firsts, at = [torch.empty(0, dtype=torch.int64)], 0
     for length in lengths:
         firsts.append(torch.arange(at, max(at, at + length - window + 1), hop))
@@ -167,12 +167,12 @@ def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
 
 
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
-    """(N, ...) cut at (B,) starts -> (B, length, ...)."""
+    """Cut values (N, ...) at (B,) starts into (B, length, ...)."""
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
 
 
 def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
-    """Motion (N, D) of a dyad -> (N, C) in the space; rows that are not finite stay so.
+    """Encode motion (N, D) of a dyad in the space, (N, C); rows that are not finite stay so.
 
     Raises ConfigError for a dyad in a space that cannot be turned into the wanted one.
     """
@@ -259,7 +259,7 @@ def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> N
 
 
 def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Least and largest deviation (C,) that a channel is divided by: blendshapes, rotations [rad], places [m]."""
+    """Return the least and largest deviations (C,) to divide by: of blendshapes, rotations [rad], places [m]."""
     bounds = []
     for name in channels:
         if name in BLENDSHAPES:
@@ -357,7 +357,7 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
 def without_sway(
     motion: Tensor, space: MotionSpace, channels: Sequence[str], events: Sequence[ListenerEvent]
 ) -> tuple[Tensor, Tensor]:
-    """Motion (N, C) of a space less the sway of its head, and that sway (N, S), by how far it is off neutral."""
+    """Return motion (N, C) of a space less the sway of its head, and that sway (N, S) relative to neutral."""
     head = head_channels(channels)
     slow = torch.from_numpy(slow_part(motion[:, head].numpy(), events))
     sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
@@ -396,7 +396,7 @@ def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor
 
 
 def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
-    """Powers (K, BANDS, S, S) of people or of their mirror images, whichever are more alike."""
+    """Return powers (K, BANDS, S, S) of people or of their mirror images, whichever are more alike."""
     turned = torch.ones(powers.shape[-1], dtype=powers.dtype)
     turned[list(lateral)] = -1
     mirror = turned[:, None] * turned
@@ -413,9 +413,7 @@ def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
 
 
 def band_powers(track: Tensor) -> Tensor:
-    """Co-spectrum (BANDS, S, S) of a track (N, S): what its channels do together within each of `BANDS_HZ`; what is
-    slower counts in the first.
-    """
+    """Return the co-spectrum (BANDS, S, S) of a track (N, S) by band of `BANDS_HZ`; slower parts count in the first."""
     from scipy import signal
 
     length = min(len(track), LONGEST)

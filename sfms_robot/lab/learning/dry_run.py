@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -67,7 +66,7 @@ ASSUMED: Final = (
 
 
 def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
-    """Figures of every stage, and hours of all their steps.
+    """Return figures of every stage, and hours of all their steps.
 
     Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
     """
@@ -77,7 +76,7 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
 
 
 def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[str, Job, int]]:
-    """Name, job and steps of each stage, on weights as they begin and made-up frames."""
+    """Yield name, job and steps of each stage, on initial weights and made-up frames."""
     cpu = torch.device("cpu")
     torch.manual_seed(settings.seed)
     listener = settings.listener
@@ -102,7 +101,7 @@ def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[s
 
 
 def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
-    """Conversations of noise: what a step costs does not depend on what is in them. `ours`: in arkit58."""
+    """Make conversations of noise: the cost of a step does not depend on the content. `ours`: in arkit58."""
     rng = np.random.default_rng(0)
     name, rest = ("arkit58", np.full(MOTION_DIM, 0.1)) if ours else (space.name, space.neutral)
     found = []
@@ -129,17 +128,16 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
 
 
 def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
-    """One piece of a batch and the update after it, made here; the pieces of a batch are all alike."""
+    """Measure one piece of a batch and the update after it; all pieces of a batch are alike."""
     batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
     samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
     pieces = batch // samples
     piece = replace(job, phase=job.phase.model_copy(update={"batch": samples}))
     job.model.train()
     began_s = time.perf_counter()
-    with TemporaryDirectory() as scratch:
-        gradients = Gradients(piece, ProcessGroup(), 1, Path(scratch))
-        with OperationCount() as count:
-            loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
+    gradients = Gradients(piece, ProcessGroup(), 1, Path())
+    with OperationCount() as count:
+        loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
     with OperationCount() as update:
         for one in job.optimizers:
             one.step()

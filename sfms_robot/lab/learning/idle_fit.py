@@ -97,8 +97,9 @@ def _of_region(region: str) -> NDArray[np.intp]:
 
 
 def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """(KNOTS, C) each: of the listener's windows with what it lacks, and of people's; where eyes look is not the
-    face's, and stays. Neighbours of people's are no further apart than a map may be steep, told from the middle.
+    """Return quantiles (KNOTS, C) of the listener's windows with the motion they lack, and of people's.
+
+    The channels of gaze stay. Neighbours of people's, from the middle on, are no further apart than a map may be steep.
     """
     rng = np.random.default_rng(0)
     rest = np.concatenate(listener).reshape(-1, len(BLENDSHAPES)).astype(np.float64)
@@ -134,7 +135,7 @@ def _leakage() -> Doubles:
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
-    """(IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
+    """Return (IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
     windows = np.concatenate(faces)
     hz = np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ)
     band = np.searchsorted(IDLE_BANDS_HZ, hz, side="right") - 1
@@ -151,7 +152,7 @@ def covariances(faces: Sequence[Floats]) -> Doubles:
 
 
 def _spread(faces: Sequence[Floats]) -> float:
-    """Deviation of the logarithm of how much people move, of those seen for ten seconds and more."""
+    """Return the deviation of the logarithm of how much people move, of those seen for ten seconds or more."""
     sizes = [np.log(windows.std(axis=(0, 1)).mean() + 1e-9) for windows in faces if len(windows) * 2 >= 10]
     return float(np.clip(np.std(sizes), 0, 1)) if len(sizes) > 1 else 0.0
 

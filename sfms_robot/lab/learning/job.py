@@ -66,7 +66,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """Means over all processes. Raises GroupError when one of them is gone."""
+        """Return the means over all processes. Raises GroupError when one of them is gone."""
         if self.size == 1:
             return list(values)
         sums = torch.tensor(values, dtype=torch.float64, device=_device())
@@ -84,12 +84,12 @@ class ProcessGroup:
         return float(found)
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Wait for all processes."""
         self.mean([0.0])
 
     @contextmanager
     def talking(self) -> Iterator[None]:
-        """Where others may be gone: raises GroupError then."""
+        """Run a part that talks to the other processes. Raises GroupError if one of them is gone."""
         try:
             yield
         except RuntimeError as error:  # gloo and NCCL raise this and its children
@@ -101,7 +101,10 @@ class ProcessGroup:
 
 @contextmanager
 def joined(device: torch.device) -> Iterator[ProcessGroup]:
-    """The group that `torchrun` says this process is of, or this process alone. Raises ConfigError, GroupError."""
+    """Join the group that `torchrun` names in the environment; yield it, or this process alone.
+
+    Raises ConfigError, GroupError.
+    """
     size = _number("WORLD_SIZE", 1)
     if size == 1:
         yield ProcessGroup(restarts=_number("TORCHELASTIC_RESTART_COUNT", 0))
@@ -122,7 +125,7 @@ def joined(device: torch.device) -> Iterator[ProcessGroup]:
 
 
 def local_rank() -> int:
-    """Which of the processes on this machine this is: which GPU is its own."""
+    """Return the number of this process among those on its machine, which is that of its GPU."""
     return _number("LOCAL_RANK", 0)
 
 
@@ -232,7 +235,7 @@ class Run:
     scratch: Path | None = None
 
     def staging(self, name: str) -> Scratch | None:
-        """Where frames of this name are staged, if they are."""
+        """Return where frames of this name are staged, if they are."""
         return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
@@ -283,7 +286,7 @@ def progress_bar() -> Iterator[Watch]:
 
 @contextmanager
 def tensorboard(folder: Path) -> Iterator[Watch]:
-    """Curves of loss, held-out loss, gradient norm, learning rate and speed in `folder`/NAME. Raises MissingExtra."""
+    """Write loss, held-out loss, gradient norm, learning rate and speed to `folder`/NAME. Raises MissingExtra."""
     with optional("--tensorboard"):
         from torch.utils.tensorboard import SummaryWriter
     writers: dict[str, SummaryWriter] = {}

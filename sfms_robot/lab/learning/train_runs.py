@@ -118,7 +118,7 @@ def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str
 
 
 def device_of(name: str) -> torch.device:
-    """`cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
+    """Return the device of `cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
     if name not in DEVICES:
         raise ConfigError(f"--device {name!r} is not one of {', '.join(DEVICES)}")
     if name == "cuda" and not torch.cuda.is_available():
@@ -127,7 +127,7 @@ def device_of(name: str) -> torch.device:
 
 
 def train_settings(options: TrainOptions, phase: str = "training") -> config.Training | config.ArigTraining:
-    """The training file with what the command line changes, `phase` being the one whose steps it means."""
+    """Read the training file and apply the options; `phase` is the one whose steps they mean."""
     settings = load_training(options.file)
     raw = settings.model_dump(mode="json")
     if isinstance(settings, config.ArigTraining):

@@ -20,7 +20,6 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -38,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
-    """AdamW with the paper's betas (V-A)."""
+    """Return AdamW with the paper's betas (V-A)."""
     return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
 
 
@@ -123,7 +122,7 @@ def _make_folder(out: Path) -> None:
 
 
 def schedule(step: int, phase: config.Phase) -> float:
-    """Share of the learning rate at `step`: linear warm-up, then cosine to zero (V-A; the warm-up is ours)."""
+    """Return the share of the learning rate at `step`: linear warm-up, cosine to zero (V-A; the warm-up is ours)."""
     warm = min(phase.warm_up_steps, max(1, phase.steps // 10))
     if step < warm:
         return (step + 1) / warm
@@ -131,7 +130,7 @@ def schedule(step: int, phase: config.Phase) -> float:
 
 
 def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
-    """Rates of `step` from those the optimizers were made with; returns the first."""
+    """Set the rates of `step` from those of the new optimizers; return the first."""
     share = schedule(step, job.phase)
     for one, rates in zip(job.optimizers, base, strict=True):
         for group, rate in zip(one.param_groups, rates, strict=True):
@@ -142,7 +141,7 @@ def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
 def make_step(
     gradients: Gradients, step: int, generator: torch.Generator, pressed: bool = False
 ) -> tuple[float, float, bool]:
-    """One update of the weights; returns loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
+    """Update the weights once; return loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
 
     Raises ModelError when loss or norm is not finite, and nothing is updated then; GroupError.
     """
@@ -173,7 +172,7 @@ def _clip(one: torch.optim.Optimizer, norm: float) -> float:
 
 
 def _held_out(job: Job) -> float:
-    """The held-out loss, leaving random states and the model's mode as they were. Raises ModelError if not finite."""
+    """Return the held-out loss; random states and the model's mode stay. Raises ModelError if it is not finite."""
     if job.held_out is None:
         raise ValueError(f"{job.name} has nothing held out")
     job.model.eval()
@@ -220,7 +219,7 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
 
 
 def pieces_of(job: Job, run: Run, file: Path) -> int:
-    """Into how many pieces every batch is cut: as the checkpoint in `file` says on resuming, else as the run asks.
+    """Return into how many pieces every batch is cut: on resuming as in the checkpoint `file`, else as the run sets.
 
     Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
     """
@@ -254,7 +253,7 @@ class Gradients:
         self._loss = loss
 
     def of(self, step: int, generator: torch.Generator) -> float:
-        """The loss of this process' pieces, after its gradients: of all processes, for all. Raises GroupError."""
+        """Return the loss of this process' pieces; set the gradients of all processes. Raises GroupError."""
         if self._pieces == 1:
             return self._piece(step, generator, 1)
         mine = range(self.group.rank, self._pieces, self.group.size)
@@ -306,12 +305,12 @@ Weights = dict[str, Tensor]
 
 
 def checkpoint_file(out: Path, name: str) -> Path:
-    """Where a job of this name keeps its checkpoint."""
+    """Return the checkpoint file of a job of this name."""
     return out / f"checkpoint-{name}.safetensors"
 
 
 def weights_of(job: Job) -> Weights:
-    """A copy of the model's state, on the CPU."""
+    """Return a copy of the model's state, on the CPU."""
     return {name: value.detach().cpu().clone() for name, value in job.model.state_dict().items()}
 
 
@@ -364,7 +363,11 @@ def load_checkpoint(file: Path, job: Job, generator: torch.Generator) -> tuple[P
         _same(file, identity, json.loads(json.dumps(job.identity)))
         job.model.load_state_dict(_under(tensors, "model."))
         for index, one in enumerate(job.optimizers):
-            one.load_state_dict(_optimizer_state(one, _under(tensors, f"optimizer.{index}.")))
+            state: dict[int, Weights] = {}
+            for name, value in _under(tensors, f"optimizer.{index}.").items():
+                parameter, key = name.split(".")
+                state.setdefault(int(parameter), {})[key] = value
+            one.load_state_dict({"state": state, "param_groups": one.state_dict()["param_groups"]})
         generator.set_state(tensors["random.data"])
         torch.set_rng_state(tensors["random.torch"])
         if job.device.type == "cuda" and "random.cuda" in tensors:
@@ -401,16 +404,8 @@ def _under(tensors: Weights, prefix: str) -> Weights:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def _optimizer_state(one: torch.optim.Optimizer, tensors: Weights) -> dict[str, Any]:
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        parameter, key = name.split(".")
-        state.setdefault(int(parameter), {})[key] = value
-    return {"state": state, "param_groups": one.state_dict()["param_groups"]}
-
-
 def _same(file: Path, theirs: object, ours: object) -> None:
-    """Raises ConfigError naming the first key whose value differs."""
+    """Raise ConfigError with the first key whose value differs."""
     then, now = dict(_flat(theirs)), dict(_flat(ours))
     for key in [*now, *then]:
         if then.get(key, "not given") != now.get(key, "not given"):

@@ -20,7 +20,6 @@ from sfms_robot.lab.evaluation.people_study import (
     prepare,
     read_answers,
     summary,
-    table,
     trials,
 )
 
@@ -49,7 +48,7 @@ def test_answers_are_kept_as_they_are_given_and_a_person_goes_on(tmp_path):
     again = Study(tmp_path)  # the program was started anew
     assert again.next(me)["answered"] == 1 and again.next(me)["trial"] != before["trial"]
     assert again.next(again.begin())["answered"] == 0
-    told = table(tmp_path / "answers.csv")
+    told = summary(read_answers(tmp_path / "answers.csv"))
     assert told["answers"] == 4 and told["participants"] == 1 and told["sides"] == {"left": 4, "right": 0}
 
 
@@ -117,7 +116,7 @@ def test_a_file_that_holds_something_else_is_one_line(tmp_path, text, told):
     file = tmp_path / "answers.csv"
     file.write_text(text.replace("{head}", "participant,trial,voice,question,left,right,chosen"))
     with pytest.raises(ConfigError) as caught:
-        table(file)
+        read_answers(file)
     assert str(caught.value).startswith(str(file)) and told in str(caught.value)
 
 

@@ -73,7 +73,7 @@ ArigCorpus = Corpus[LabelledDyad]
 
 
 def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
-    """The set in `data` is listening; data/speaking and data/interaction, where they are, the other two."""
+    """Open the sets of a split by scene: `data` itself is listening, data/speaking and data/interaction the others."""
     found = {"listening": open_dataset(data, split)}
     for scene in ("speaking", "interaction"):
         if any((data / scene).glob(f"{split}/*.npz")):
@@ -90,12 +90,12 @@ def gather(
     settings: config.Arig,
     scratch: Scratch | None = None,
 ) -> ArigCorpus:
-    """`corpus.gather` in one motion space, for a listener of such settings."""
+    """Run `corpus.gather` in one motion space, for a listener of these settings."""
     return dyads.gather(scenes, window, partial(frames_of, space=space, settings=settings), scratch)
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
-    """Windows at (B,) starts as the model takes them."""
+    """Return the windows at (B,) starts as the model takes them."""
     found = corpus.cut(starts, window)
     return replace(found, user_sound=found.user_sound.float(), agent_sound=found.agent_sound.float())
 

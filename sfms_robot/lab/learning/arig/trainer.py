@@ -71,7 +71,7 @@ def train_arig(
 def arig_job(
     settings: config.ArigTraining, student: Student, corpus: ArigCorpus, held_out: ArigCorpus, device: torch.device
 ) -> Job:
-    """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
+    """Return the job of a model whose scales are set; move the model to `device`."""
     phase = settings.training
     starts = corpus.starts_by_scene(phase.window_frames)
     eventful = starts_by_event(corpus, starts, phase.window_frames) if phase.event_windows else {}
@@ -106,7 +106,7 @@ def arig_job(
 
 
 def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
-    """(3,) how likely a window is of each of `SCENES`; those without windows are left out. Raises ConfigError."""
+    """Return the probabilities (3,) of windows of `SCENES`, 0 for those without windows. Raises ConfigError."""
     weights = torch.tensor([getattr(stage, scene) * (scene in starts) for scene in SCENES], dtype=torch.float64)
     if not weights.any():
         wanted = ", ".join(scene for scene in SCENES if getattr(stage, scene))
@@ -115,7 +115,7 @@ def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
 
 
 def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: int) -> dict[str, list[Tensor]]:
-    """By scene, of every kind of event but blinks that there is in it, those of the `starts` whose window has one."""
+    """Return by scene, for every kind of event but blinks in it, those of the `starts` whose window has one."""
     control, found = corpus.frames.control, {}
     if control is None or not control.shape[-1]:
         return {}
@@ -136,7 +136,7 @@ def draw(
     eventful: Mapping[str, Sequence[Tensor]] = MappingProxyType({}),
     share: float = 0.0,
 ) -> Tensor:
-    """(count,) first frames: a scene by its weight, then any of its windows.
+    """Draw first frames (count,): a scene by its weight, then any of its windows.
 
     `share` of them are of one of its `eventful` sets instead, any of these and then any of the set.
     """
@@ -152,7 +152,7 @@ def draw(
 
 @torch.no_grad()
 def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> LossParts:
-    """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
+    """Return the losses, without augmentation, on windows drawn with a fixed seed as the last stage draws them."""
     student.eval()
     generator = torch.Generator().manual_seed(0)
     starts = corpus.starts_by_scene(phase.window_frames)
@@ -237,12 +237,12 @@ def loss_parts(
 
 
 def group_of(channel: str) -> str:
-    """Of `GROUPS`."""
+    """Return the group of `GROUPS` that a channel belongs to."""
     return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
 
 
 def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
-    """(C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
+    """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
     drawn = set(settings.drawn_channels)
     members = Counter(group_of(name) for name in drawn)
     weights = torch.zeros(len(settings.channels))
@@ -255,9 +255,8 @@ def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tenso
 def augment(
     dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
 ) -> tuple[ArigDyad, Tensor]:
-    """Missing modalities, other microphones, and a past that is not quite what it was.
+    """Return windows with missing modalities, other microphones and a noisy past; and the motion (B, N, C) after it.
 
-    Also the motion (B, N, C) that comes after such a past.
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
     everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. A
     head whose past is not told is as it was.
@@ -296,7 +295,7 @@ def augment(
 
 
 def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
-    """(B, N, A) what another microphone would add to logarithms of power; nothing to other features."""
+    """Draw what another microphone would add (B, N, A) to logarithms of power; nothing to other features."""
     off = torch.zeros(b, n, model.sound_width)
     if model.settings.sound != "mel":
         return off
@@ -350,7 +349,7 @@ def _wander(
 
 
 def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
-    """Jumps (B, N, C), each spread evenly over the frames from it on: 1 to `GLIDE`, drawn for each window."""
+    """Spread jumps (B, N, C) evenly over the frames from each on: 1 to `GLIDE`, drawn for each window."""
     b, n = jumps.shape[:2]
     frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator)
     total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame

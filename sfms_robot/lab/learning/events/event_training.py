@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, ndtri
 from scipy.stats import ks_2samp
 
+from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
@@ -22,12 +23,13 @@ from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
 from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
-from sfms_robot.lab.evaluation.meetings import tables
+from sfms_robot.lab.evaluation.meetings import decisions, tables
 from sfms_robot.lab.evaluation.rollout import tracked
-from sfms_robot.lab.evaluation.whole_recordings import event_spans
+from sfms_robot.lab.evaluation.whole_recordings import event_spans, heard_in
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,
+    LEARNED,
     NOD,
     RIDGE,
     STUDY_RIDGE,
@@ -36,7 +38,6 @@ from sfms_robot.lab.learning.events.event_trainer import (
     hazard,
     inputs,
 )
-from sfms_robot.lab.learning.events.labels import LEARNED
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE
 from sfms_robot.listeners.events.model import STEP_S, EventModel, EventTables, Hazard, HazardBank, Shape
 from sfms_robot.signals import event_sizes as sizes
@@ -169,18 +170,20 @@ def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
 
 
 def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
-    """Return the figures of the people's nods, and of nods drawn in their places at each rate of `KNOBS`."""
+    """Return the figures of the people's nods, and of nods decided in their places at each rate of `KNOBS`."""
 
     def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
         counts = [event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)]
         total = added(sums for sums, _ in counts)
         return event_trainer.figures(total), np.concatenate([intervals_s for _, intervals_s in counts])
 
-    figures, theirs_s = counted(map(event_trainer.people_did, judged))
+    figures, theirs_s = counted(event_trainer.begun_in(one.person.nods, one.listening)[:, 0] for one in judged)
     found = {"people": figures}
+    heard = [heard_in(event_trainer.meeting_scene(one.person)[0]) for one in judged]
     for knob in KNOBS:
-        nods = (event_trainer.roll_out(model, one, knob, at + 1000 * seed) for at, one in enumerate(judged))
-        figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in nods)
+        asked = Calmness(nod=knob)
+        decided = (decisions(model, rows, [at + 1000 * seed], asked)[0] for at, rows in enumerate(heard))
+        figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in decided)
         found[f"{knob:g}"] = {**figures, "interval_ks": float(ks_2samp(ours_s, theirs_s).statistic)}
     return {key: {name: rounded(value) for name, value in figures.items()} for key, figures in found.items()}
 
@@ -287,7 +290,7 @@ BLINK_CUES: Final = {"silence_s": {0.0: 0.0, 0.12: 1.0, 0.4: 0.6, 0.8: 0.0}, "sh
 
 
 def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
-    """From recorded seconds between blinks."""
+    """Fit the hazard of blinks on recorded seconds between them."""
     every = np.concatenate([np.asarray(gap, np.float64) for gap in gaps])
     since = [np.arange(1, max(2, round(gap / STEP_S) + 1)) * STEP_S for gap in every.tolist()]
     rows = np.full((sum(map(len, since)), len(EVIDENCE)), np.nan)
@@ -300,7 +303,7 @@ def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
 
 
 def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
-    """`found` in the meetings, brought to how often people look away from one another."""
+    """Return `found` in the meetings, brought to how often people look away from one another."""
     weights = {name: weight for name, weight in found.weights.items() if name not in ("at_person_s", "own_voice_s")}
     more = round(float(np.log(AT_PERSON_S / AT_PERSON_SPEAKING_S)), 3)
     weights["own_voice_s"] = {0.0: more, 0.5: round(more / 2, 3), 1.0: 0.0}
@@ -310,7 +313,7 @@ def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
 
 
 def at_rate(given: Hazard, kind: str, students: Iterable[EventStudent], per_minute: float) -> Hazard:
-    """The same with the intercept that gives so many a minute, in the steps of others in which it may happen."""
+    """Return the hazard with the intercept that gives `per_minute` in the steps in which it may happen."""
     rows = np.concatenate(
         [one.evidence[one.lessons[kind].may & (one.evidence[:, AT["own_voice_s"]] > 1.0)] for one in students
          if kind in one.lessons]

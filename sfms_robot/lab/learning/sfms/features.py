@@ -70,7 +70,7 @@ def gather(
     settings: config.Sfms | None = None,
     scratch: Scratch | None = None,
 ) -> SfmsCorpus:
-    """`corpus.gather` in one motion space.
+    """Run `corpus.gather` in one motion space.
 
     `frontend` extracts features of the sound; None leaves the sound out, which is enough for a tokenizer.
     `settings`: of a listener that may get events; None: one that does not.
@@ -122,7 +122,7 @@ def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor,
 
 
 def _whole(audio: Floats) -> Floats:
-    """Samples up to a whole number of our frames, the last one ending in silence."""
+    """Return the samples, padded with silence to a whole number of our frames."""
     return np.pad(audio, (0, -len(audio) % FRAME_SAMPLES))
 
 
@@ -182,8 +182,10 @@ STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many win
 
 @torch.no_grad()
 def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch,
-    so that busy seconds may borrow from quiet ones of the same stretch.
+    """Place the keyframes (N, G) of all dyads.
+
+    Each dyad is placed as a whole where a keyframe has its cost; else stretch by stretch, so that busy seconds may
+    borrow from quiet ones of the same stretch.
     """
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
     masks = []
@@ -197,7 +199,7 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
 
 
 def _stretches(frames: int, size: int, least: int) -> list[int]:
-    """Lengths that add up to `frames`, none under `least` unless there is only one."""
+    """Return lengths that add up to `frames`, none under `least` unless there is only one."""
     whole, rest = divmod(frames, size)
     sizes = [size] * whole
     if rest and (rest >= least or not sizes):
@@ -209,7 +211,7 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
 
 @torch.no_grad()
 def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
-    """Tokens (N, G) of every listener in the corpus."""
+    """Return the tokens (N, G) of every listener in the corpus."""
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
@@ -223,7 +225,7 @@ def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Of tokens (N, G) of dyads of those lengths: the last keyframe at or before each frame of its dyad, 0 for none."""
+    """Return the last keyframe (N, G) at or before each frame of its dyad, 0 for none, of tokens (N, G) of dyads."""
     return torch.cat([last_keyframes(one[None]).tokens[0, ..., 0] for one in torch.split(tokens, list(lengths))])
 
 
@@ -247,7 +249,7 @@ def without_last_keyframes(
     share: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Tokens (B, T, G) of which a `share` of groups has missed its last keyframes and is put right in frame `first`.
+    """Return tokens (B, T, G): a `share` of groups has missed its last keyframes and is put right in frame `first`.
 
     Args:
         tokens: what was meant; dense: (B, T, G) what each frame's keyframe would be.

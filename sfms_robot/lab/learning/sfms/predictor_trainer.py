@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +81,7 @@ def train_listener(
 def listener_job(
     settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
 ) -> Job:
-    """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
+    """Return the job of phase 2, on a model whose tokenizer is trained; move the model to `device`."""
     phase, listener = settings.predictor, settings.listener
     starts = corpus.starts(listener.window_frames)
     eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
@@ -109,22 +108,20 @@ def listener_job(
         seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
-        return _loss(model, seen, target, settings, generator, partial(missing, chosen, generator))
-
-    def missing(chosen: Tensor, generator: torch.Generator, meant: Tensor, first: Tensor) -> Tensor:
-        if not phase.missed_keyframes:
-            return meant
-        tokenizer, window = model.tokenizer, listener.window_frames
-        return without_last_keyframes(
-            meant,
-            windows(dense, chosen, window),
-            windows(motion, chosen, window),
-            first,
-            tokenizer.member,
-            torch.tensor(tokenizer.costs, device=device),
-            phase.missed_keyframes,
-            generator,
-        )
+        meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
+        count = _drawn(listener, target, generator)
+        if phase.missed_keyframes:
+            meant = without_last_keyframes(
+                meant,
+                windows(dense, chosen, listener.window_frames),
+                windows(motion, chosen, listener.window_frames),
+                listener.past_frames + count[:, 0],
+                model.tokenizer.member,
+                torch.tensor(model.tokenizer.costs, device=device),
+                phase.missed_keyframes,
+                generator,
+            )
+        return _loss(model, seen, meant, count, settings)
 
     return Job(
         name="listener",
@@ -146,14 +143,14 @@ def listener_job(
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
-    """Those of the `starts` in whose future something other than a blink is under way."""
+    """Return those of the `starts` in whose future an event other than a blink is under way."""
     active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
     busy = (corpus.frames.control[:, active] > 0).any(-1)
     return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
 
 
 def corrected(settings: config.Training) -> config.Sfms:
-    """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p, if it is to be."""
+    """Return the listener with the weight of class 0 in (14) taken out of its probability (p' ~ w p), if configured."""
     if not settings.predictor.undo_weight:
         return settings.listener
     bias = -math.log(settings.predictor.transition_weight)
@@ -164,30 +161,26 @@ def corrected(settings: config.Training) -> config.Sfms:
     return settings.listener.model_copy(update={"groups": groups})
 
 
-def _loss(
-    model: SfmsModel,
-    seen: Context,
-    target: Tensor,
-    settings: config.Training,
-    generator: torch.Generator,
-    missing: Callable[[Tensor, Tensor], Tensor] = lambda meant, first: meant,
-) -> Tensor:
-    """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
+def _drawn(listener: config.Sfms, target: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw how many frames (B, 1) of each future (B, H, G) are drawn already when the rest is planned.
 
-    None of them drawn is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left
-    of the one before. A stream of hop 4 plans with 4 of them drawn. `missing`: tokens
-    (B, P + H, G) and the first frame to draw (B,) -> those that are seen and learned instead.
+    None of them is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left of the
+    one before. A stream of hop 4 plans with 4 of them drawn.
     """
-    training, (b, h, _) = settings.predictor, target.shape
-    most = h if settings.listener.hop_frames < h else 1
-    count = torch.randint(most, (b, 1), generator=generator).to(target.device)
+    b, h, _ = target.shape
+    return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator).to(target.device)
+
+
+def _loss(model: SfmsModel, seen: Context, meant: Tensor, count: Tensor, settings: config.Training) -> Tensor:
+    """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames that are drawn already.
+
+    `meant` (B, P + H, G): tokens of the past, in place of those in `seen`, and of the future.
+    """
+    training, h = settings.predictor, settings.listener.future_frames
+    target = meant[:, -h:]
     drawn = torch.arange(h, device=target.device) < count  # (B, H)
-    past = seen.tokens[:, :-h]
-    meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])
-    seen, target = replace(seen, tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
     future = torch.where(drawn[..., None], target, UNDECIDED)
-    seen = replace(seen, tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
-    logits = model.predictor.teacher_forced(seen, target)
+    logits = model.predictor.teacher_forced(replace(seen, tokens=torch.cat([meant[:, :-h], future], dim=1)), target)
     weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
     loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
     if training.dtw_weight:
@@ -205,7 +198,7 @@ def augment(
     training: config.PredictorTraining,
     generator: torch.Generator,
 ) -> Context:
-    """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
+    """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G)."""
     b, p = seen.heard.shape
     device = seen.tokens.device
 
@@ -229,7 +222,7 @@ def augment(
 
 
 def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator) -> Tensor:
-    """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own.
+    """Move a share of the keyframes by one level in one dimension: in a roll-out the past is the model's own.
 
     Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
     """
@@ -249,21 +242,21 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 def held_out_loss(
     model: SfmsModel, corpus: SfmsCorpus, settings: config.Training, tokens: Tensor | None = None
 ) -> float:
-    """The loss without augmentation on windows drawn with a fixed seed; `tokens` (N, G) of the corpus, if at hand."""
+    """Return the loss, not augmented, on windows drawn with a fixed seed; `tokens` (N, G) of the corpus if known."""
     model.eval()
     tokens = tokenise(model, corpus) if tokens is None else tokens
     generator = torch.Generator().manual_seed(0)
-    losses = [
-        float(_loss(model, seen, target, settings, generator))
-        for seen, target in some_windows(model, corpus, tokens, settings.listener, generator)
-    ]
+    losses = []
+    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator):
+        meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
+        losses.append(float(_loss(model, seen, meant, _drawn(settings.listener, target, generator), settings)))
     return sum(losses) / len(losses)
 
 
 def some_windows(
     model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
 ) -> Iterator[tuple[Context, Tensor]]:
-    """Batches of contexts and the tokens (B, H, G) that came next."""
+    """Yield batches of contexts and the tokens (B, H, G) that came next."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
@@ -274,7 +267,7 @@ def some_windows(
 
 @torch.no_grad()
 def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
-    """Recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
+    """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
     All groups and future frames pooled, on windows drawn with a fixed seed.
     """
@@ -295,7 +288,7 @@ def next_tokens(
     transition_weight: float,
     group_weights: Sequence[float],
 ) -> Tensor:
-    """Equation (14): weighted cross-entropy, class 0 weighing `transition_weight` and a keyframe 1; mean over groups.
+    """Return (14): weighted cross-entropy, class 0 weighing `transition_weight` and a keyframe 1; mean over groups.
 
     Args:
         logits: per group (B, H, V_g + 1).
@@ -319,7 +312,7 @@ def next_tokens(
 
 
 def soft_dtw(cost: Tensor, gamma: float) -> Tensor:
-    """Least summed cost of a path through cost (B, T, U), from corner to corner, with soft minima -> (B,).
+    """Return the least summed cost (B,) of a path through cost (B, T, U), from corner to corner, with soft minima.
 
     Steps (1, 0), (0, 1), (1, 1), full window. As `gamma` goes to 0 it becomes DTW; above 0 it lies below it. The paths
     are summed along anti-diagonals, so that the batch and each diagonal go at once.
@@ -337,21 +330,16 @@ def soft_dtw(cost: Tensor, gamma: float) -> Tensor:
         here = cost[:, row, column.clamp(0, columns - 1)]  # (B, T)
         if diagonal:
             three = torch.stack([last[:, 1:], last[:, :-1], before[:, :-1]])  # from the left, above, both
-            here = here + _soft_min(three, gamma)
+            some = three.isfinite().any(0)
+            soft = -gamma * torch.logsumexp(-torch.where(some, three, 0.0) / gamma, dim=0)
+            here = here + torch.where(some, soft, torch.inf)  # with a finite gradient where all three are infinite
         now = torch.where(inside, here, torch.inf)
         before, last = last, torch.cat([far[:, :1], now], dim=1)
     return last[:, rows]
 
 
-def _soft_min(values: Tensor, gamma: float) -> Tensor:
-    """Over the first dimension; infinite where all of them are, without a gradient that is not a number."""
-    some = values.isfinite().any(0)
-    safe = torch.where(some, values, 0.0)
-    return torch.where(some, -gamma * torch.logsumexp(-safe / gamma, dim=0), torch.inf)
-
-
 def keyframe_dtw(expected: Tensor, target: Tensor, gamma: float) -> Tensor:
-    """Mean soft-DTW per frame between keyframe probabilities and indicators (B, H, G), each group a sequence."""
+    """Return the mean soft-DTW per frame of keyframe probabilities and indicators (B, H, G), each group a sequence."""
     p, y = (one.transpose(1, 2).flatten(0, 1) for one in (expected, target))  # (B G, H)
     cost = (p[:, :, None] - y[:, None, :]) ** 2
     return soft_dtw(cost, gamma).mean() / target.shape[1]
