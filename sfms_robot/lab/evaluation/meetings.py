@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, Self
@@ -35,7 +35,7 @@ from sfms_robot.lab.evaluation.listener_meetings import (
 )
 from sfms_robot.lab.evaluation.robustness import voice_folders
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollout, run_in_processes, spread
-from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in
+from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in, unspoken
 from sfms_robot.lab.learning.events.event_trainer import (
     FLOOR,
     GAZE,
@@ -46,6 +46,7 @@ from sfms_robot.lab.learning.events.event_trainer import (
     Logistic,
     inputs,
     meeting_scene,
+    muted,
     student,
     teach,
 )
@@ -312,9 +313,7 @@ _SILENT: Final = {
 def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles, Doubles]:
     """Return the evidence (N, len(HEARD)) of the person in the frames: with the listener's own voice, and without."""
     scene = scene_in(speaker, calmness.addressed)
-    alone = scene.speaks.copy()
-    alone[:, 0] = False
-    return heard_in(scene), heard_in(replace(scene, speaks=alone))
+    return heard_in(scene), heard_in(unspoken(scene))
 
 
 def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
@@ -322,7 +321,8 @@ def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Dou
 
     With the listener's own voice, without it, and without it while the others are a minute off.
     """
-    own, alone = (heard_in(meeting_scene(each)[0]) for each in (person, mute(person)))
+    scene, _ = meeting_scene(person)
+    own, alone = heard_in(scene), heard_in(unspoken(scene))
     at = np.minimum(np.arange(frames), len(own) - 1)
     return own[at], alone[at], np.roll(alone, round(SHIFT_S * FRAME_HZ), axis=0)[at]
 
@@ -365,12 +365,6 @@ def _decided(
     return tuple(found)
 
 
-def mute(person: MeetingPerson) -> MeetingPerson:
-    """Return the person without a word; the time of listening still excludes the person's speech."""
-    words = {agent: spans for agent, spans in person.words.items() if agent != person.agent}
-    return replace(person, words=words)
-
-
 @dataclass(frozen=True)
 class ReferenceHazard:
     """Log-odds of a nod, from two fits: with the person's own speech, and without."""
@@ -381,16 +375,13 @@ class ReferenceHazard:
     @classmethod
     def of(cls, people: Sequence[MeetingPerson]) -> Self:
         """Fit on these people; takes some seconds for a hundred meetings."""
-        rng = np.random.default_rng(0)
-        with_voice = [student(person, rng) for person in people]
-        without = [student(mute(person), rng) for person in people]
-        return cls(teach(with_voice, "nod", NOD), teach(without, "nod", _SILENT))
+        taught = [student(person, np.random.default_rng(0)) for person in people]
+        return cls(teach(taught, "nod", NOD), teach(map(muted, taught), "nod", _SILENT))
 
     def scores(self, person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
         """Return (frames,) each: with the own speech, without it, and without it while the others are a minute off."""
-        rng = np.random.default_rng(0)
-        heard = student(person, rng).evidence
-        alone = student(mute(person), rng).evidence
+        one = student(person, np.random.default_rng(0))
+        heard, alone = one.evidence, muted(one).evidence
         other = alone.copy()
         other[:, : len(HEARD)] = np.roll(alone[:, : len(HEARD)], round(SHIFT_S / STEP_S), axis=0)
         by_step = (

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -135,6 +135,13 @@ def counts_in(scene: Scene) -> Bools:
     waiting[:, MINE] = False
     counts: Bools = others | waiting
     return counts
+
+
+def unspoken(scene: Scene) -> Scene:
+    """Return the scene without one's own voice."""
+    speaks = scene.speaks.copy()
+    speaks[:, MINE] = False
+    return replace(scene, speaks=speaks)
 
 
 def _since(happens: Bools) -> Doubles:

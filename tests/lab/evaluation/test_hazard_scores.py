@@ -9,10 +9,10 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.lab.corpora.compose.ami import read_people
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
-from sfms_robot.lab.evaluation.meetings import annotated, decisions, delayed, mute, sensed
+from sfms_robot.lab.evaluation.meetings import annotated, decisions, delayed, sensed
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.lab.evaluation.whole_recordings import event_spans, hazards_in
-from sfms_robot.lab.learning.events.event_trainer import student
+from sfms_robot.lab.learning.events.event_trainer import muted, student
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
 from sfms_robot.signals.audio import AudioFile
@@ -147,8 +147,9 @@ def test_what_annotators_saw_is_what_hazards_were_taught_on(tmp_path):
     person = read_people(write_tables(tmp_path, until_s=120.0))[0]
     frames = int(person.until_s * FRAME_HZ)
     own, alone, elsewhere = annotated(person, frames)
-    for given, told in ((person, own), (mute(person), alone)):
-        taught = student(given, np.random.default_rng(0)).evidence[1:, : len(HEARD)]  # as steps begin
+    one = student(person, np.random.default_rng(0))
+    for given, told in ((one, own), (muted(one), alone)):
+        taught = given.evidence[1:, : len(HEARD)]  # as steps begin
         assert np.array_equal(told[STEP_FRAMES - 1 :: STEP_FRAMES][: len(taught)], taught, equal_nan=True)
     assert not np.array_equal(own, alone, equal_nan=True)
     assert np.array_equal(elsewhere[SHIFT_FRAMES:], alone[:-SHIFT_FRAMES], equal_nan=True)

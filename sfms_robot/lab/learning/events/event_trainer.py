@@ -13,7 +13,7 @@ which they were possible, given the person's history (AUC, mean over people).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -30,8 +30,8 @@ from sfms_robot.lab.evaluation.phrase_timing import (
     rank_auc,
     ratio_of,
 )
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in, done_at, heard_in
-from sfms_robot.listeners.events.evidence import AT, NUMBERS
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in, done_at, heard_in, unspoken
+from sfms_robot.listeners.events.evidence import AT, HEARD, NUMBERS
 from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S, Hazard
 from sfms_robot.signals.phase import piecewise_linear_basis
 
@@ -107,15 +107,16 @@ class EventStudent:
     """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
+        scene: Of all frames.
         evidence: (M, len(EVIDENCE)) as each step begins.
-        listening, others: (N,) frames in which the person listens, and in which another one speaks.
+        listening: (N,) frames in which the person listens.
         lessons: by kind.
     """
 
     person: MeetingPerson
+    scene: Scene
     evidence: Doubles
     listening: Bools
-    others: Bools
     lessons: Mapping[str, Lesson]
 
 
@@ -130,14 +131,20 @@ def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
         own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
     ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
     rows = np.concatenate([heard_in(scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
+    return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
+
+
+def muted(one: EventStudent) -> EventStudent:
+    """Return the rows without the person's own voice among the evidence."""
+    evidence = one.evidence.copy()
+    evidence[:, : len(HEARD)] = _by_step(heard_in(unspoken(one.scene)))
+    return replace(one, evidence=evidence)
+
+
+def _by_step(rows: Doubles) -> Doubles:
+    """Return what is known of rows (N, E) of frames as each step begins (M, E): before the first, nothing."""
     before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
-    return EventStudent(
-        person=person,
-        evidence=before[: len(rows) // STEP_FRAMES],  # known as each step begins: before the first, nothing
-        listening=listening,
-        others=np.asarray(scene.speaks[:, 1:].any(axis=1)),
-        lessons=lessons,
-    )
+    return before[: len(rows) // STEP_FRAMES]
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
@@ -429,7 +436,9 @@ def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
     ].T
     spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
     masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
-    counts = phrase_end_counts(onsets_s, phrase_ends(one.others, FRAME_HZ), one.listening, FRAME_HZ)
+    counts = phrase_end_counts(
+        onsets_s, phrase_ends(one.scene.speaks[:, 1:].any(axis=1), FRAME_HZ), one.listening, FRAME_HZ
+    )
     rates = {f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()}
     return {**rates, "phrase_end": np.array(counts)}, np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S))
 

@@ -170,7 +170,7 @@ def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
 
 
 def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
-    """Return the figures of the people's nods, and of nods decided in their places at each rate of `KNOBS`."""
+    """Return figures of the people's nods, and of nods alone decided in their places at each rate of `KNOBS`."""
 
     def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
         counts = [event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)]
@@ -179,9 +179,9 @@ def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) ->
 
     figures, theirs_s = counted(event_trainer.begun_in(one.person.nods, one.listening)[:, 0] for one in judged)
     found = {"people": figures}
-    heard = [heard_in(event_trainer.meeting_scene(one.person)[0]) for one in judged]
+    heard = [heard_in(one.scene) for one in judged]
     for knob in KNOBS:
-        asked = Calmness(nod=knob)
+        asked = Calmness.model_validate(dict.fromkeys(EVENT_KINDS, 0.0) | {"nod": knob})
         decided = (decisions(model, rows, [at + 1000 * seed], asked)[0] for at, rows in enumerate(heard))
         figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in decided)
         found[f"{knob:g}"] = {**figures, "interval_ks": float(ks_2samp(ours_s, theirs_s).statistic)}
