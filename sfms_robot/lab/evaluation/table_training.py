@@ -56,9 +56,9 @@ def train_all(
     size: SizeName,
     steps: int | None,
     jobs: int,
-    anew: bool,
+    again: bool,
 ) -> None:
-    """Train tokenizers and keep them in `out`; interrupted ones are resumed, or all trained again with `anew`.
+    """Train tokenizers and keep them in `out`; interrupted ones are resumed, or all trained again with `again`.
 
     `examples` (W, T, 58) are windows of which some get a history.
     """
@@ -68,7 +68,7 @@ def train_all(
     tasks = [
         (
             known[name],
-            Run(resume=not anew and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
+            Run(resume=not again and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
             name,
         )
         for name in names

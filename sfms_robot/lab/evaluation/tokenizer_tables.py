@@ -314,7 +314,7 @@ def evaluate_table(
     wanted = list(dict.fromkeys(name for each in chosen for name in needed(each, models is None)))
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
         examples = Windows.of(recorded[takes.HELD_OUT], _WINDOW_FRAMES).motion
-        train_all(missing, folder, recorded[takes.TRAIN], examples, size=size, steps=steps, jobs=jobs, anew=train)
+        train_all(missing, folder, recorded[takes.TRAIN], examples, size=size, steps=steps, jobs=jobs, again=train)
     loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))
     for name, model in loaded.items():  # errors in different units cannot stand in one table

@@ -19,7 +19,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
 
 Five duties make a resumed run bit-identical on a CPU:
  - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
-   or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
+   or from torch's global one (dropout); never from numpy, the clock or another generator;
  - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
@@ -74,7 +74,7 @@ class ProcessGroup:
             dist.all_reduce(sums)
         return [float(each) / self.size for each in sums]
 
-    def told_by_first(self, find: Callable[[], float]) -> float:
+    def from_first(self, find: Callable[[], float]) -> float:
         """Return what the first process finds; the others wait for it."""
         if self.size == 1:
             return find()
@@ -146,7 +146,7 @@ def _first_line(error: Exception) -> str:
 
 # --- Trainer's side --------------------------------------------------------------------------------------------------
 #
-# A step's batch is cut into pieces, each drawn with a generator of its own; process r of W takes pieces r, r + W, ...
+# A step's batch is cut into pieces, each drawn with its own generator; process r of W takes pieces r, r + W, ...
 # A piece is the same in every process, so the losses of a run do not depend on the number of processes, up to the order
 # of summation. One process with one piece computes what plain training does.
 
@@ -253,7 +253,7 @@ class TrainingOutcome:
     resumed_at: int | None
 
 
-# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. They are told; nothing waits
+# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. Nothing waits for them
 
 Watch = Callable[[Report], None]
 CURVES_EVERY = 10  # steps

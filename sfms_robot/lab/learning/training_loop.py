@@ -77,7 +77,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             every = phase.evaluate_every if job.held_out else 0
             looked = every > 0 and (position.step % every == 0 or position.step == phase.steps)
             if looked:
-                position = _compared(position, group.told_by_first(partial(_held_out, job)))
+                position = _compared(position, group.from_first(partial(_held_out, job)))
                 best = weights_of(job) if position.worse == 0 else best
             impatient = phase.patience is not None and position.worse >= phase.patience
             position = replace(position, finished=impatient or position.step >= phase.steps)

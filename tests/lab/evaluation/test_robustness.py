@@ -89,11 +89,6 @@ def test_what_is_not_an_input_is_not_there():
     assert all(not len(frame.audio) and frame.face is not None for frame in face)
 
 
-def test_attention_flickers():
-    frames = heard_and_seen(SPEAKER, "both", FLICKER, 0.1, np.random.default_rng(1))
-    assert [frame.attention for frame in frames[:4]] == [0, 1, 0, 1]
-
-
 def test_counts_are_of_what_is_seen_and_of_what_was_decided():
     nod = ListenerEvent("nod", 1.0, 0.5, 0.1)
     found = counted(Rollout(np.zeros((2, 500, 58), np.float32), np.zeros((2, 500), np.int8), ((nod, nod), (nod,))))

@@ -82,8 +82,3 @@ def test_learned_vectors_stay_where_they_are_unless_training_moves_them() -> Non
 def test_a_window_that_does_not_halve_three_times_is_refused() -> None:
     with pytest.raises(ConfigError, match="window_frames 20 is not a multiple of 8"):
         grouped(window_frames=20)
-
-
-def test_a_width_that_heads_do_not_divide_is_refused() -> None:
-    with pytest.raises(ConfigError, match="width 18 is not a multiple of twice heads"):
-        dense(width=18)

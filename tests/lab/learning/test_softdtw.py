@@ -26,11 +26,6 @@ def test_with_hard_minima_it_is_the_squared_dtw(rows: int, columns: int, seed: i
     assert float(soft_dtw(cost, 1e-4)) == pytest.approx(dtw(a, b[None])[0] ** 2, abs=5e-3)
 
 
-def test_a_batch_is_its_samples():
-    cost = torch.rand(5, 8, 8, generator=torch.Generator().manual_seed(2))
-    torch.testing.assert_close(soft_dtw(cost, 0.1), torch.cat([soft_dtw(one[None], 0.1) for one in cost]))
-
-
 def test_a_keyframe_one_frame_late_costs_less_than_none_and_more_than_in_time():
     def indicator(*frames: int) -> torch.Tensor:
         out = torch.zeros(1, 8, 1)

@@ -194,7 +194,7 @@ def tokenizer_loss(
 ) -> tuple[Tensor, Tensor]:
     """Return loss (13) without its masking term, and the squared error of each window (B,).
 
-    A learned codebook, which has no gradient, takes a step of its own.
+    A learned codebook has no gradient and is moved here.
     """
     quantizer = tokenizer.quantizer
     latent = quantizer.latent(batch)
