@@ -10,8 +10,7 @@ import torch
 from tiny_arig_training import settings
 
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.job import Run
-from sfms_robot.lab.learning.process_group import joined
+from sfms_robot.lab.learning.job import Run, joined
 
 
 def main() -> None:
@@ -30,7 +29,7 @@ def main() -> None:
         run = Run(
             resume=resume,
             device=torch.device("cpu"),
-            watch=watch,
+            watches=(watch,),
             group=group,
             accumulate=given.get("accumulate"),
             scratch=scratch,

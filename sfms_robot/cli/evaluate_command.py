@@ -64,18 +64,16 @@ def tokenizer(
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
     if table is None:
-        from sfms_robot.lab.evaluation.listener_evaluation import evaluate_tokenizer
+        from sfms_robot.lab.evaluation.listener_tables import evaluate_tokenizer
 
         if data is None:
             raise BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order.value if order else None), json)
         return
-    from sfms_robot.lab.evaluation.tokenizer_tables import TableOptions, evaluate_table
+    from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options = TableOptions(
-        table=table, data=data, models=models, train=train, size=size.value, steps=steps, jobs=jobs, plots=plots
-    )
-    show(interruptible(lambda: evaluate_table(options)), json)
+    options: dict[str, Any] = {"train": train, "size": size.value, "steps": steps, "jobs": jobs, "plots": plots}
+    show(interruptible(lambda: evaluate_table(table, data, models, **options)), json)
 
 
 @app.command("listener")
@@ -100,7 +98,7 @@ def listener_(
     json: bool = JSON,
 ) -> None:
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
-    from sfms_robot.lab.evaluation.listener_evaluation import evaluate_listener
+    from sfms_robot.lab.evaluation.listener_tables import evaluate_listener
 
     of_arig = table is not None and table.value.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
@@ -110,13 +108,12 @@ def listener_(
     if of_arig:
         if order is not None or hop is not None:
             raise BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.lab.evaluation.arig_tables import AblationOptions, arig_table
+        from sfms_robot.lab.evaluation.arig_tables import arig_table
 
-        ablations = AblationOptions(models=models, training=config, steps=steps)
-        found = interruptible(lambda: arig_table(table.value, listener, data, clips, seed, ablations))
-        show(found, json)
+        trained: dict[str, Any] = {"models": models, "training": config, "steps": steps}
+        show(interruptible(lambda: arig_table(table.value, listener, data, clips=clips, seed=seed, **trained)), json)
         return
-    from sfms_robot.lab.evaluation.papers import sfms_table
+    from sfms_robot.lab.evaluation.arig_tables import sfms_table
 
     options: dict[str, Any] = {
         "samples": samples, "limit": clips, "seed": seed, "order": order.value if order else None, "hop": hop,
@@ -141,13 +138,11 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.lab.evaluation.papers import EVERY, PapersOptions, evaluate_papers
+    from sfms_robot.lab.evaluation.arig_tables import EVERY, evaluate_papers
 
-    options = PapersOptions(
-        data=data, models=models, tables=table or EVERY, clips=clips, samples=samples, steps=steps, seed=seed
-    )
+    options: dict[str, Any] = {"clips": clips, "samples": samples, "steps": steps, "seed": seed}
     each = _quiet if json else _print_paper
-    show(interruptible(lambda: evaluate_papers(options, each)), json, _quiet)
+    show(interruptible(lambda: evaluate_papers(data, models, table or EVERY, each, **options)), json, _quiet)
 
 
 @app.command()
@@ -243,14 +238,9 @@ def metrics_(
     json: bool = JSON,
 ) -> None:
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
-    from sfms_robot.lab.evaluation.motion_metrics import MetricFiles, evaluate_metrics
+    from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 
-    show(
-        evaluate_metrics(
-            MetricFiles(truth=truth, prediction=prediction, speaker=speaker, space=space, frames=frames), seed
-        ),
-        json,
-    )
+    show(evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed), json)
 
 
 @app.command()
@@ -290,12 +280,9 @@ def people(
     from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
-        show(people_study.table(results), json)
+        show(people_study.summary(people_study.read_answers(results)), json)
         return
-    options = people_study.StudyOptions(
-        conditions=tuple(listener), data=data, voices=voices, seconds=seconds, seed=seed, folder=out
-    )
-    study = people_study.prepare(options)
+    study = people_study.prepare(listener, data, voices=voices, seconds=seconds, seed=seed, folder=out)
 
     def ask(url: str, taken: int | None) -> None:
         note = "" if taken is None else f" (port {taken} is taken)"

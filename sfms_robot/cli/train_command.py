@@ -97,7 +97,7 @@ def tokenizer(
         resume=resume,
         device=device.value,
         steps=steps,
-        placement=placement.value if placement else None,
+        changes={"placement": placement.value} if placement else {},
         tensorboard=tensorboard,
         order=order.value if order else None,
         overwrite=overwrite,

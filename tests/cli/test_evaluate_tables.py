@@ -7,7 +7,7 @@ import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
-from sfms_robot.lab.evaluation.tokenizer_tables import TableOptions, train_missing
+from sfms_robot.lab.evaluation.tokenizer_tables import missing_in
 from sfms_robot.signals.tracks import Track, write_track
 
 TABLE = ("evaluate", "tokenizer", "--table")
@@ -63,7 +63,7 @@ def test_what_does_not_go_together_is_refused(command_line, words, said):
 def test_an_installed_package_says_how_to_get_the_tokenizers_it_does_not_carry(tmp_path: Path) -> None:
     said = r"2 tokenizers of this table are not there \(a, ...\): add --models DIR, which trains what is missing"
     with pytest.raises(ConfigError, match=said):
-        train_missing(TableOptions(table="4"), ["a", "b"], tmp_path / "tokenizers", {})
+        missing_in(tmp_path / "tokenizers", ["a", "b"], may_train=False)
 
 
 def test_a_folder_without_tracks_is_refused_before_anything_is_trained(tmp_path: Path, command_line) -> None:

@@ -20,8 +20,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.lab.bench.measure import Row, row, times
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.learning.dry_run import jobs_of
-from sfms_robot.lab.learning.job import Job
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
 
 _FILES: Final = ("sfms-small", "arig")

@@ -11,35 +11,37 @@ size, steps and data of the shipped listener, and nothing beyond the paper. Thei
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from sfms_robot import config
-from sfms_robot.config import find, parse_training
+from sfms_robot.config import find, load_training
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE, SHAPES, Doubles
 from sfms_robot.lab.corpora.collection import Order
+from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.interaction import played
 from sfms_robot.lab.evaluation.intervals import Chosen, jackknife, people_of
-from sfms_robot.lab.evaluation.listener_evaluation import spread_clips
+from sfms_robot.lab.evaluation.listener_tables import collect, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
+from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts, tracked
+from sfms_robot.lab.evaluation.tokenizer_tables import TABLES as TOKENIZER_TABLES
+from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table, needed
 from sfms_robot.lab.learning.arig.features import open_scenes
-from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.resume import checkpoint_file
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.lab.learning.train_runs import TrainOptions, run_of, train_listener, train_settings, train_tokenizer
+from sfms_robot.lab.learning.train_runs import TrainOptions, train_listener, train_tokenizer
+from sfms_robot.lab.learning.training_loop import checkpoint_file
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.registry import load_listener
+from sfms_robot.listeners.sfms.stream import SfmsListener
 
 Kind = Literal["sfms", "arig"]
 LABELS: Final = {"sfms": "SFMS, as written", "arig": "ARIG, as written"}
-TABLES: Final = ("arig-1", "arig-2", "arig-4")
+ARIG_TABLES: Final = ("arig-1", "arig-2", "arig-4")
 CLIP_FRAMES: Final = 250
 PARTS: Final[Mapping[str, slice]] = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
@@ -134,29 +136,35 @@ def rows_of(
 # --- listeners that are played --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class AblationOptions:
-    """Where listeners for the tables are kept, and how missing ones are trained.
-
-    `training`: None is the paper as written. `steps`: in place of the file's. `train`: False leaves out the rows of
-    listeners that are missing.
-    """
-
-    models: Path | None = None
-    training: Path | None = None
-    steps: int | None = None
-    train: bool = True
-
-
 def arig_table(
-    name: str, names: Sequence[str], data: Path, clips: int | None, seed: int, ablations: AblationOptions
+    name: str,
+    names: Sequence[str],
+    data: Path,
+    *,
+    clips: int | None,
+    seed: int,
+    models: Path | None,
+    training: Path | None = None,
+    steps: int | None = None,
+    train: bool = True,
 ) -> dict[str, Any]:
     """Return `arig-2`: `names` side by side on the listening set; or `arig-1`, `arig-4`: ablations, on interaction.
 
-    With a folder for models each table includes the paper as written. Raises ConfigError.
+    Args:
+        name: Of `ARIG_TABLES`.
+        names: Listeners, by name or folder.
+        data: Composed dyads.
+        clips: Most dyads.
+        seed: Of the listeners.
+        models: Folder of listeners that only tables need; with it each table includes the paper as written.
+        training: Training file of the ablations; None: the paper as written.
+        steps: Of a training, in place of the file's.
+        train: Train missing ablations; else their rows are left out.
+
+    Raises ConfigError.
     """
-    if name not in TABLES:
-        raise ConfigError(f"--table {name}: is not one of {', '.join(TABLES)}")
+    if name not in ARIG_TABLES:
+        raise ConfigError(f"--table {name}: is not one of {', '.join(ARIG_TABLES)}")
     scenes = open_scenes(data, "validation")
     number = int(name.removeprefix("arig-"))
     scene = "listening" if number == 2 else "interaction"
@@ -166,13 +174,22 @@ def arig_table(
     if not held_out:
         raise ConfigError(f"{data}: no validation dyad is as long as a clip of {CLIP_FRAMES} frames")
     folders = {one: find("listeners", one, "config.yaml") for one in names}
-    if number != 2 and ablations.train:
-        folders = _ablated(number, data, ablations) | folders
-    elif ablations.models is not None:
-        folders |= as_written("arig", data, ablations.models, ablations.steps)
+    if number != 2 and train:
+        if models is None:
+            raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
+        unchanged = "arig-as-written" if training is None else "arig"
+        folders = {
+            label: trained(
+                "arig", models / (label.replace("/", "").replace(" ", "-").lower() if changes else unchanged), data,
+                file=training, steps=steps, changes=changes,
+            )
+            for label, changes in {"ARIG": {}, **ABLATIONS[number]}.items()
+        } | folders  # fmt: skip
+    elif models is not None:
+        folders[LABELS["arig"]] = trained("arig", models / "arig-as-written", data, steps=steps)
     answers = {}
     for label, folder in folders.items():
-        rolled = played(label, load_listener(folder), {scene: held_out}, seed, CLIP_FRAMES)[scene]
+        rolled = rollouts(load_listener(folder), tracked(held_out, label), seed, CLIP_FRAMES)
         answers[label] = cut([one.motion[0] for one in rolled], CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], CLIP_FRAMES)
@@ -180,55 +197,137 @@ def arig_table(
     return {"table": name, "clips": len(truth), "frames": CLIP_FRAMES, "rows": rows}
 
 
-def _ablated(number: int, data: Path, options: AblationOptions) -> dict[str, Path]:
-    """Return the folders of the full model and the table's ablations; missing ones are trained in the same way."""
-    if options.models is None:
-        raise ConfigError(f"--table arig-{number}: needs --models DIR, where its listeners are trained and kept")
-    file = options.training or training_file("arig")
-    base = train_settings(TrainOptions(file=file, data=data, out=options.models, steps=options.steps))
-    if not isinstance(base, config.ArigTraining):
-        raise ConfigError(f"{file}: listener.kind is not arig")
-    folders = {}
-    variants: dict[str, Mapping[str, Any]] = {"ARIG": {}, **ABLATIONS[number]}
-    for label, changes in variants.items():
-        unchanged = "arig-as-written" if options.training is None else "arig"
-        out = options.models / (label.replace("/", "").replace(" ", "-").lower() if changes else unchanged)
-        folders[label] = out
-        if not (out / checkpoint.WEIGHTS).is_file():
-            raw = base.model_dump(mode="json")
-            raw["listener"] |= changes
-            settings = parse_training(raw, file)
-            assert isinstance(settings, config.ArigTraining)
-            begun = checkpoint_file(out, "arig").is_file()
-            with run_of(TrainOptions(file=file, data=data, out=out, resume=begun, tensorboard=False)) as run:
-                train_arig(settings, data, out, run)
-    return folders
-
-
 def training_file(kind: Kind) -> Path:
     """Return the file with the training of a paper's listener as written."""
     return data_dir("configs") / "training" / f"{kind}-as-written.yaml"
 
 
-def as_written(
-    kind: Kind, data: Path, models: Path, steps: int | None = None, order: Order | None = None
-) -> dict[str, Path]:
-    """Return the label and folder in `models` of a paper's listener, trained on `data` if missing.
+def trained(
+    kind: Kind,
+    out: Path,
+    data: Path,
+    *,
+    file: Path | None = None,
+    steps: int | None = None,
+    order: Order | None = None,
+    changes: Mapping[str, Any] = MappingProxyType({}),
+) -> Path:
+    """Return `out`, a folder with a listener of a paper, which is trained on `data` if it is missing.
 
-    Training takes half an hour or more of one core; an interrupted one is resumed. `steps`: of every phase, in place of
-    the file's. Raises ConfigError.
+    Training takes half an hour or more of one core; an interrupted one is resumed. `file`: of the training; None: as
+    written. `steps`: of every phase, in place of the file's. `changes`: of the listener. Raises ConfigError.
     """
-    out = models / f"{kind}-as-written"
+    file = file or training_file(kind)
+    if load_training(file).listener.kind != kind:
+        raise ConfigError(f"{file}: listener.kind is not {kind}")
 
     def options(job: str) -> TrainOptions:
         begun = checkpoint_file(out, job).is_file()
         return TrainOptions(
-            file=training_file(kind), data=data, out=out, resume=begun, steps=steps, tensorboard=False,
-            order=order if kind == "sfms" else None,
-        )  # fmt: skip
+            file=file, data=data, out=out, resume=begun, steps=steps, tensorboard=False, order=order, changes=changes
+        )
 
     if not (out / checkpoint.WEIGHTS).is_file():
         if kind == "sfms" and not (out / TOKENIZER_WEIGHTS).is_file():
             train_tokenizer(options("tokenizer"))
         train_listener(options("listener" if kind == "sfms" else "arig"))
-    return {LABELS[kind]: out}
+    return out
+
+
+# --- evaluate papers -------------------------------------------------------------------------------------------------
+
+_SFMS, _ARIG = "sfms-small", "arig-small"
+_TRAIN_DYADS: Final = 200  # from which the heuristics take their means
+_SFMS_TABLES: Final = ("1", "2")
+EVERY: Final = (*_SFMS_TABLES, *TOKENIZER_TABLES, *ARIG_TABLES)
+
+
+def evaluate_papers(
+    data: Path,
+    models: Path | None,
+    tables: Sequence[str],
+    each: Callable[[str, dict[str, Any]], None],
+    *,
+    clips: int | None,
+    samples: int,
+    steps: int | None,
+    seed: int,
+) -> dict[str, Any]:
+    """Return every table; call `each(name, table)` as soon as one is done.
+
+    Blocks for minutes; for hours if listeners have to be trained. An interrupted training is resumed.
+
+    Args:
+        data: Composed dyads, with speaking/ and interaction/.
+        models: Folder of listeners and tokenizers for tables alone, trained if missing; None: their rows are left out,
+            and `not_trained` of a table lists how to make them.
+        tables: Of `EVERY`.
+        each: Called with every table.
+        clips: Most dyads for a table.
+        samples: Answers to every clip of tables 1 and 2.
+        steps: Of every training, in place of its file's.
+        seed: Of the listeners.
+
+    Raises ConfigError.
+    """
+    unknown = [name for name in tables if name not in EVERY]
+    if unknown:
+        raise ConfigError(f"--table {unknown[0]}: is not one of {', '.join(EVERY)}")
+    found: dict[str, dict[str, Any]] = {}
+    for name in tables:
+        if name in TOKENIZER_TABLES:
+            found[name] = evaluate_table(name, models=None if models is None else models / "tokenizers", steps=steps)
+        elif name in _SFMS_TABLES:
+            found[name] = sfms_table(
+                int(name), [_SFMS], data, samples=samples, limit=clips, seed=seed, models=models, steps=steps
+            )
+        else:
+            names, train = [_ARIG, _SFMS] if name == "arig-2" else [_ARIG], models is not None
+            found[name] = arig_table(name, names, data, clips=clips, seed=seed, models=models, steps=steps, train=train)
+        if models is None:
+            found[name]["not_trained"] = _not_trained(name)
+        each(name, found[name])
+    return {"tables": found}
+
+
+def sfms_table(
+    number: int,
+    names: Sequence[str],
+    data: Path,
+    *,
+    samples: int,
+    limit: int | None,
+    seed: int,
+    order: Order | None = None,
+    hop: int | None = None,
+    models: Path | None = None,
+    steps: int | None = None,
+) -> dict[str, Any]:
+    """Return table 1 or 2 of SFMS for listeners by name; with a folder `models` also for the paper as written."""
+    listeners = {name: load_at_hop(name, hop, "auto") for name in names}
+    if models is not None:
+        written = trained("sfms", models / "sfms-as-written", data, steps=steps, order=order)
+        listeners[LABELS["sfms"]] = load_at_hop(str(written))
+    space = shared_space(listeners)
+    features = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
+    train, held_out = (
+        spread_clips(open_for(space.name, data, split, order, features), most)
+        for split, most in (("train", _TRAIN_DYADS), ("validation", limit))
+    )
+    found, given = collect(number, listeners, space, train, held_out, range(seed, seed + samples))
+    return table(number, found, given, samples, seed)
+
+
+def _not_trained(name: str) -> dict[str, str]:
+    """Return the missing rows of a table, and what makes them."""
+
+    def file(kind: Kind) -> str:
+        return "/".join(training_file(kind).parts[-3:])
+
+    if name in TOKENIZER_TABLES:
+        lacking = set(needed(name)) - set(needed(name, shipped=True))
+        return {row: f"evaluate tokenizer --table {name} --models DIR, minutes each" for row in sorted(lacking)}
+    if name in _SFMS_TABLES:
+        return {LABELS["sfms"]: f"train tokenizer, then train listener, --config {file('sfms')}"}
+    rows = [LABELS["arig"]] if name == "arig-2" else ["ARIG", *ABLATIONS[int(name.removeprefix("arig-"))]]
+    return {row: f"train listener --config {file('arig')}" for row in rows}

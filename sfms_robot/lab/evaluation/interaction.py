@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,16 +13,15 @@ from sfms_robot import config
 from sfms_robot.config import find
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Floats
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
-from sfms_robot.lab.evaluation.listener_evaluation import bar, spread_clips
+from sfms_robot.lab.evaluation.listener_tables import spread_clips
 from sfms_robot.lab.evaluation.phrase_timing import near
-from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
+from sfms_robot.lab.evaluation.rollout import Rollout, rollouts, tracked
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener
-from sfms_robot.ports import Listener
 
 _LAGS: Final = 12  # frames in both directions in which the jaw is searched
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
@@ -42,7 +41,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this command evaluates listeners of kind arig")
     held_out = {scene: spread_clips(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}
-    rolled = played(name, listener, held_out, seed)
+    rolled = {scene: rollouts(listener, tracked(dyads, f"{name}, {scene}"), seed) for scene, dyads in held_out.items()}
     every = [one for scene in held_out for one in rolled[scene]]
     dyads = [dyad for each in held_out.values() for dyad in each]
     motions, people = [one.motion[0] for one in every], [dyad.listener for dyad in dyads]
@@ -61,14 +60,6 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
         "jaw_left_a_second_after_speech": listening_again(motions, dyads),
         "people_jaw_left_a_second_after_speech": listening_again(people, dyads),
     }
-
-
-def played(
-    name: str, listener: Listener, held_out: Mapping[str, Sequence[Dyad]], seed: int, clip_frames: int = 1
-) -> dict[str, list[Rollout]]:
-    """Play a listener through the dyads of each scene, with a progress bar."""
-    with bar(name, sum(map(len, held_out.values()))) as advance:
-        return {scene: rollouts(listener, dyads, seed, advance, clip_frames) for scene, dyads in held_out.items()}
 
 
 # --- states ---------------------------------------------------------------------------------------------------------
@@ -90,38 +81,30 @@ def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
     }
     found: dict[str, Any] = {}
     for name, table in tables.items():
-        found |= {f"{name}_accuracy": accuracy(table), f"{name}_balanced_accuracy": balanced_accuracy(table)}
+        found[f"{name}_accuracy"], found[f"{name}_balanced_accuracy"] = accuracies(table)
     return {**found, "confusion": {"states": list(STATES), "label_by_answer": tables["state"].tolist()}}
 
 
 def _by_rule(voices: Bools, data: Path, clips: int | None) -> dict[str, States]:
-    """Return the answers of the most frequent state and of the best voice rule of training for voices (N, 2)."""
+    """Return the answers of the most frequent state and of the best voice rule of training for voices (N, 2).
+
+    The best that voice activity alone can do is the most frequent state of each pattern of speech, agent x user.
+    """
     learned = [
-        dyad
+        (voice_tracks(dyad), dyad.states)
         for each in open_scenes(data, "train").values()
         for dyad in spread_clips(each, clips)
         if dyad.states is not None
     ]
-    states = np.concatenate([np.zeros(0, np.int8), *(dyad.states for dyad in learned if dyad.states is not None)])
-    if not (states >= 0).any():
+    states = np.concatenate([np.zeros(0, np.int8), *(states for _, states in learned)])
+    if not (known := states >= 0).any():
         return {}
-    majority = np.full(len(voices), np.bincount(states[states >= 0]).argmax(), np.int8)
-    rule = voice_rule(np.concatenate([voice_tracks(dyad) for dyad in learned]), states)
-    return {"majority": majority, "voice_rule": rule[voices[:, 0].astype(int), voices[:, 1].astype(int)]}
-
-
-def voice_rule(voiced: Bools, states: States) -> States:
-    """Return the most frequent state (2, 2) of each pattern of speech (N, 2), agent x user; unlabelled frames drop out.
-
-    This is the best that voice activity alone can do.
-    """
-    best = np.full((2, 2), STATE["waiting"], np.int8)
-    for agent in (0, 1):
-        for user in (0, 1):
-            seen = states[(voiced[:, 0] == agent) & (voiced[:, 1] == user) & (states >= 0)]
-            if len(seen):
-                best[agent, user] = np.bincount(seen, minlength=len(STATES)).argmax()
-    return best
+    heard = np.concatenate([voices for voices, _ in learned])
+    counts = np.zeros((2, 2, len(STATES)), np.int64)
+    np.add.at(counts, (*heard[known].astype(int).T, states[known]), 1)
+    rule = np.where(counts.any(axis=-1), counts.argmax(axis=-1), STATE["waiting"]).astype(np.int8)
+    majority = np.full(len(voices), counts.sum(axis=(0, 1)).argmax(), np.int8)
+    return {"majority": majority, "voice_rule": rule[tuple(voices.astype(int).T)]}
 
 
 def voice_tracks(dyad: Dyad) -> Bools:
@@ -141,58 +124,56 @@ def confusion(said: States, states: States) -> NDArray[np.int64]:
     return out
 
 
-def accuracy(table: NDArray[np.int64]) -> float:
-    """Return the share on the diagonal; NaN of an empty table."""
-    total = table.sum()
-    return float(np.trace(table) / total) if total else float("nan")
+def accuracies(table: NDArray[np.int64]) -> tuple[float, float]:
+    """Return the share on the diagonal, and the mean over the states that occur of the share found; NaN without any.
 
-
-def balanced_accuracy(table: NDArray[np.int64]) -> float:
-    """Return the mean, over the states that occur, of the share found; a constant answer gets 1 over their number."""
-    of = table.sum(axis=1)
-    return float((np.diag(table)[of > 0] / of[of > 0]).mean()) if of.any() else float("nan")
+    By the second a constant answer gets 1 over the number of states.
+    """
+    of, found = table.sum(axis=1), np.diag(table)
+    if not of.any():
+        return float("nan"), float("nan")
+    return float(found.sum() / of.sum()), float((found[of > 0] / of[of > 0]).mean())
 
 
 # --- lips and smoothness --------------------------------------------------------------------------------------------
 
 
-def jaw_tracking(made: Sequence[Floats], recorded: Sequence[Floats], lags: int = _LAGS) -> dict[str, float]:
-    """Return how the jaw of motions (N, 58) follows the recorded ones; pairs of 2 `lags` frames or fewer drop out.
+def jaw_tracking(made: Sequence[Floats], recorded: Sequence[Floats]) -> dict[str, float]:
+    """Return how the jaw of motions (N, 58) follows the recorded ones; pairs of 24 frames or fewer drop out.
 
     correlation at lag 0, over all clips, each less its mean; the lag (positive: late) with the highest correlation, and
     that; and the deviation of the jaw over that of the recorded one.
     """
-    long = [(a[:, _JAW], b[:, _JAW]) for a, b in zip(made, recorded, strict=True) if len(a) > 2 * lags]
-    found = {0: 0.0}
-    spread = 0.0
+    long = [(a[:, _JAW], b[:, _JAW]) for a, b in zip(made, recorded, strict=True) if len(a) > 2 * _LAGS]
+
+    def at_lag(lag: int) -> tuple[Doubles, Doubles]:
+        """Return both tracks, all clips one after the other, ours `lag` frames later."""
+        parts = [(one[max(0, lag) : len(one) + min(0, lag)], other[max(0, -lag) : len(other) - max(0, lag)])
+                 for one, other in long]  # fmt: skip
+        ours, theirs = (np.concatenate([one - one.mean() for one in each]) for each in zip(*parts, strict=True))
+        return ours.astype(np.float64), theirs.astype(np.float64)
+
+    found, spread = {0: 0.0}, 0.0
     if long:
-        found = {lag: _pooled(long, lag) for lag in range(-lags, lags + 1)}
-        ours, theirs = (np.concatenate([one - one.mean() for one in each]).std() for each in zip(*long, strict=True))
-        spread = float(ours / max(theirs, _STILL))
+        for lag in range(-_LAGS, _LAGS + 1):
+            x, y = at_lag(lag)
+            found[lag] = float(np.corrcoef(x, y)[0, 1]) if min(x.std(), y.std()) >= _STILL else 0.0
+        ours, theirs = at_lag(0)
+        spread = float(ours.std() / max(theirs.std(), _STILL))
     best = max(found, key=lambda lag: (found[lag], -abs(lag)))
     return {"correlation": found[0], "lag_frames": best, "correlation_at_lag": found[best], "jaw_spread": spread}
 
 
-def _pooled(pairs: Sequence[tuple[Floats, Floats]], lag: int) -> float:
-    ours, theirs = [], []
-    for one, other in pairs:
-        a, b = one[max(0, lag) : len(one) + min(0, lag)], other[max(0, -lag) : len(other) - max(0, lag)]
-        ours.append(a - a.mean())
-        theirs.append(b - b.mean())
-    x, y = np.concatenate(ours).astype(float), np.concatenate(theirs).astype(float)
-    return float(np.corrcoef(x, y)[0, 1]) if min(x.std(), y.std()) >= _STILL else 0.0
-
-
-def border_ratio(motions: Sequence[Floats], period: int, first: int = 1, skip: int = 25) -> float:
+def border_ratio(motions: Sequence[Floats], period: int) -> float:
     """Return the mean acceleration of the head's rotation at chunk borders over that elsewhere.
 
-    Frame t of a motion (N, 58) was made in chunk (t - first) // period; an acceleration is at a border when its three
-    frames are of different chunks. The first `skip` frames, in which a stream settles, do not count.
+    Frame t of a motion (N, 58) was made in chunk (t - 1) // period; an acceleration is at a border when its three
+    frames are of different chunks. The first second, in which a stream settles, does not count.
     """
     at, away = [], []
     for motion in motions:
-        size = np.linalg.norm(np.diff(motion[skip:, :3].astype(float), 2, axis=0), axis=1) / FRAME_S**2
-        frame = np.arange(skip, len(motion) - 2) - first  # the earliest of the three
+        size = np.linalg.norm(np.diff(motion[FRAME_HZ:, :3].astype(float), 2, axis=0), axis=1) / FRAME_S**2
+        frame = np.arange(FRAME_HZ, len(motion) - 2) - 1  # the earliest of the three
         across = frame // period != (frame + 2) // period
         at.append(size[across])
         away.append(size[~across])

@@ -44,6 +44,16 @@ def ends(values: Doubles) -> Doubles:
     return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
+def rounded(value: float) -> float | None:
+    """Return a figure as reports have it; None if it is not finite."""
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
+def finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row for JSON: None in place of numbers that are not finite."""
+    return {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()}
+
+
 def draw_people(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
     """Draw sets of `count` people with replacement; return how often each is in each set (draws, count)."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), draws)

@@ -22,6 +22,7 @@ from sfms_robot.lab.corpora.compose.speaking import sent
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, laugh, lay, mouth_over
 from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.rollout import speaker_frames
+from sfms_robot.lab.learning.events.event_trainer import spans_by
 from sfms_robot.signals import events
 from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions
@@ -146,15 +147,16 @@ def listener_meeting(
     own, said = own_voice(voices, voice, rng), None
     if own is not None:
         said = sent(lay(_spoken(person.talk, whole), whole.frames, own, rng)[0], rng)
-    alone = _speakers(person, whole) == 1
-    floor = _floor(person, whole, alone)
+    talks = {agent: active(spans_by(person.floor, agent), whole) for agent in {agent for _, _, agent in person.floor}}
+    alone = np.sum([np.zeros(whole.frames, np.int64), *talks.values()], axis=0) == 1
+    floor = _floor(person, talks, alone)
     attention = np.full(whole.frames, np.nan)
     for agent in person.gaze_known:
         theirs = floor == agent
-        attention[theirs] = active(_spans(person.looked_at, agent), whole)[theirs]
+        attention[theirs] = active(spans_by(person.looked_at, agent), whole)[theirs]
     speech, mouth = lay(_spoken(person.others, whole), whole.frames, voice, rng)
     moving = mouth_over(speech, motions.talk, whole.frames, rng) if mouth is None else mouth
-    look, nods = attention.astype(np.float32), _spans(person.others_nods)
+    look, nods = attention.astype(np.float32), spans_by(person.others_nods)
     face = speaker_motion(moving, motions, rng, look, person.others_laughs, nods)
     audio = heard(laugh(speech, person.others_laughs, laughter, rng), voice, rng)
     spans = {"nod": person.nods, "mm_hm": person.mm_hms, "laugh": person.laughs}
@@ -180,27 +182,15 @@ def _spoken(spans: Doubles, stretch: Stretch) -> Doubles:
     return np.asarray(spoken[spoken[:, 1] > spoken[:, 0]])
 
 
-def _speakers(person: MeetingPerson, stretch: Stretch) -> Ints:
-    """Return (N,) how many of the others speak."""
-    agents = sorted({agent for _, _, agent in person.floor})
-    masks = [active(_spans(person.floor, agent), stretch) for agent in agents]
-    return np.asarray(np.sum([np.zeros(stretch.frames, np.int64), *masks], axis=0), np.int64)
-
-
-def _floor(person: MeetingPerson, stretch: Stretch, alone: Bools) -> NDArray[np.str_]:
+def _floor(person: MeetingPerson, talks: Mapping[str, Bools], alone: Bools) -> NDArray[np.str_]:
     """Return (N,) the only other who speaks, else the last of them who spoke for a second; "" before the first."""
-    floor = np.full(stretch.frames, "", dtype="<U1")
+    floor = np.full(len(alone), "", dtype="<U1")
     taken = sorted((start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S)
     for taken_s, agent in taken:
         floor[int(np.ceil(taken_s * FRAME_HZ)) :] = agent
-    for agent in {agent for _, _, agent in person.floor}:
-        floor[alone & active(_spans(person.floor, agent), stretch)] = agent
+    for agent, talk in talks.items():
+        floor[alone & talk] = agent
     return floor
-
-
-def _spans(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
-    """Return (K, 2) of one agent, or of all."""
-    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
 # --- parts and variants ---------------------------------------------------------------------------------------------
@@ -211,14 +201,9 @@ def part(speaker: Sequence[SpeakerFrame], first: int, frames: int) -> list[Speak
     return [at_time((index + 1) * FRAME_S, frame) for index, frame in enumerate(speaker[first : first + frames])]
 
 
-def without_own_voice(speaker: Sequence[SpeakerFrame]) -> list[SpeakerFrame]:
-    """Return the frames for a head that never speaks."""
-    return [changed(frame, agent_audio=None) for frame in speaker]
-
-
-def shifted(speaker: Sequence[SpeakerFrame], by_s: float = SHIFT_S) -> list[SpeakerFrame]:
-    """Return the input from the others `by_s` late, its end moved to the beginning; the own voice stays in place."""
-    by = round(by_s * FRAME_HZ) % len(speaker)
+def shifted(speaker: Sequence[SpeakerFrame]) -> list[SpeakerFrame]:
+    """Return the input from the others `SHIFT_S` late, its end moved to the beginning; the own voice stays in place."""
+    by = round(SHIFT_S * FRAME_HZ) % len(speaker)
     before = [*speaker[len(speaker) - by :], *speaker[: len(speaker) - by]]
     return [
         changed(at_time(frame.time_s, other), agent_audio=frame.agent_audio)

@@ -9,17 +9,44 @@ needs rendered pictures and is out of scope. The paper's rows come from other da
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 
+from sfms_robot import config
+from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS, Doubles
+from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SPACE_CHANNELS, Doubles
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import Dataset, Order, usable
+from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.corpora.learning2listen import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.intervals import Chosen, jackknife
+from sfms_robot.lab.evaluation.detection import behaviour
+from sfms_robot.lab.evaluation.intervals import Chosen, finite, jackknife, people_of
+from sfms_robot.lab.evaluation.metrics import cut
+from sfms_robot.lab.evaluation.rollout import (
+    frames_of_dyad,
+    load_at_hop,
+    offline_rollout,
+    rollout,
+    rollouts,
+    tracked,
+    whole_clips,
+)
+from sfms_robot.lab.learning.corpus import in_space
+from sfms_robot.lab.learning.sfms.features import frames_of, gather
+from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_scores
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import reconstruction_error
+from sfms_robot.listeners.sfms.placement import Strategy
+from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.ports import Listener
 
 PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
     "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
@@ -99,10 +126,7 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
         "clips": len(clips.truth),
         "frames": clips.truth.shape[1],
         "samples": samples,
-        "rows": [
-            {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()}
-            for row in rows
-        ],
+        "rows": [finite(row) for row in rows],
     }
 
 
@@ -125,23 +149,21 @@ def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
     low = np.where(shapes, 0.0, clips.train.min(axis=(0, 1)))
     high = np.where(shapes, 1.0, clips.train.max(axis=(0, 1)))
     n, t, d = clips.speaker.shape
-    still = {"Median": np.median(clips.train, axis=(0, 1)), "MeanFr": clips.train.mean(axis=(0, 1))}
-    return {
-        "Random": np.random.default_rng(seed).uniform(low, high, (n, samples, t, d)),
-        **{
-            name: np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
-            for name, motion in (("Median", still["Median"]), ("Mime", clips.speaker), ("MeanFr", still["MeanFr"]))
-        },
+    still = {
+        "Median": np.median(clips.train, axis=(0, 1)),
+        "Mime": clips.speaker,
+        "MeanFr": clips.train.mean(axis=(0, 1)),
     }
+    answers = {"Random": np.random.default_rng(seed).uniform(low, high, (n, samples, t, d))}
+    for name, motion in still.items():
+        answers[name] = np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
+    return answers
 
 
 def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
-    """Every metric is the mean over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
+    """Return the score of table 1: means over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
-    most = max(CLUSTERS.values())
-    if (frames := truth.shape[0] * truth.shape[1]) < most:
-        raise ConfigError(f"table 1 needs {most} frames for the clusters of SI, the clips have {frames} in all")
     centres = metrics.centres_of(truth, PARTS[clips.space], CLUSTERS)
 
     def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
@@ -182,7 +204,7 @@ def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
 
 
 def _table_2(clips: Clips, pred: Doubles) -> Score:
-    """FRCorr is the challenge's sum over the samples, with a column for the mean; FRSyn skips constant channels.
+    """Return the score of table 2. FRCorr is the challenge's sum over the samples; FRSyn skips constant channels.
 
     All but FRDvs are means over the clips: the numbers of each clip are computed once for any choice of clips.
     """
@@ -202,3 +224,130 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
         return dict(zip(_COLUMNS_2, values, strict=True)) | {"FRCorr per sample": correlation}
 
     return score
+
+
+# --- The commands ----------------------------------------------------------------------------------------------------
+
+_PLACEMENTS: tuple[Strategy, ...] = ("exact", "penalised", "static", "static_paper", "learned")
+
+
+def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
+    """Return the held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
+    folder = find("listeners", name, "config.yaml")
+    settings, listener = config.load(config.Sfms, folder / CONFIG), load_folder(folder, "torch")
+    model = listener.model
+    dyads = open_for(listener.space.name, data, "validation", order)
+    corpus = gather(dyads, model.tokenizer.window, listener.space, None, settings)
+    placements = [
+        each for each in _PLACEMENTS if (each == "penalised") == (settings.placement == "penalised")
+        and (each != "learned" or model.tokenizer.score is not None)
+    ]  # fmt: skip
+    return {
+        "listener": name,
+        "window": model.tokenizer.window,
+        "rows": [{"name": each, "mse": reconstruction_error(model, corpus, each)} for each in placements],
+    }
+
+
+def evaluate_listener(
+    names: Sequence[str], data: Path, seed: int, order: Order | None = None, hop: int | None = None
+) -> dict[str, Any]:
+    """Stream the held-out speakers of `data` through listeners; return their behaviour beside that of the dyads.
+
+    For an SFMS listener the rows also have its keyframe scores. `hop`: see `load_at_hop`.
+    """
+    dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, "validation", order))]
+    if not dyads:
+        raise ConfigError(f"{data}: no dyad of validation can be read")
+    rows: list[dict[str, Any]] = []
+    for name in names:
+        listener = load_at_hop(name, hop)
+        motions = [one.motion[0] for one in rollouts(listener, tracked(dyads, name), seed)]
+        figures = behaviour(motions, dyads)
+        if isinstance(listener, SfmsListener):
+            settings = listener.settings
+            corpus = gather(dyads, settings.window_frames, listener.space, listener.frontend, settings)
+            figures |= keyframe_scores(listener.model, corpus, settings)
+        rows.append({"name": name, "hop": listener.hop, **figures})
+    rows.append({"name": "dyads", **behaviour([dyad.listener for dyad in dyads], dyads)})
+    return {
+        "listeners": list(names),
+        "dyads": len(dyads),
+        "rows": [finite(row) for row in rows],
+    }
+
+
+def shared_space(listeners: Mapping[str, Listener]) -> MotionSpace:
+    """Return the motion space of all listeners; of one that decides events, that of its model of motion.
+
+    Raises ConfigError when there are several.
+    """
+    spaces = {
+        name: getattr(getattr(listener, "how", listener), "space", MotionSpace("arkit58", np.zeros(58)))
+        for name, listener in listeners.items()
+    }
+    if len({space.name for space in spaces.values()}) > 1:
+        named = ", ".join(f"{name}: {space.name}" for name, space in spaces.items())
+        raise ConfigError(f"one table has one motion space, these have several ({named}): evaluate them one by one")
+    return next(iter(spaces.values()))
+
+
+def spread_clips(dyads: Dataset, most: int | None) -> list[Dyad]:
+    """Return at most `most` dyads, spread evenly; those that cannot be read are skipped with a warning.
+
+    Raises ConfigError when none can be read.
+    """
+    step = 1.0 if most is None else max(1.0, len(dyads) / most)
+    chosen = replace(dyads, clips=tuple(dyads.clips[int(at)] for at in np.arange(0, len(dyads), step)))
+    found = list(usable(chosen))
+    if not found:
+        raise ConfigError(f"{dyads.layout} {dyads.split}: none of {len(chosen)} clips can be read")
+    return found
+
+
+def collect(
+    number: int,
+    listeners: Mapping[str, Listener],
+    space: MotionSpace,
+    train: Sequence[Dyad],
+    held_out: Sequence[Dyad],
+    seeds: Sequence[int],
+) -> tuple[Clips, dict[str, Doubles]]:
+    """Return the clips of a table, and the answers of every listener (N, K, T, D), K seeds.
+
+    A listener hears a dyad from its beginning; clips are cut out of its answer. Raises ConfigError when the dyads are
+    too short for the table's metrics.
+    """
+    learned = [np.asarray(in_space(dyad, dyad.listener, space)) for dyad in train]
+    heard = [frames_of(dyad, space) for dyad in held_out]
+    longest = max(len(one.motion) for one in heard)
+    frames = min(FRAMES[number], longest, max(len(one) for one in learned))
+    if frames < NEEDED_FRAMES[number]:
+        raise ConfigError(f"table {number} needs clips of {NEEDED_FRAMES[number]} frames, the longest has {longest}")
+    rest = torch.tensor(space.neutral, dtype=torch.float32)
+    faces = [np.asarray(torch.where(one.face_known[:, None], one.face, rest)) for one in heard]  # unknown: at rest
+    clips = Clips(
+        space=space.name,
+        truth=cut([np.asarray(one.motion) for one in heard], frames),
+        speaker=cut(faces, frames),
+        train=cut(learned, frames),
+        people=people_of(held_out, [len(one.motion) for one in heard], frames),
+    )
+    return clips, {
+        name: cut([_answered(listener, space, dyad, seeds, frames) for dyad in tracked(held_out, name)], frames)
+        for name, listener in listeners.items()
+    }
+
+
+def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:
+    """Return (S, N, D) in the space; the end that does not fill a clip may be missing."""
+    if isinstance(listener, SfmsListener):
+        return np.asarray(offline_rollout(listener, dyad, seeds).motion)
+    if dyad.space != "arkit58":
+        raise ConfigError(f"dyad {dyad.name}: space {dyad.space}; listeners of other kinds than sfms need arkit58")
+    if dyad.fps != FRAME_HZ:
+        raise ConfigError(
+            f"dyad {dyad.name}: {dyad.fps:g} frames a second; listeners of other kinds than sfms need {FRAME_HZ}"
+        )
+    heard = whole_clips(frames_of_dyad(dyad), frames)
+    return np.stack([space.encode(one) for one in rollout(listener, heard, seeds).motion])

@@ -7,40 +7,64 @@ so the figures do not depend on the number of processes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, Doubles, Floats
+from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
 from sfms_robot.lab.corpora.splits import Split
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, added_up, asked_and_seen
-from sfms_robot.lab.evaluation.hazard_scores import ReferenceHazard, annotated, decisions, delayed, sensed
 from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates
 from sfms_robot.lab.evaluation.listener_meetings import (
+    SHIFT_S,
     ListenerMeeting,
     listener_meeting,
     part,
     shifted,
-    without_own_voice,
 )
 from sfms_robot.lab.evaluation.robustness import voice_folders
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollout, run_in_processes, spread
-from sfms_robot.lab.evaluation.whole_recordings import hazards_in
+from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in, unspoken
+from sfms_robot.lab.learning.events.event_trainer import (
+    FLOOR,
+    GAZE,
+    NOD,
+    OTHERS,
+    OWN_NODS,
+    PHASE,
+    Logistic,
+    inputs,
+    meeting_scene,
+    muted,
+    student,
+    teach,
+)
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
-from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.events.evidence import HEARD, Sensed
+from sfms_robot.listeners.events.model import (
+    AT_PERSON,
+    LEAD_FRAMES,
+    STEP_FRAMES,
+    STEP_S,
+    EventMemory,
+    EventModel,
+)
 from sfms_robot.listeners.registry import engine_name
+from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.ports import Listener
+from sfms_robot.signals import phase
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 _PREFIXES: Final = {"annotated": "annotated_", "decided": "decided_", "people": "people_", "R2": "r2_"}
@@ -75,23 +99,6 @@ class TimingOptions:
     own_voice: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class _MeetingTask:
-    """One person's meeting.
-
-    Attributes:
-        number: Place in the tables.
-        table: (CELLS,) nods per minute by speech phase, and `reference`: of training people; None without any.
-    """
-
-    options: TimingOptions
-    person: MeetingPerson
-    number: int
-    table: Doubles | None
-    reference: ReferenceHazard | None
-    calibration: DetectorCalibration
-
-
 @dataclass(frozen=True)
 class _Played:
     participant: str
@@ -106,30 +113,19 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     Raises ConfigError or ModelError.
     """
     listener = _listener(options)  # report its errors here, not from a process
-    everybody = read_people(tables(options.data))
-    chosen = spread(people_of(everybody, options.split, options.allow_training), options.meetings)
-    training = split_series(everybody)["train"]
-    table = timing.table_rates(training) if training else None
-    reference = ReferenceHazard.of(training) if training else None
+    people = read_people(tables(options.data))
+    chosen = spread(people_of(people, options.split, options.allow_training), options.meetings)
+    training = split_series(people)["train"]
+    baselines = (timing.table_rates(training), ReferenceHazard.of(training)) if training else None
     calibration = DetectorCalibration.of(_motions(options.split))
-    tasks = [
-        _MeetingTask(
-            options=options,
-            person=person,
-            number=everybody.index(person),
-            table=table,
-            reference=reference,
-            calibration=calibration,
-        )
-        for person in chosen
-    ]
-    played = run_in_processes(_play, tasks, options.jobs, "people listening")
-    people = timing.per_person((one.participant, one.sums) for one in played)
-    found = estimates(timing.figures_of(people[0]), people, options.seed)
+    tasks = [(people.index(person), person) for person in chosen]
+    played = run_in_processes(partial(_play, options, baselines, calibration), tasks, options.jobs, "people listening")
+    sums = timing.per_person((one.participant, one.sums) for one in played)
+    found = estimates(timing.figures_of(sums[0]), sums, options.seed)
     return {
         "listener": options.listener,
         "split": options.split,
-        "people": len(people),
+        "people": len(sums),
         "meetings": len(played),
         "minutes": round(sum(one.minutes for one in played), 2),
         "minutes_of_motion_each": options.minutes,
@@ -137,10 +133,10 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "seeds": options.seeds,
         "hop": None if isinstance(listener, EventModel) else listener.hop,
         "engine": None if isinstance(listener, EventModel) else engine_name(listener),
-        **{name: _rounded(one.value) for name, one in found.items()},
+        **{name: one.value if one.value is None else round(one.value, 4) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
-        "interval": {name: one.interval and [_rounded(end) for end in one.interval] for name, one in found.items()},
+        "interval": {name: one.interval and [round(end, 4) for end in one.interval] for name, one in found.items()},
         "interval_level": LEVEL,
         "detector": calibration.report(),
         "asked_and_seen": calibration.report_of(added_up(one.sightings for one in played)),
@@ -174,32 +170,44 @@ def tables(data: Path) -> Path:
 # --- playing --------------------------------------------------------------------------------------------------------
 
 
-def _play(task: _MeetingTask) -> _Played:
-    """Play one meeting: the person's events, the listener's hazards, decisions and motion."""
-    options, (voices, laughter, motions) = task.options, _material(task.options.split, task.options.data)
-    rng = np.random.default_rng([options.seed, task.number])
-    one = listener_meeting(task.person, voices, laughter, motions, rng)
+def _play(
+    options: TimingOptions,
+    baselines: tuple[Doubles, ReferenceHazard] | None,
+    calibration: DetectorCalibration,
+    task: tuple[int, MeetingPerson],
+) -> _Played:
+    """Play one meeting: the person's events, the listener's hazards, decisions and motion.
+
+    `baselines` are of training people: nods per minute (CELLS,) by speech phase, and the reference. `task`: place in
+    the tables, and person.
+    """
+    number, person = task
+    voices, laughter, motions = _material(options.split, options.data)
+    one = listener_meeting(person, voices, laughter, motions, np.random.default_rng([options.seed, number]))
     listener = _listener(options)
     first, frames = middle(one.frames, 0.0 if isinstance(listener, EventModel) else options.minutes)
     played = np.zeros(one.frames, bool)
     played[first : first + frames] = True
     sums = timing.people_sums(one, played)
-    if task.table is not None and task.reference is not None:
-        sums |= timing.table_sums(one, task.table)
-        sums |= timing.hazard_sums("r2_", one, *task.reference.scores(task.person, one.frames))
-    seeds = range(1000 * (options.seed + task.number), 1000 * (options.seed + task.number) + options.seeds)
+    if baselines is not None:
+        rates, reference = baselines
+        sums["table_nod_auc"] = timing.ranked(rates[timing.cells(phase.times(one.others))], one)
+        sums |= timing.hazard_sums("r2_", one, *reference.scores(person, one.frames))
+    seeds = range(1000 * (options.seed + number), 1000 * (options.seed + number) + options.seeds)
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener.when, listener.calmness, task.person, one, seeds, options.own_voice)
+        sums |= _by_events(listener.when, listener.calmness, person, one, seeds, options.own_voice)
     if isinstance(listener, EventModel):
-        sums |= _by_events(listener, Calmness(), task.person, one, seeds, options.own_voice)
+        sums |= _by_events(listener, Calmness(), person, one, seeds, options.own_voice)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
         speaker = part(one.speaker, first, frames)
-        rolled = rollout(listener, speaker if options.own_voice else without_own_voice(speaker), seeds)
-        detected, known = [Detected.of(motion) for motion in rolled.motion], task.calibration
-        sums |= timing.motion_sums(one, rolled.motion, detected, first, known, options.own_voice)
+        if not options.own_voice:
+            speaker = [changed(frame, agent_audio=None) for frame in speaker]
+        rolled = rollout(listener, speaker, seeds)
+        detected = [Detected.of(motion) for motion in rolled.motion]
+        sums |= timing.motion_sums(one, rolled.motion, detected, first, calibration, options.own_voice)
         streams = zip(rolled.events, detected, strict=True)
-        sightings = added_up(asked_and_seen(events, each, known.lag_s) for events, each in streams)
+        sightings = added_up(asked_and_seen(events, each, calibration.lag_s) for events, each in streams)
     return _Played(one.participant, one.frames / FRAME_HZ / 60, sums, sightings)
 
 
@@ -236,13 +244,10 @@ def _by_events(
     return sums | timing.decided_sums(one, streams, own_voice)
 
 
-def _listener(options: TimingOptions) -> Listener | EventModel:
-    return _load(options.listener, options.hop, options.engine)
-
-
 @cache
-def _load(name: str, hop: int | None, engine: EngineName) -> Listener | EventModel:
-    return EventModel.load(Path(name)) if name.endswith(".yaml") else load_at_hop(name, hop, engine)
+def _listener(options: TimingOptions) -> Listener | EventModel:
+    name = options.listener
+    return EventModel.load(Path(name)) if name.endswith(".yaml") else load_at_hop(name, options.hop, options.engine)
 
 
 @cache
@@ -257,10 +262,6 @@ def _motions(split: Split) -> Motions:
 
 
 # --- the report -----------------------------------------------------------------------------------------------------
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)
 
 
 def _notes(found: Mapping[str, Estimate], own_voice: bool) -> Iterator[str]:
@@ -294,3 +295,108 @@ def _rows(name: str, found: Mapping[str, Estimate]) -> list[dict[str, Any]]:
         | {who: cell(prefix + key) for who, prefix in _PREFIXES.items()}
         for key in dict.fromkeys(map(bare, found))
     ]
+
+
+# --- Decisions without motion ----------------------------------------------------------------------------------------
+#
+# There are two ways. Left to itself it decides, and its history is what it decided. Given a person's history it decides
+# nothing: only its hazards are computed, at every instant, as if it had done what the person did so far. These are
+# ranked against what the person did next: nods drawn from good hazards with a few seeds rank hardly better than chance.
+#
+# `ReferenceHazard` is the bar: what the annotations themselves reveal about nods. A logistic hazard of speech and its
+# length, of looks, laughs and nods, and of the person's earlier nods, fitted on training people and evaluated at every
+# instant of another person's meeting. It gets exactly what the annotators saw, where a head has a microphone and a
+# camera; once with the person's own speech, and once fitted and evaluated without.
+
+_SILENT: Final = {
+    **PHASE,
+    **{name: knots for name, knots in FLOOR.items() if name != "floor_mine"},
+    **OWN_NODS,
+    **GAZE,
+    **OTHERS,
+}
+
+
+def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles, Doubles]:
+    """Return the evidence (N, len(HEARD)) of the person in the frames: with the listener's own voice, and without."""
+    scene = scene_in(speaker, calmness.addressed)
+    return heard_in(scene), heard_in(unspoken(scene))
+
+
+def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+    """Return the evidence (frames, len(HEARD)) that annotators saw in place of a microphone and a camera.
+
+    With the listener's own voice, without it, and without it while the others are a minute off.
+    """
+    scene, _ = meeting_scene(person)
+    own, alone = heard_in(scene), heard_in(unspoken(scene))
+    at = np.minimum(np.arange(frames), len(own) - 1)
+    return own[at], alone[at], np.roll(alone, round(SHIFT_S * FRAME_HZ), axis=0)[at]
+
+
+def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
+    """Return hazards one frame late. A head gets its voice a frame early, which would reveal its own "mm-hm"."""
+    return {kind: np.concatenate([values[:1], values[:-1]]) for kind, values in hazards_hz.items()}
+
+
+def decisions(
+    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness
+) -> list[tuple[ListenerEvent, ...]]:
+    """Return the decisions for each seed without a given history, skipping steps at which no event can begin."""
+    steps = steps_in(len(heard))
+    most = most_in(model, heard[steps], calmness)
+    found = []
+    for seed in seeds:
+        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
+        frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
+        found.append(_decided(model, heard, frames, model.start(seed, calmness)))
+    return found
+
+
+def _decided(
+    model: EventModel, heard: Doubles, frames: Sequence[int], memory: EventMemory
+) -> tuple[ListenerEvent, ...]:
+    """Decide at the end of each of `frames`, the last of which is beyond the end."""
+    found = list[ListenerEvent]()
+    at, look_back = 0, math.inf  # the frame from which on a look aside is over
+    while (frame := min(frames[at], look_back)) < len(heard):
+        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
+        found += decision.events
+        at += frame == frames[at]
+        look = last_shift(memory.done)
+        over = math.inf  # the step at which the newest look is over, if it goes aside
+        if look is not None and look.target_rad != AT_PERSON:
+            step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
+            over = step * STEP_FRAMES + STEP_FRAMES - 1
+        look_back = max(frame + STEP_FRAMES, over)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class ReferenceHazard:
+    """Log-odds of a nod, from two fits: with the person's own speech, and without."""
+
+    speaking: Logistic
+    silent: Logistic
+
+    @classmethod
+    def of(cls, people: Sequence[MeetingPerson]) -> Self:
+        """Fit on these people; takes some seconds for a hundred meetings."""
+        taught = [student(person, np.random.default_rng(0)) for person in people]
+        return cls(teach(taught, "nod", NOD), teach(map(muted, taught), "nod", _SILENT))
+
+    def scores(self, person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+        """Return (frames,) each: with the own speech, without it, and without it while the others are a minute off."""
+        one = student(person, np.random.default_rng(0))
+        heard, alone = one.evidence, muted(one).evidence
+        other = alone.copy()
+        other[:, : len(HEARD)] = np.roll(alone[:, : len(HEARD)], round(SHIFT_S / STEP_S), axis=0)
+        by_step = (
+            self.speaking.log_odds(inputs(heard, NOD)),
+            self.silent.log_odds(inputs(alone, _SILENT)),
+            self.silent.log_odds(inputs(other, _SILENT)),
+        )
+        # (M,) known as each step begins -> (frames,) known as each frame is over
+        at = ((np.arange(frames) + 1) // STEP_FRAMES).clip(0, len(heard) - 1)
+        speaking, silent, shifted = (np.asarray(steps[at]) for steps in by_step)
+        return speaking, silent, shifted

@@ -3,14 +3,16 @@
 N clips or contexts, K samples of each, T frames, D channels. Predecessors disagree under the same names, so the
 definition is part of the name or said where it is made. FRRea, a distance between rendered images, is out of scope.
 
-The Learning2Listen line: clips are (N, T, D), or (T, D) for one. Sources: Boese0601/Dyadic-Interaction-Modeling @
-9fc92f72 (DIM), sanjayss34/lm-listener @ 53ce4ecc, evonneng/learning2listen @ a0825d58 (definitions only).
+The Learning2Listen line: clips are (N, T, D), or (T, D) for one, of equal shapes. Sources:
+Boese0601/Dyadic-Interaction-Modeling @ 9fc92f72 (DIM), sanjayss34/lm-listener @ 53ce4ecc, evonneng/learning2listen @
+a0825d58 (definitions only).
 
-The REACT challenges: predictions are (N, K, T, D), or (N, T, D) for K = 1. The only appropriate reaction to a context
-is that of its recorded listener. The challenge's features are 25 attributes: 15 action units, valence and arousal, 8
-expression probabilities; name the feature space next to every number. ReactFace's variants on the 58 coefficients are
-other numbers under other names. Sources: reactmultimodalchallenge/baseline_react2023 @ c5a8ff85 and baseline_react2024
-@ 0c3ce587 (definitions), lingjivoo/ReactFace @ fa4b3a42 (MIT, the 58-d variants).
+The REACT challenges: predictions are (N, K, T, D), truth and speaker (N, T, D), of more than 50 frames. The only
+appropriate reaction to a context is that of its recorded listener. The challenge's features are 25 attributes: 15
+action units, valence and arousal, 8 expression probabilities; name the feature space next to every number. ReactFace's
+variants on the 58 coefficients are other numbers under other names. Sources:
+reactmultimodalchallenge/baseline_react2023 @ c5a8ff85 and baseline_react2024 @ 0c3ce587 (definitions),
+lingjivoo/ReactFace @ fa4b3a42 (MIT, the 58-d variants).
 """
 
 from __future__ import annotations
@@ -21,14 +23,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial.distance import cdist
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 
-ATTRIBUTES: Final = 25
 _ATTRIBUTE_GROUPS: Final = ((slice(0, 15), 15.0), (slice(15, 17), 1.0), (slice(17, 25), 8.0))  # DTW is divided by
 _SID_EPS: Final = 1e-6  # inside the logarithm, as in DIM
 _STS_DT: Final = 0.1
@@ -51,34 +51,16 @@ def cut(motions: Sequence[Doubles] | Sequence[Floats], frames: int) -> Doubles:
     return np.stack(clips).astype(np.float64)
 
 
-def _clips(x: ArrayLike) -> Doubles:
-    array = np.asarray(x, dtype=np.float64)
-    if array.ndim == 2:
-        array = array[None]
-    if array.ndim != 3:
-        raise ValueError(f"clips: expected (N, T, D) or (T, D), got shape {array.shape}")
-    return array
-
-
-def _alike(*clips: ArrayLike) -> list[Doubles]:
-    arrays = [_clips(one) for one in clips]
-    if len({array.shape for array in arrays}) != 1:
-        raise ValueError(f"clips: expected one shape, got {', '.join(str(array.shape) for array in arrays)}")
-    return arrays
-
-
 # --- Learning2Listen ------------------------------------------------------------------------------------------------
 
 
-def frechet_distance(a: ArrayLike, b: ArrayLike) -> float:
+def frechet_distance(a: Doubles, b: Doubles) -> float:
     """Return FD of all frames of two sets of clips: |mu|^2 + tr(Sa) + tr(Sb) - 2 tr sqrt(Sa Sb), covariances ddof 1.
 
     The root is taken through symmetric eigenvalues, which stays real. Fewer frames than channels make a covariance
     singular, which is logged.
     """
-    x, y = (one.reshape(-1, one.shape[-1]) for one in (_clips(a), _clips(b)))
-    if x.shape[1] != y.shape[1]:
-        raise ValueError(f"clips: {x.shape[1]} channels against {y.shape[1]}")
+    x, y = (one.reshape(-1, one.shape[-1]) for one in (a, b))
     if min(len(x), len(y)) <= x.shape[1]:
         _log.warning("FD of %d frames in %d dimensions: the covariance is singular", min(len(x), len(y)), x.shape[1])
     gap = x.mean(axis=0) - y.mean(axis=0)
@@ -89,56 +71,50 @@ def frechet_distance(a: ArrayLike, b: ArrayLike) -> float:
     return float(gap @ gap + np.trace(sx) + np.trace(sy) - 2 * np.sqrt(np.maximum(cross, 0.0)).sum())
 
 
-def paired_frechet_distance(target: ArrayLike, pred: ArrayLike, speaker: ArrayLike) -> float:
+def paired_frechet_distance(target: Doubles, pred: Doubles, speaker: Doubles) -> float:
     """Return P-FD: FD of frames that hold speaker and listener side by side."""
-    person = _clips(speaker)
-    truth, guess = (np.concatenate([person, _clips(one)], axis=-1) for one in (target, pred))
+    truth, guess = (np.concatenate([speaker, one], axis=-1) for one in (target, pred))
     return frechet_distance(truth, guess)
 
 
-def l2(target: ArrayLike, pred: ArrayLike) -> float:
+def l2(target: Doubles, pred: Doubles) -> float:
     """Return the distance over all channels, mean over clips and frames."""
-    truth, guess = _alike(target, pred)
-    return float(np.linalg.norm(truth - guess, axis=-1).mean())
+    return float(np.linalg.norm(target - pred, axis=-1).mean())
 
 
-def mse(target: ArrayLike, pred: ArrayLike) -> float:
+def mse(target: Doubles, pred: Doubles) -> float:
     """Return the mean squared error (lm-listener, DIM)."""
-    truth, guess = _alike(target, pred)
-    return float(((truth - guess) ** 2).mean())
+    return float(((target - pred) ** 2).mean())
 
 
-def variance(x: ArrayLike, definition: Literal["flat", "time", "sum"] = "flat") -> float:
+def variance(x: Doubles, definition: Literal["flat", "time", "sum"] = "flat") -> float:
     """Return one of three numbers of one name.
 
     "flat" pools clips, frames and channels (DIM); "time" is the variance over time per channel and clip, averaged
     (lm-listener); "sum" adds the pooled variances of the channels (DIM's other one).
     """
-    clips = _clips(x)
     if definition == "flat":
-        return float(clips.var())
-    return float(clips.var(axis=1).mean() if definition == "time" else clips.var(axis=(0, 1)).sum())
+        return float(x.var())
+    return float(x.var(axis=-2).mean() if definition == "time" else x.reshape(-1, x.shape[-1]).var(axis=0).sum())
 
 
-def shannon_index(pred: ArrayLike, centres: Doubles, unit: Literal["nats", "bits"] = "nats") -> float:
+def shannon_index(pred: Doubles, centres: Doubles, unit: Literal["nats", "bits"] = "nats") -> float:
     """Return SI: the entropy of the clusters (`cluster_centres` (k, D)) that the predicted frames fall into.
 
     Centres of another k-means differ, so numbers compare only with the same centres.
     """
-    guess = _clips(pred)
-    labels, _ = vq(guess.reshape(-1, guess.shape[-1]), centres)
+    labels, _ = vq(pred.reshape(-1, pred.shape[-1]), centres)
     share = np.bincount(labels) / len(labels)
     share = share[share > 0]
     return float(-(share * (np.log if unit == "nats" else np.log2)(share + _SID_EPS)).sum())
 
 
-def cluster_centres(reference: ArrayLike, k: int) -> Doubles:
+def cluster_centres(reference: Doubles, k: int) -> Doubles:
     """Return the k-means centres (k, D) of the pooled frames of clips, with a fixed seed.
 
     Raises ValueError for fewer frames than k, or too many equal frames.
     """
-    clips = _clips(reference)
-    frames = clips.reshape(-1, clips.shape[-1])
+    frames = reference.reshape(-1, reference.shape[-1])
     if len(frames) < k:
         raise ValueError(f"{len(frames)} frames do not make {k} clusters")
     with warnings.catch_warnings(), np.errstate(invalid="raise"):
@@ -161,21 +137,19 @@ def centres_of(truth: Doubles, parts: Mapping[str, slice], clusters: Mapping[str
         raise ConfigError(f"the clips' own motion: {error}") from error
 
 
-def rpcc_flat(target: ArrayLike, pred: ArrayLike, speaker: ArrayLike) -> float:
+def rpcc_flat(target: Doubles, pred: Doubles, speaker: Doubles) -> float:
     """Return DIM's RPCC: |corr(target, speaker) - corr(pred, speaker)|, everything flattened into one vector."""
-    truth, guess, person = (one.ravel() for one in _alike(target, pred, speaker))
+    truth, guess, person = (one.ravel() for one in (target, pred, speaker))
     return float(abs(np.corrcoef(truth, person)[0, 1] - np.corrcoef(guess, person)[0, 1]))
 
 
-def rpcc_channels(target: ArrayLike, pred: ArrayLike, speaker: ArrayLike) -> float:
+def rpcc_channels(target: Doubles, pred: Doubles, speaker: Doubles) -> float:
     """Return RPCC per clip and channel, averaged before the difference, without constant channels."""
-    truth, guess, person = _alike(target, pred, speaker)
-
-    def mean(one: Doubles) -> float:
-        values = _pearson(one, person)
-        return float(np.nanmean(values)) if np.isfinite(values).any() else 0.0
-
-    return abs(mean(truth) - mean(guess))
+    truth, guess = (
+        float(np.nanmean(values)) if np.isfinite(values).any() else 0.0
+        for values in (_pearson(target, speaker), _pearson(pred, speaker))
+    )
+    return abs(truth - guess)
 
 
 def _pearson(a: Doubles, b: Doubles) -> Doubles:
@@ -186,12 +160,12 @@ def _pearson(a: Doubles, b: Doubles) -> Doubles:
     return np.asarray(np.where(constant, np.nan, (x * y).sum(axis=-2) / np.where(constant, 1.0, norm)))
 
 
-def sts(target: ArrayLike, pred: ArrayLike) -> float:
+def sts(target: Doubles, pred: Doubles) -> float:
     """Return DIM's STS: the root of the summed squared differences of the frame steps over 0.1.
 
     The clips are joined end to end first, so their borders count as steps, as in the reference.
     """
-    truth, guess = (one.reshape(-1, one.shape[-1]) for one in _alike(target, pred))
+    truth, guess = (one.reshape(-1, one.shape[-1]) for one in (target, pred))
     gap = np.diff(truth, axis=0) - np.diff(guess, axis=0)
     return float(np.sqrt((gap**2 / _STS_DT).sum()))
 
@@ -199,32 +173,11 @@ def sts(target: ArrayLike, pred: ArrayLike) -> float:
 # --- REACT ----------------------------------------------------------------------------------------------------------
 
 
-def _samples(pred: ArrayLike) -> Doubles:
-    """Return (N, K, T, D). Raises ValueError for another number of dimensions."""
-    array = np.asarray(pred, dtype=np.float64)
-    if array.ndim == 3:
-        array = array[:, None]
-    if array.ndim != 4:
-        raise ValueError(f"predictions: expected (N, K, T, D) or (N, T, D), got shape {array.shape}")
-    return array
-
-
-def _like(x: ArrayLike, predictions: Doubles, name: str) -> Doubles:
-    array = np.asarray(x, dtype=np.float64)
-    wanted = (predictions.shape[0], *predictions.shape[2:])
-    if array.shape != wanted:
-        raise ValueError(f"{name}: expected shape {wanted} of the predictions, got {array.shape}")
-    return array
-
-
-def ccc(a: ArrayLike, b: ArrayLike) -> float:
+def ccc(x: Doubles, y: Doubles) -> float:
     """Return the concordance correlation of two tracks (..., T, D), per channel, then the mean.
 
     A channel that is constant in either track counts 0, also when both are equal: truth against truth may be < 1.
     """
-    x, y = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    if x.shape != y.shape or x.ndim < 2:
-        raise ValueError(f"tracks: expected (..., T, D) of one shape, got {x.shape} and {y.shape}")
     mean_x, mean_y = x.mean(axis=-2, keepdims=True), y.mean(axis=-2, keepdims=True)
     covariance = ((x - mean_x) * (y - mean_y)).mean(axis=-2, keepdims=True)  # rho * s_x * s_y
     constant = (np.ptp(x, axis=-2, keepdims=True) == 0) | (np.ptp(y, axis=-2, keepdims=True) == 0)
@@ -251,25 +204,20 @@ def dtw(one: Doubles, many: Doubles) -> Doubles:
     return np.asarray(np.sqrt(last[:, rows]), np.float64)
 
 
-def _mean_score(pred: ArrayLike, target: ArrayLike, score: Callable[[Doubles, Doubles], float]) -> float:
-    samples = _samples(pred)
-    truths = _like(target, samples, "target")
-    return float(np.mean([score(true, one) for true, context in zip(truths, samples, strict=True) for one in context]))
+def _mean_score(pred: Doubles, target: Doubles, score: Callable[[Doubles, Doubles], float]) -> float:
+    return float(np.mean([score(true, one) for true, context in zip(target, pred, strict=True) for one in context]))
 
 
-def frc(pred: ArrayLike, target: ArrayLike) -> float:
+def frc(pred: Doubles, target: Doubles) -> float:
     """Return FRCorr per sample: the mean CCC with the truth. The challenge sums over the K samples."""
     return _mean_score(pred, target, ccc)
 
 
-def frd(pred: ArrayLike, target: ArrayLike) -> float:
+def frd(pred: Doubles, target: Doubles) -> float:
     """Return FRDist per sample: the mean weighted DTW to the truth. The challenge sums over the K samples.
 
-    Defined on the 25 attributes only, whose groups have their own weights. Raises ValueError for other widths.
+    Defined on the 25 attributes only, whose groups have their own weights.
     """
-    width = _samples(pred).shape[-1]
-    if width != ATTRIBUTES:
-        raise ValueError(f"frd: expected the {ATTRIBUTES} attributes, got {width} channels (reactface_frd: any)")
 
     def score(truth: Doubles, sample: Doubles) -> float:
         return sum(float(dtw(truth[:, part], sample[None, :, part])[0]) / weight for part, weight in _ATTRIBUTE_GROUPS)
@@ -277,55 +225,41 @@ def frd(pred: ArrayLike, target: ArrayLike) -> float:
     return _mean_score(pred, target, score)
 
 
-def reactface_frd(pred: ArrayLike, target: ArrayLike) -> float:
+def reactface_frd(pred: Doubles, target: Doubles) -> float:
     """Return ReactFace's FRDist on raw coefficients: one DTW over all channels, times 10."""
     return 10.0 * _mean_score(pred, target, lambda truth, sample: float(dtw(truth, sample[None])[0]))
 
 
-def _mean_square_distance(points: Doubles) -> float:
-    """Return the mean over ordered pairs of (n, M) of the squared distance, over M; 0 for a single point."""
-    n, size = points.shape
-    if n < 2:
-        return 0.0
-    centred = points - points.mean(axis=0)  # sum over pairs of |p - q|^2 = 2 n sum |p - mean|^2
-    return float(2 * n * (centred**2).sum() / (n * (n - 1)) / size)
-
-
-def frdiv(pred: ArrayLike) -> float:
+def frdiv(pred: Doubles) -> float:
     """Return FRDiv: mean squared difference between the samples of a context. Paper eq. 16 drops the counts."""
-    return float(np.mean([_mean_square_distance(one.reshape(len(one), -1)) for one in _samples(pred)]))
+    return float(2 * pred.var(axis=1, ddof=1).mean()) if pred.shape[1] > 1 else 0.0
 
 
-def frdvs(pred: ArrayLike) -> float:
+def frdvs(pred: Doubles) -> float:
     """Return FRDvs: mean squared difference between contexts, per sample index."""
-    return frdiv(_samples(pred).transpose(1, 0, 2, 3))
+    return frdiv(pred.transpose(1, 0, 2, 3))
 
 
-def frvar(pred: ArrayLike) -> float:
+def frvar(pred: Doubles) -> float:
     """Return FRVar: the variance over time (ddof 1), mean over everything else. Paper eq. 17 omits the square."""
-    return float(_samples(pred).var(axis=2, ddof=1).mean())
+    return float(pred.var(axis=2, ddof=1).mean())
 
 
-def frsyn(pred: ArrayLike, speaker: ArrayLike, as_challenge: bool = True) -> float:
+def frsyn(pred: Doubles, speaker: Doubles, as_challenge: bool = True) -> float:
     """Return FRSyn: the mean of the finite `synchrony_lags`; NaN without any."""
     known = synchrony_lags(pred, speaker, as_challenge)
     known = known[np.isfinite(known)]
     return float(np.mean(known)) if len(known) else float("nan")
 
 
-def synchrony_lags(pred: ArrayLike, speaker: ArrayLike, as_challenge: bool) -> Doubles:
+def synchrony_lags(pred: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:
     """Return the |lag| in frames, up to 49, at which each prediction (N, K) and the speaker correlate best.
 
     As in the challenge only sample 0 counts, and one constant channel makes every lag NaN, which argmax answers with
     the first: |lag| = 49. Otherwise all samples count without their constant channels, NaN if no channel is left: that
     is the number to trust.
     """
-    predictions = _samples(pred)
-    speakers = _like(speaker, predictions, "speaker")
-    frames = predictions.shape[2]
-    if frames <= _MAX_LAG + 1:
-        raise ValueError(f"clips: {frames} frames are too short for lags up to {_MAX_LAG}")
-    return np.stack([_best_lags(one, person, as_challenge) for one, person in zip(predictions, speakers, strict=True)])
+    return np.stack([_best_lags(one, person, as_challenge) for one, person in zip(pred, speaker, strict=True)])
 
 
 def _best_lags(context: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:

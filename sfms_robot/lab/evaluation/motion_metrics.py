@@ -29,23 +29,6 @@ _TRACKS: Final = (".csv", ".csv.gz")
 _SHOWN: Final = 3  # names of a message
 
 
-@dataclass(frozen=True, kw_only=True)
-class MetricFiles:
-    """The files to score: `.npy` arrays, face tracks (CSV, also gzipped), or folders of face tracks, matched by name.
-
-    Attributes:
-        truth, speaker: (T, D) or (N, T, D); prediction: also (N, K, T, D), K answers to every clip.
-        space: A key of `WIDTHS`; None: by the number of channels, 58 being arkit58.
-        frames: Length of the clips; None: of the shortest.
-    """
-
-    truth: Path
-    prediction: Path
-    speaker: Path | None = None
-    space: str | None = None
-    frames: int | None = None
-
-
 @dataclass(frozen=True)
 class _Scored:
     """Clips (N, T, D) of one length, with the speaker's if given, and the K answers (N, K, T, D) to them."""
@@ -56,12 +39,31 @@ class _Scored:
     speaker: Doubles | None
 
 
-def evaluate_metrics(files: MetricFiles, seed: int = 1) -> dict[str, Any]:
+def evaluate_metrics(
+    truth: Path,
+    prediction: Path,
+    speaker: Path | None = None,
+    *,
+    space: str | None = None,
+    frames: int | None = None,
+    seed: int = 1,
+) -> dict[str, Any]:
     """Return rows of `name`, `part`, `definition`, `value` and `interval`: 95 % over clips, None if clips are pooled.
 
-    Values are means over the answers to a clip. Raises ConfigError for files that do not match.
+    Files are `.npy` arrays, face tracks (CSV, also gzipped), or folders of face tracks, matched by name. Values are
+    means over the answers to a clip.
+
+    Args:
+        truth: (T, D) or (N, T, D).
+        prediction: Also (N, K, T, D), K answers to every clip.
+        speaker: As truth; None: metrics that need it are left out.
+        space: A key of `WIDTHS`; None: by the number of channels, 58 being arkit58.
+        frames: Length of the clips; None: of the shortest.
+        seed: Of the intervals.
+
+    Raises ConfigError for files that do not match.
     """
-    scored = _read(files)
+    scored = _read(truth, prediction, speaker, space, frames)
     rows: list[dict[str, Any]] = []
     for part, where in PARTS.get(scored.space, {}).items():
         rows += [{"part": part} | row for row in _part_rows(scored, part, where, seed)]
@@ -75,34 +77,33 @@ def evaluate_metrics(files: MetricFiles, seed: int = 1) -> dict[str, Any]:
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
-def _read(files: MetricFiles) -> _Scored:
-    truth, prediction = _clips(files.truth), _clips(files.prediction)
-    speaker = None if files.speaker is None else _clips(files.speaker)
-    given = {files.truth: truth, files.prediction: prediction}
-    if files.speaker is not None and speaker is not None:
-        given[files.speaker] = speaker
-    space = _space(files, truth)
+def _read(
+    truth_file: Path, prediction_file: Path, speaker_file: Path | None, space: str | None, frames: int | None
+) -> _Scored:
+    truth, prediction = _clips(truth_file), _clips(prediction_file)
+    given = {truth_file: truth, prediction_file: prediction}
+    if speaker_file is not None:
+        given[speaker_file] = _clips(speaker_file)
+    space = _space(space, truth_file, next(iter(truth.values())).shape[-1])
     for path, clips in given.items():
         if list(clips) != list(truth):
-            raise ConfigError(f"{path}: its clips ({_names(clips)}) are not those of {files.truth} ({_names(truth)})")
+            raise ConfigError(f"{path}: its clips ({_names(clips)}) are not those of {truth_file} ({_names(truth)})")
         for name, clip in clips.items():
             _check(path, name, clip, WIDTHS[space], answers=clips is prediction)
-    frames = min(clip.shape[-2] for clips in given.values() for clip in clips.values())
-    if files.frames is not None:
-        if files.frames > frames:
-            raise ConfigError(f"--frames {files.frames}: the shortest clip has {frames}")
-        frames = files.frames
     lengths = {name: min(clips[name].shape[-2] for clips in given.values()) for name in truth}
+    shortest = min(lengths.values())
+    if frames is not None and frames > shortest:
+        raise ConfigError(f"--frames {frames}: the shortest clip has {shortest}")
 
     def cut_alike(clips: dict[str, Doubles]) -> Doubles:
-        return metrics.cut([clip[..., : lengths[name], :] for name, clip in clips.items()], frames)
+        return metrics.cut([clip[..., : lengths[name], :] for name, clip in clips.items()], frames or shortest)
 
     answers = cut_alike(prediction)
     return _Scored(
         space,
         cut_alike(truth),
         answers if answers.ndim == 4 else answers[:, None],
-        None if speaker is None else cut_alike(speaker),
+        None if speaker_file is None else cut_alike(given[speaker_file]),
     )
 
 
@@ -128,16 +129,13 @@ def _track(file: Path) -> Doubles:
     return resample(read_track(file), FRAME_HZ).motion.astype(np.float64)
 
 
-def _space(files: MetricFiles, truth: dict[str, Doubles]) -> str:
-    width = next(iter(truth.values())).shape[-1]
-    if files.space is None:
-        found = next((space for space, channels in WIDTHS.items() if channels == width), None)
-        if found is None:
-            raise ConfigError(f"{files.truth}: {width} channels, not {_spaces()}")
-        return found
-    if files.space not in WIDTHS:
-        raise ConfigError(f"--space {files.space}: not one of {', '.join(WIDTHS)}")
-    return files.space
+def _space(space: str | None, file: Path, width: int) -> str:
+    found = space or next((name for name, channels in WIDTHS.items() if channels == width), None)
+    if found is None:
+        raise ConfigError(f"{file}: {width} channels, not {_spaces()}")
+    if found not in WIDTHS:
+        raise ConfigError(f"--space {found}: not one of {', '.join(WIDTHS)}")
+    return found
 
 
 def _spaces() -> str:

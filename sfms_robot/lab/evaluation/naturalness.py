@@ -14,8 +14,9 @@ training loss.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,11 +33,10 @@ from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
 from sfms_robot.lab.corpora.reading import speaks
-from sfms_robot.lab.evaluation.behaviour_stats import movement, slow_poses_deg
+from sfms_robot.lab.evaluation.detection import movement, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import ends
-from sfms_robot.lab.evaluation.listener_evaluation import bar
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, tracked
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener
@@ -79,16 +79,11 @@ def evaluate_naturalness(
         raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; this comparison needs {2 * FOLDS} or more")
     listener = load_at_hop(name, engine=engine)
     heard = [frames_of_dyad(dyad) for dyad in dyads]
-    with bar(f"{name} listens", len(dyads) + 1) as advance:
-        ours = []
-        for number, speaker in enumerate(heard):
-            ours.append(rollout(listener, speaker, [seed + number]).motion[0])
-            advance()
-        long = long_run(listener, heard, drift_s, seed)
-        advance()
+    listened = enumerate(tracked(heard, f"{name} listens"))
+    ours = [rollout(listener, speaker, [seed + number]).motion[0] for number, speaker in listened]
+    long = long_run(listener, heard, drift_s, seed)
     theirs, training = [dyad.listener for dyad in dyads], _training_windows(data, len(dyads))
-    with bar("two-sample tests", 2 * (4 if training else 2) * len(REGIONS) * FOLDS) as advance:
-        tests = two_samples(listening(dyads, ours), listening(dyads, theirs), training, advance)
+    tests = two_samples(listening(dyads, ours), listening(dyads, theirs), training)
     addressed = [
         np.ones(len(dyad.listener), bool) if dyad.attention is None else np.asarray(dyad.attention > 0.5)
         for dyad in dyads
@@ -102,17 +97,15 @@ def evaluate_naturalness(
         **tests,
         **compared(movement(ours, addressed), movement(theirs, addressed)),
         **drifted(long, theirs),
-        "notes": list(notes(dyads, training)),
+        "notes": notes(dyads, training),
     }
 
 
-def notes(dyads: Sequence[Dyad], training: Sequence[Floats]) -> Iterator[str]:
-    """Yield what a reader of the figures has to know."""
+def notes(dyads: Sequence[Dyad], training: Sequence[Floats]) -> list[str]:
+    """Return what a reader of the figures has to know."""
     unknown = sum(dyad.attention is None for dyad in dyads)
-    if unknown:
-        yield f"the person's attention is unknown in {unknown} dyads: gaze counts all the time there"
-    if not training:
-        yield "too few dyads of training to compare its people with these"
+    found = [f"the person's attention is unknown in {unknown} dyads: gaze counts all the time there"] if unknown else []
+    return found if training else [*found, "too few dyads of training to compare its people with these"]
 
 
 def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
@@ -120,14 +113,12 @@ def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
 
     A mouth that talks is judged by its words (`evaluate interaction`).
     """
-    rng = np.random.default_rng(0)
-    return [windows(motion, rng, silent(dyad)[: len(motion)]) for dyad, motion in zip(dyads, motions, strict=True)]
-
-
-def silent(dyad: Dyad) -> Bools:
-    """Return (N,) frames in which the dyad's listener is silent."""
-    frames = len(dyad.listener)
-    return np.ones(frames, bool) if dyad.agent_audio is None else ~speaks(dyad.agent_audio, frames, FRAME_HZ)
+    rng, found = np.random.default_rng(0), []
+    for motion, dyad in zip(motions, dyads, strict=True):
+        frames, said = len(dyad.listener), dyad.agent_audio
+        silent = np.ones(frames, bool) if said is None else ~speaks(said, frames, FRAME_HZ)
+        found.append(windows(motion, rng, silent[: len(motion)]))
+    return found
 
 
 def _training_windows(data: Path, count: int) -> list[Floats]:
@@ -147,8 +138,7 @@ def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_
             frames += speaker
     kept = frames[: round(drift_s * FRAME_HZ)]
     timed = [changed(frame, time_s=(index + 1) * FRAME_S) for index, frame in enumerate(kept)]
-    motion: Floats = rollout(listener, timed, [seed]).motion[0]
-    return motion
+    return np.asarray(rollout(listener, timed, [seed]).motion[0])
 
 
 def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:
@@ -174,9 +164,7 @@ def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
 # --- two-sample tests -----------------------------------------------------------------------------------------------
 
 
-def two_samples(
-    ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequence[Floats], each: Callable[[], object]
-) -> dict[str, Any]:
+def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequence[Floats]) -> dict[str, Any]:
     """Return by region `two_sample_auc` of windows by dyad, each with its interval over dyads, and tests for scale.
 
     For scale: people against other people of the same split and, if `training` is given, people of training against
@@ -184,17 +172,18 @@ def two_samples(
     against people of training. `levelled_`: each motion standardised by its own mean and deviation.
     """
     half = 2 * (len(theirs) // 2)
-    pairs: dict[str, tuple[Sequence[Floats], ...]] = {
+    pairs: dict[str, tuple[Sequence[Floats], Sequence[Floats]]] = {
         "two_sample_auc": (ours, theirs),
         "person_two_sample_auc": (theirs[0:half:2], theirs[1:half:2]),
     }
     if training:
         pairs |= {"training_two_sample_auc": (training, theirs), "imitated_two_sample_auc": (ours, training)}
-    pairs |= {f"levelled_{name}": tuple([*map(levelled, one)] for one in pair) for name, pair in pairs.items()}
-    found = {
-        name: {region: separability(one, other, region, each) for region in REGIONS}
-        for name, (one, other) in pairs.items()
+    pairs |= {
+        f"levelled_{name}": ([*map(levelled, one)], [*map(levelled, other)]) for name, (one, other) in pairs.items()
     }
+    found = {name: dict[str, tuple[float, float, float]]() for name in pairs}
+    for name, region in tracked(list(product(pairs, REGIONS)), "two-sample tests"):
+        found[name][region] = separability(*pairs[name], region)
     return {
         **{name: {region: round(auc, 3) for region, (auc, _, _) in one.items()} for name, one in found.items()},
         "interval": {
@@ -229,13 +218,11 @@ def levelled(part: Floats) -> Floats:
     return np.asarray((part - part.mean(axis=(0, 1))) / part.std(axis=(0, 1)).clip(min=1e-6), np.float32)
 
 
-def separability(
-    ours: Sequence[Floats], theirs: Sequence[Floats], region: str, each: Callable[[], object] = lambda: None
-) -> tuple[float, float, float]:
+def separability(ours: Sequence[Floats], theirs: Sequence[Floats], region: str) -> tuple[float, float, float]:
     """Return the area under the ROC curve and its 95 % interval over dyads, of windows (W, 50, 58) by dyad.
 
-    Dyad d of both is the same dyad, or at least not a person of another one. Calls `each()` after every fold. Raises
-    ValueError for fewer dyads than folds.
+    Dyad d of both is the same dyad, or at least not a person of another one. Raises ValueError for fewer dyads than
+    folds.
     """
     if len(ours) != len(theirs) or len(ours) < FOLDS:
         raise ValueError(f"dyads: expected equally many, {FOLDS} or more, got {len(ours)} and {len(theirs)}")
@@ -251,7 +238,6 @@ def separability(
         held_out = fold[dyad] == number
         if held_out.any() and not held_out.all():
             scores[held_out] = _scores(values[~held_out], label[~held_out], values[held_out], _SEED + number)
-        each()
     rng, drawn = np.random.default_rng(_SEED), []
     rows = [np.flatnonzero(dyad == number) for number in range(dyad.max() + 1)]
     for _ in range(_RESAMPLED):  # dyads, with replacement

@@ -26,8 +26,7 @@ from typing import Any, Final
 
 import numpy as np
 import soundfile
-from rich.console import Console
-from rich.progress import Progress
+from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
 from sfms_robot.config import find
@@ -38,8 +37,10 @@ from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
 from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread, tracked
 from sfms_robot.listeners.registry import load_listener, one_thread
+from sfms_robot.viewer.page_process import Address
+from sfms_robot.viewer.study_server import serve_study
 
 QUESTIONS: Final = {
     "person": "Which listens more like a person?",
@@ -80,23 +81,7 @@ class Preference:
 
 
 _COLUMNS: Final = tuple(field.name for field in fields(Preference))
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyOptions:
-    """Options of the command.
-
-    Attributes:
-        conditions: Listeners by name or folder, and RECORDED for the people of `data`.
-        data: Composed dyads, or any data set with voices; None: the bundled voices that were never trained on.
-    """
-
-    conditions: Sequence[str]
-    data: Path | None
-    voices: int
-    seconds: float
-    seed: int
-    folder: Path
+_PREFERENCE: Final = TypeAdapter(Preference)
 
 
 class Study:
@@ -148,16 +133,9 @@ class Study:
         if any((answer.participant, answer.trial) == (participant, number) for answer in self._answers):
             return  # sent twice on a bad connection
         sides = {"left": trial.left, "right": trial.right, NEITHER: NEITHER}
+        given: dict[str, Any] = {"participant": participant, "trial": number, "voice": trial.voice}
         rows = [
-            Preference(
-                participant=participant,
-                trial=number,
-                voice=trial.voice,
-                question=question,
-                left=trial.left,
-                right=trial.right,
-                chosen=sides[chosen[question]],
-            )
+            Preference(**given, question=question, left=trial.left, right=trial.right, chosen=sides[chosen[question]])
             for question in QUESTIONS
         ]
         append_answers(self.folder / _ANSWERS, rows)
@@ -185,9 +163,6 @@ def trials(conditions: Sequence[str], voices: int, seed: int, participant: str) 
 
 def serve(study: Study, view: str, ready: Callable[[str, int | None], None]) -> None:
     """Serve the page until interrupted. Calls `ready(url, taken port or None)` once. Raises ConfigError, PortError."""
-    from sfms_robot.viewer.page_process import Address
-    from sfms_robot.viewer.study_server import serve_study
-
     serve_study(study, Address.parsed(view), ready)
 
 
@@ -204,27 +179,47 @@ class _StudyVoice:
     recorded: Floats | None
 
 
-def prepare(options: StudyOptions) -> Study:
-    """Return the study in `options.folder`, made if it is missing. Blocks for minutes. Raises RobotError."""
-    described = _described(options)
-    file, clips = options.folder / _STUDY, options.folder / _CLIPS
+def prepare(
+    conditions: Sequence[str], data: Path | None, *, voices: int, seconds: float, seed: int, folder: Path
+) -> Study:
+    """Return the study in `folder`, made if it is missing. Blocks for minutes.
+
+    Args:
+        conditions: Listeners by name or folder, and RECORDED for the people of `data`.
+        data: Composed dyads, or any data set with voices; None: the bundled voices that were never trained on.
+        voices: How many; each condition hears every voice.
+        seconds: Length of a clip.
+        seed: Of the listeners and of the order of trials.
+        folder: Of the study.
+
+    Raises RobotError.
+    """
+    described = {
+        "version": 1,
+        "conditions": list(conditions),
+        "weights": _weights(conditions, data),
+        "data": None if data is None else data.name,
+        "seconds": seconds,
+        "asked_voices": voices,
+        "seed": seed,
+    }
+    file, clips = folder / _STUDY, folder / _CLIPS
     if file.is_file():
         found = json.loads(file.read_text(encoding="utf-8"))
         if found != described | {"voices": found.get("voices")}:
             raise ConfigError(f"{file}: another study (other conditions, voices or seed); name another folder (--out)")
-        return Study(options.folder)
-    voices = _voices(options)
+        return Study(folder)
+    heard = _voices(data, voices, round(seconds * FRAME_HZ))
     clips.mkdir(parents=True, exist_ok=True)
     one_thread()
-    with Progress(console=Console(stderr=True)) as progress:
-        for condition in progress.track(options.conditions, description="clips"):
-            for number, motion in enumerate(_motions(condition, voices, options)):
-                motion.astype("<f4").tofile(clips / f"{clip_name(options.seed, condition, number)}.f32")
-    for number, each in enumerate(voices):
+    for condition in tracked(conditions, "clips"):
+        for number, motion in enumerate(_motions(condition, heard, seed)):
+            motion.astype("<f4").tofile(clips / f"{clip_name(seed, condition, number)}.f32")
+    for number, each in enumerate(heard):
         soundfile.write(clips / f"voice-{number}.wav", each.audio, AUDIO_HZ, subtype="PCM_16")
-    plain = described | {"voices": [each.name for each in voices]}
+    plain = described | {"voices": [each.name for each in heard]}
     file.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
-    return Study(options.folder)
+    return Study(folder)
 
 
 def clip_name(seed: int, condition: str, voice: int) -> str:
@@ -232,32 +227,24 @@ def clip_name(seed: int, condition: str, voice: int) -> str:
     return hashlib.sha256(f"{seed} {condition} {voice}".encode()).hexdigest()[:12]
 
 
-def _described(options: StudyOptions) -> dict[str, Any]:
-    """Return everything that identifies a study; listeners also by their weights."""
-    if len(set(options.conditions)) != len(options.conditions) or len(options.conditions) < 2:
+def _weights(conditions: Sequence[str], data: Path | None) -> dict[str, str]:
+    """Return the digest of each listener's weights. Raises ConfigError for conditions that cannot be compared."""
+    if len(set(conditions)) != len(conditions) or len(conditions) < 2:
         raise ConfigError("--listener: two or more, each once; 'recorded' is what the people of --data did")
-    if RECORDED in options.conditions and options.data is None:
+    if RECORDED in conditions and data is None:
         raise ConfigError("--listener recorded: needs --data (composed dyads, or a data set)")
     weights = {}
-    for name in options.conditions:
+    for name in conditions:
         if name != RECORDED:
             folder = find("listeners", name, "config.yaml")
             load_listener(folder)  # report its errors here
             weights[name] = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-    return {
-        "version": 1,
-        "conditions": list(options.conditions),
-        "weights": weights,
-        "data": None if options.data is None else options.data.name,
-        "seconds": options.seconds,
-        "asked_voices": options.voices,
-        "seed": options.seed,
-    }
+    return weights
 
 
-def _voices(options: StudyOptions) -> list[_StudyVoice]:
-    """Return the voices, each cut to warm-up and clip. Raises ConfigError if there are too few."""
-    length, warm_up = round(options.seconds * FRAME_HZ), round(_WARM_UP_S * FRAME_HZ)
+def _voices(data: Path | None, count: int, length: int) -> list[_StudyVoice]:
+    """Return voices of `length` frames, each after a warm-up. Raises ConfigError if there are too few."""
+    warm_up = round(_WARM_UP_S * FRAME_HZ)
     found: list[_StudyVoice] = []
 
     def cut(name: str, frames: Sequence[SpeakerFrame], audio: Floats, recorded: Floats | None, end: int) -> None:
@@ -267,31 +254,28 @@ def _voices(options: StudyOptions) -> list[_StudyVoice]:
         motion = None if recorded is None else recorded[begin:end]
         found.append(_StudyVoice(name, frames[max(0, begin - warm_up) : end], sound, motion))
 
-    if options.data is not None:
-        for dyad in map(at_frame_rate, usable(open_for("arkit58", options.data, "test"))):
+    if data is not None:
+        for dyad in map(at_frame_rate, usable(open_for("arkit58", data, "test"))):
             if dyad.audio is not None and len(dyad.speaker) >= length:
                 end = min(len(dyad.speaker), length + warm_up)
                 cut(dyad.name, frames_of_dyad(dyad), dyad.audio, dyad.listener, end)
     else:  # consecutive pieces of the bundled voices that were never trained on
         for speaker in unseen(voice_folders(None)):
-            count = len(speaker.voice) // FRAME_SAMPLES
-            face = np.full((count, 58), np.nan, np.float32) if speaker.face is None else speaker.face[:count]
-            frames = speaker_frames(speaker.voice, face, attention=np.ones(count, np.float32))
-            for end in range(length, count + 1, length):
+            frames = speaker_frames(speaker.voice, speaker.face, attention=np.ones(len(speaker.face), np.float32))
+            for end in range(length, len(frames) + 1, length):
                 cut(f"{speaker.name} {(end - length) / FRAME_HZ:.0f} s", frames, speaker.voice, None, end)
-    if len(found) < options.voices:
-        raise ConfigError(f"--voices {options.voices}: there are {len(found)} of {options.seconds:g} s or more")
-    return spread(found, options.voices)
+    if len(found) < count:
+        raise ConfigError(f"--voices {count}: there are {len(found)} of {length / FRAME_HZ:g} s or more")
+    return spread(found, count)
 
 
-def _motions(condition: str, voices: Sequence[_StudyVoice], options: StudyOptions) -> list[Floats]:
+def _motions(condition: str, voices: Sequence[_StudyVoice], seed: int) -> list[Floats]:
     """Return the motion (N, 58) to every voice."""
     if condition == RECORDED:
         return [each.recorded for each in voices if each.recorded is not None]
     listener = load_listener(find("listeners", condition, "config.yaml"))
-    length = round(options.seconds * FRAME_HZ)
     return [
-        rollout(listener, each.frames, [options.seed + _HOPS * number]).motion[0, -length:]
+        rollout(listener, each.frames, [seed + _HOPS * number]).motion[0, -(len(each.audio) // FRAME_SAMPLES) :]
         for number, each in enumerate(voices)
     ]
 
@@ -313,9 +297,8 @@ def read_answers(file: Path) -> list[Preference]:
 
 def _answer(file: Path, line: int, row: Mapping[str, str | None]) -> Preference:
     try:
-        values: dict[str, Any] = {key: value for key, value in row.items() if value is not None}
-        answer = Preference(**values | {"trial": int(values["trial"]), "voice": int(values["voice"])})
-    except (TypeError, ValueError, KeyError) as error:
+        answer = _PREFERENCE.validate_python({key: value for key, value in row.items() if value is not None})
+    except ValueError as error:
         raise ConfigError(f"{file}: line {line} is not an answer: {error}") from error
     if answer.question not in QUESTIONS:
         raise ConfigError.at(file, f"line {line}: question", answer.question, "is not a question", QUESTIONS)
@@ -337,7 +320,7 @@ def append_answers(file: Path, answers: Sequence[Preference]) -> None:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def summary(answers: Sequence[Preference], seed: int = 0) -> dict[str, Any]:
+def summary(answers: Sequence[Preference]) -> dict[str, Any]:
     """Return per question and pair of conditions: counts, share of the first, interval, p; and strengths."""
     conditions = sorted({name for answer in answers for name in (answer.left, answer.right)})
     rows, strengths = [], {}
@@ -345,7 +328,7 @@ def summary(answers: Sequence[Preference], seed: int = 0) -> dict[str, Any]:
         asked = [answer for answer in answers if answer.question == question]
         rows += [_pair(question, first, second, asked) for first, second in combinations(conditions, 2)]
         if len(conditions) > 2 and asked:
-            strengths[question] = _strengths(conditions, asked, seed)
+            strengths[question] = _strengths(conditions, asked)
     chosen = [answer for answer in answers if answer.chosen != NEITHER]
     left = sum(answer.chosen == answer.left for answer in chosen)
     return {
@@ -372,7 +355,7 @@ def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -
     return row
 
 
-def _strengths(conditions: Sequence[str], asked: Sequence[Preference], seed: int) -> dict[str, dict[str, Any]]:
+def _strengths(conditions: Sequence[str], asked: Sequence[Preference]) -> dict[str, dict[str, Any]]:
     people = sorted({answer.participant for answer in asked})
     wins = np.zeros((len(people), len(conditions), len(conditions)))
     for answer in asked:
@@ -382,7 +365,7 @@ def _strengths(conditions: Sequence[str], asked: Sequence[Preference], seed: int
             wins[place, conditions.index(better), conditions.index(worse)] += share
     value, interval = bradley_terry(wins.sum(axis=0)), None
     if len(people) > 1:
-        drawn = draw_people(len(people), seed)
+        drawn = draw_people(len(people), 0)
         interval = ends(np.array([bradley_terry(np.tensordot(counts, wins, axes=1)) for counts in drawn])).T.tolist()
     return {
         name: {"strength": float(value[place]), "interval": interval and interval[place]}
@@ -399,8 +382,3 @@ def bradley_terry(wins: Doubles) -> Doubles:
         strength = won / (met / (strength[:, None] + strength[None, :])).sum(axis=1)
         strength /= np.exp(np.log(strength).mean())
     return np.asarray(np.log(strength))
-
-
-def table(answers: Path) -> dict[str, Any]:
-    """Return the summary of the answers in a CSV file. Raises ConfigError."""
-    return summary(read_answers(answers))

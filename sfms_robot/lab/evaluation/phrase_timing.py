@@ -6,16 +6,19 @@ phrase ends, so a listener that nods at random gets 1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfms_robot.frames import Doubles
 from sfms_robot.signals.events import Bools, runs
 
 AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
 LATER_S: Final = (1.5, 3.0)  # compared with `AFTER_S`
+PAUSE_S: Final = 0.2  # of silence, which ends a phrase
 QUIET_DB: Final = -66.0  # of full scale: nothing below is speech
 LISTENING_S: Final = 2.0  # the other person spoke this recently
 
@@ -38,123 +41,100 @@ def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.0
     loud_db = np.percentile(level_db, 97)
     floor_db = ndimage.percentile_filter(level_db, 5, size=max(3, int(8 / frame_s)), mode="nearest")
     threshold_db = np.clip(floor_db + 8, loud_db - 34, loud_db - 16)
-    active = (level_db > threshold_db) & (level_db > QUIET_DB)
-    return _without_short(active, True, 2)
+    active: Bools = (level_db > threshold_db) & (level_db > QUIET_DB)
+    for start, end in runs(active):
+        active[start:end] = end - start > 1  # one frame is no speech
+    return active
 
 
-def _without_short(active: Bools, value: bool, frames: int) -> Bools:
-    out = active.copy()
-    for start, end in runs(active == value):
-        if end - start < frames:
-            out[start:end] = not value
-    return out
+def phrase_ends(voice_active: Bools, rate_hz: float) -> Doubles:
+    """Return the seconds at which speech ends and at least 0.2 s of silence follow."""
+    need = int(np.ceil(PAUSE_S * rate_hz - 1e-9))
+    return np.array([start / rate_hz for start, end in runs(~voice_active) if start > 0 and end - start >= need])
 
 
-def phrase_ends(voice_active: ArrayLike, rate_hz: float, silence_s: float = 0.2) -> NDArray[np.float64]:
-    """Return the seconds at which speech ends and at least `silence_s` of silence follows."""
-    active = np.asarray(voice_active, bool)
-    need = int(np.ceil(silence_s * rate_hz - 1e-9))
-    silences = runs(~active)
-    return np.array([start / rate_hz for start, end in silences if start > 0 and end - start >= need])
-
-
-def listening_mask(voice_active: ArrayLike, rate_hz: float, own_voice: ArrayLike | None = None) -> Bools:
+def listening_mask(voice_active: Bools, rate_hz: float, own_voice: Bools | None = None) -> Bools:
     """Return True where the other spoke in the last 2 s (this instant included) and the listener is silent."""
-    active = np.asarray(voice_active, bool)
-    last = np.maximum.accumulate(np.where(active, np.arange(len(active)), -(10**9)))
-    recent = np.arange(len(active)) - last <= LISTENING_S * rate_hz
-    return recent if own_voice is None else recent & ~np.asarray(own_voice, bool)
+    index = np.arange(len(voice_active))
+    last = np.maximum.accumulate(np.where(voice_active, index, -(10**9)))
+    recent = index - last <= LISTENING_S * rate_hz
+    return recent if own_voice is None else recent & ~own_voice
 
 
-def nods_per_minute(onsets_s: Sequence[float] | NDArray[np.float64], listening: ArrayLike, rate_hz: float) -> float:
+def nods_per_minute(onsets_s: ArrayLike, listening: Bools, rate_hz: float) -> float:
     """Return onsets inside listening time per minute of it; NaN without listening time."""
-    inside, minutes = _inside(onsets_s, np.asarray(listening, bool), rate_hz)
+    inside, minutes = _inside(onsets_s, listening, rate_hz)
     return inside / minutes if minutes else float("nan")
 
 
-def _inside(onsets_s: Sequence[float] | NDArray[np.float64], mask: Bools, rate_hz: float) -> tuple[int, float]:
+def _inside(onsets_s: ArrayLike, mask: Bools, rate_hz: float) -> tuple[int, float]:
     index = np.round(np.asarray(onsets_s, np.float64) * rate_hz).astype(int)
     index = index[(index >= 0) & (index < len(mask))]
     return int(mask[index].sum()), float(mask.sum()) / rate_hz / 60
 
 
 def phrase_end_counts(
-    onsets_s: Sequence[float] | NDArray[np.float64],
-    ends_s: Sequence[float] | NDArray[np.float64],
-    listening: ArrayLike,
-    rate_hz: float,
+    onsets_s: ArrayLike, ends_s: Doubles, listening: Bools, rate_hz: float
 ) -> tuple[int, float, int, float]:
     """Count onsets and minutes in the two windows after phrase ends, both within listening time.
 
     Returns (onsets after, minutes after, onsets later, minutes later): add them up over people, then divide.
     An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
     """
-    listened = np.asarray(listening, bool)
-    after = window_after(ends_s, AFTER_S, len(listened), rate_hz) & listened
-    later = window_after(ends_s, LATER_S, len(listened), rate_hz) & listened
+    after, later = (window_after(ends_s, span_s, len(listening), rate_hz) & listening for span_s in (AFTER_S, LATER_S))
     return (*_inside(onsets_s, after, rate_hz), *_inside(onsets_s, later, rate_hz))
 
 
-def window_after(
-    ends_s: Sequence[float] | NDArray[np.float64], span_s: tuple[float, float], size: int, rate: float
-) -> Bools:
+def window_after(ends_s: Iterable[float], span_s: tuple[float, float], size: int, rate: float) -> Bools:
     """Return (size,), True in the window `span_s` after each instant of `ends_s`."""
     mask = np.zeros(size, bool)
     for end in ends_s:
-        mask[max(0, int(round((end + span_s[0]) * rate))) : max(0, int(round((end + span_s[1]) * rate)))] = True
+        first, last = (max(0, round(float(end + offset) * rate)) for offset in span_s)
+        mask[first:last] = True
     return mask
 
 
-def phrase_end_ratio(
-    onsets_s: Sequence[float] | NDArray[np.float64],
-    ends_s: Sequence[float] | NDArray[np.float64],
-    listening: ArrayLike,
-    rate_hz: float,
-) -> float:
-    """Return nod onsets per minute 0 to 0.8 s after a phrase end over those 1.5 to 3 s after it; NaN if undefined."""
-    return ratio_of(phrase_end_counts(onsets_s, ends_s, listening, rate_hz))
-
-
 def ratio_of(counts: Sequence[float]) -> float:
-    """Return the ratio of rates of (onsets after, minutes after, onsets later, minutes later), summed over people."""
+    """Return the phrase-end ratio of (onsets after, minutes after, onsets later, minutes later), summed over people.
+
+    It is the rate of onsets 0 to 0.8 s after a phrase end over that 1.5 to 3 s after it; NaN if undefined.
+    """
     after, after_min, later, later_min = counts
     if not later or not after_min or not later_min:
         return float("nan")
     return (after / after_min) / (later / later_min)
 
 
-def near(spans_s: ArrayLike, frames: int, rate_hz: float, within_s: float) -> Bools:
+def near(spans_s: Doubles, frames: int, rate_hz: float, within_s: float) -> Bools:
     """Return (frames,), True at instants that are at most `within_s` away from one of the spans (K, 2)."""
     mask = np.zeros(frames, bool)
-    for start, end in np.asarray(spans_s, np.float64).reshape(-1, 2):
-        first, last = np.ceil((start - within_s) * rate_hz - 1e-6), np.floor((end + within_s) * rate_hz + 1e-6)
-        mask[max(0, int(first)) : max(0, int(last) + 1)] = True
+    for start, end in spans_s.tolist():
+        first, last = math.ceil((start - within_s) * rate_hz - 1e-6), math.floor((end + within_s) * rate_hz + 1e-6)
+        mask[max(0, first) : max(0, last + 1)] = True
     return mask
 
 
-def rank_auc(scores: ArrayLike, positive: ArrayLike, negative: ArrayLike) -> float:
+def rank_auc(scores: Doubles, positive: NDArray[Any], negative: NDArray[Any]) -> float:
     """Return the chance that a positive instant scores higher than a negative one, ties half; NaN without either kind.
 
     scores (N,); positive and negative are (N,) masks or indices.
     """
     from scipy import stats
 
-    values = np.asarray(scores, np.float64)
-    high, low = values[np.asarray(positive)], values[np.asarray(negative)]
+    high, low = scores[positive], scores[negative]
     if not len(high) or not len(low):
         return float("nan")
     ranks = stats.rankdata(np.concatenate([high, low]))[: len(high)]
     return float((ranks.sum() - len(high) * (len(high) + 1) / 2) / (len(high) * len(low)))
 
 
-def find_gaze_shifts(yaw_rad: ArrayLike, pitch_rad: ArrayLike, rate_hz: float, least_rad: float = 0.14) -> list[float]:
-    """Return the seconds at which the gaze (head and eyes together), (N,) each, jumps by 8 degrees or more.
+def find_gaze_shifts(gaze: Doubles, rate_hz: float, least_rad: float = 0.14) -> list[float]:
+    """Return the seconds at which the gaze (N, 2) of head and eyes together jumps by 8 degrees or more.
 
     A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
     """
     from scipy import signal
 
-    gaze = np.stack([np.asarray(yaw_rad, np.float64), np.asarray(pitch_rad, np.float64)], axis=1)
     rest, jump = max(1, round(0.24 * rate_hz)), max(1, round(0.2 * rate_hz))
     if len(gaze) < 2 * rest + jump:
         return []

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Final, Literal
@@ -78,21 +78,9 @@ def evaluate_robustness(
     load_listener(folder)  # report its errors here, not from a process
     voices = voice_folders(data)
     everybody = unseen(voices, split)[:speakers]
-    tasks = [
-        _RobustnessTask(
-            folder=folder,
-            voices=voices,
-            split=split,
-            speaker=place,
-            inputs=inputs,
-            condition=CONDITIONS.index(condition),
-            minutes=minutes,
-            seeds=range(seed, seed + seeds),
-        )
-        for place, speaker in enumerate(everybody)
-        for inputs, condition in cases(speaker)
-    ]
-    rows = run_in_processes(_play, tasks, jobs, "speakers heard")
+    tasks = [(place, inputs, number) for place in range(len(everybody)) for inputs, number in cases()]
+    work = partial(_play, folder, voices, split, minutes, range(seed, seed + seeds))
+    rows = run_in_processes(work, tasks, jobs, "speakers heard")
     found: dict[str, Any] = {}
     for kind in RANGES:
         rate_key, scatter_key = f"{kind}s_per_minute", f"{kind}s_variance_over_mean"
@@ -117,31 +105,21 @@ def evaluate_robustness(
     }
 
 
-@dataclass(frozen=True, kw_only=True)
-class _RobustnessTask:
-    """One speaker in one condition: places of `speaker` among the voices of `split`, and in `CONDITIONS`."""
-
-    folder: Path
-    voices: tuple[Path, ...]
-    split: Split
-    speaker: int
-    inputs: Inputs
-    condition: int
-    minutes: float
-    seeds: range
-
-
-def _play(task: _RobustnessTask) -> dict[str, Any]:
-    speaker, condition = unseen(task.voices, task.split)[task.speaker], CONDITIONS[task.condition]
-    rng = np.random.default_rng([task.seeds.start, task.speaker, task.condition])
-    frames = heard_and_seen(speaker, task.inputs, condition, task.minutes, rng)
-    played = rollout(_listener(task.folder), frames, task.seeds)
+def _play(
+    folder: Path, voices: tuple[Path, ...], split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
+) -> dict[str, Any]:
+    """Play one speaker in one condition: places among the voices of `split`, and in `CONDITIONS`."""
+    place, inputs, number = task
+    speaker, condition = unseen(voices, split)[place], CONDITIONS[number]
+    frames = heard_and_seen(speaker, inputs, condition, minutes, np.random.default_rng([seeds.start, place, number]))
+    voice = np.resize(speaker.voice, len(frames) * FRAME_SAMPLES)  # as recorded
+    listened = float(listening_mask(voice_activity(voice), FRAME_HZ).sum()) / FRAME_HZ / 60
     return {
         "speaker": speaker.name,
-        "inputs": task.inputs,
+        "inputs": inputs,
         "condition": condition.name,
-        "tells_speech": condition.tells_speech(task.inputs),
-        **rates(counted(played), len(frames) / FRAME_HZ / 60, listened_minutes(speaker, task.minutes)),
+        "tells_speech": inputs != "face" or condition.mouth_moves,
+        **rates(counted(rollout(_listener(folder), frames, seeds)), len(frames) / FRAME_HZ / 60, listened),
     }
 
 
@@ -153,11 +131,11 @@ _listener = cache(load_listener)
 
 @dataclass(frozen=True)
 class UnseenSpeaker:
-    """A person who talks: voice (n,) 16 kHz, and face (N, 58) at 25 frames a second, or None without a film."""
+    """A person who talks: voice (N * 640,) at 16 kHz, and face (N, 58) at 25 frames a second."""
 
     name: str
     voice: Floats
-    face: Floats | None
+    face: Floats
 
 
 def voice_folders(data: Path | None) -> tuple[Path, ...]:
@@ -178,15 +156,15 @@ def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[UnseenSpeak
     kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
     if not kept:
         raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for {split}")
-    found = []
-    for number, (name, voice) in enumerate(sorted(kept.items())):
-        rng = np.random.default_rng(number)
-        frames = len(voice.recording) // FRAME_SAMPLES
-        mouth = voice.mouth if voice.mouth is not None else mouth_over(voice.recording, motions.talk, frames, rng)
-        frames = min(frames, len(mouth))
-        face = speaker_motion(mouth[:frames], motions, rng, attention=np.ones(frames, np.float32))
-        found.append(UnseenSpeaker(name, voice.recording[: frames * FRAME_SAMPLES], face))
-    return tuple(found)
+
+    def speaker(number: int, name: str) -> UnseenSpeaker:
+        rng, recording, mouth = np.random.default_rng(number), kept[name].recording, kept[name].mouth
+        frames = len(recording) // FRAME_SAMPLES
+        mouth = (mouth_over(recording, motions.talk, frames, rng) if mouth is None else mouth)[:frames]
+        face = speaker_motion(mouth, motions, rng, attention=np.ones(len(mouth), np.float32))
+        return UnseenSpeaker(name, recording[: len(mouth) * FRAME_SAMPLES], face)
+
+    return tuple(speaker(number, name) for number, name in enumerate(sorted(kept)))
 
 
 # --- conditions -----------------------------------------------------------------------------------------------------
@@ -207,16 +185,6 @@ class InputCondition:
     face: Degrade | None = None
     attention: Callable[[int], Floats] | None = None
     mouth_moves: bool = True
-
-    def concerns(self, inputs: Inputs) -> bool:
-        """Return whether it changes these inputs, or is the condition that the others are compared with."""
-        of_voice, of_face = self.voice is not None, self.face is not None or self.attention is not None
-        nothing = not of_voice and not of_face
-        return nothing or (of_voice and inputs != "face") or (of_face and inputs != "voice")
-
-    def tells_speech(self, inputs: Inputs) -> bool:
-        """Return whether a listener can know that the person speaks."""
-        return inputs != "face" or self.mouth_moves
 
 
 def noise(voice: Floats, rng: np.random.Generator) -> Floats:
@@ -295,12 +263,8 @@ def _clipped(values: NDArray[np.floating]) -> Floats:
     return np.asarray(np.clip(values, -1, 1), np.float32)
 
 
-PLAIN: Final = InputCondition(name="as recorded")
-FLICKER: Final = InputCondition(
-    name="attention flickers", attention=lambda frames: (np.arange(frames) % 2).astype(np.float32)
-)
 CONDITIONS: Final = (
-    PLAIN,
+    InputCondition(name="as recorded"),
     *(InputCondition(name=each.__name__, voice=each) for each in (noise, quiet, loud, room, telephone)),
     *(
         InputCondition(
@@ -308,17 +272,18 @@ CONDITIONS: Final = (
         )
         for each in (jitter, lost, constant, saturated, upside_down)
     ),
-    FLICKER,
+    InputCondition(name="attention flickers", attention=lambda frames: (np.arange(frames) % 2).astype(np.float32)),
 )
 
 
-def cases(speaker: UnseenSpeaker) -> Iterator[tuple[Inputs, InputCondition]]:
-    """Yield the inputs and conditions in which a speaker is played."""
-    every: tuple[Inputs, ...] = ("voice",) if speaker.face is None else ("voice", "face", "both")
-    for inputs in every:
-        for condition in CONDITIONS:
-            if condition.concerns(inputs):
-                yield inputs, condition
+def cases() -> Iterator[tuple[Inputs, int]]:
+    """Yield the inputs of a speaker, and the places of the conditions that change them or nothing at all."""
+    inputs: Inputs
+    for inputs in ("voice", "face", "both"):
+        for number, how in enumerate(CONDITIONS):
+            changed = {"face"} if how.face or how.attention else {"voice"} if how.voice else {"voice", "face"}
+            if inputs == "both" or inputs in changed:
+                yield inputs, number
 
 
 def heard_and_seen(
@@ -329,7 +294,7 @@ def heard_and_seen(
     voice = np.resize(speaker.voice, frames * FRAME_SAMPLES).astype(np.float32)
     voice = condition.voice(voice, rng) if condition.voice else voice
     face = np.full((frames, len(CHANNEL_INDEX)), np.nan, np.float32)
-    if inputs != "voice" and speaker.face is not None:
+    if inputs != "voice":
         face = np.resize(speaker.face, face.shape).astype(np.float32)
         face = condition.face(face, rng) if condition.face else face
     attention = condition.attention(frames) if condition.attention else np.ones(frames, np.float32)
@@ -348,24 +313,16 @@ def counted(played: Rollout) -> dict[str, list[int]]:
     return {kind: [len(seen(motion, kind)) for motion in played.motion] for kind in MOTION_EVENTS} | decided
 
 
-def listened_minutes(speaker: UnseenSpeaker, minutes: float) -> float:
-    """Return the minutes in which the speaker talks, or stopped less than 2 s ago, by the voice as recorded."""
-    voice = np.resize(speaker.voice, round(60 * minutes * FRAME_HZ) * FRAME_SAMPLES)
-    return float(listening_mask(voice_activity(voice), FRAME_HZ).sum()) / FRAME_HZ / 60
-
-
-def rates(
-    counts: Mapping[str, Sequence[int]], minutes: float, listened: float | None = None
-) -> dict[str, float | None]:
+def rates(counts: Mapping[str, Sequence[int]], minutes: float, listened: float) -> dict[str, float | None]:
     """Return the mean per minute and the variance over the mean of counts over streams; None if undefined.
 
-    Events that only answer a speaker are counted per minute of `listened` (default: of all).
+    Events that only answer a speaker are counted per minute of `listened`: the speaker talks, or stopped less than 2 s
+    ago.
     """
     figures: dict[str, float | None] = {}
     for kind, numbers in counts.items():
         mean = float(np.mean(numbers))
-        always = listened is None or kind.removeprefix("decided_") in ALWAYS
-        time = minutes if always else max(listened or 0.0, FRAME_S / 60)
+        time = minutes if kind.removeprefix("decided_") in ALWAYS else max(listened, FRAME_S / 60)
         figures[f"{kind}s_per_minute"] = round(mean / time, 3)
         several = mean > 0 and len(numbers) > 1
         figures[f"{kind}s_variance_over_mean"] = round(float(np.var(numbers, ddof=1)) / mean, 3) if several else None

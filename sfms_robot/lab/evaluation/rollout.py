@@ -10,8 +10,9 @@ A listener that follows events receives the given ones, each `LEAD_FRAMES` befor
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import track
 from torch import Tensor
 
 from sfms_robot.config import find
@@ -66,23 +67,20 @@ def run_in_processes(
 
     Shows a progress bar. An exception of a task is raised here and ends the others. `work` is a module's function.
     """
-    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
     workers = min(jobs or os.cpu_count() or 1, len(tasks))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task(title, total=len(tasks))
-        if workers <= 1:
-            one_thread()
-            results = []
-            for task in tasks:
-                results.append(work(task))
-                progress.advance(bar)
-            return results
-        with process_pool(workers) as pool:
-            waiting = [pool.submit(work, task) for task in tasks]
-            for done in as_completed(waiting):
-                done.result()
-                progress.advance(bar)
-            return [one.result() for one in waiting]
+    if workers <= 1:
+        one_thread()
+        return [work(task) for task in tracked(tasks, title)]
+    with process_pool(workers) as pool:
+        waiting = [pool.submit(work, task) for task in tasks]
+        for done in tracked(as_completed(waiting), title, len(tasks)):
+            done.result()
+        return [one.result() for one in waiting]
+
+
+def tracked(items: Iterable[_Task], title: str, total: int | None = None) -> Iterable[_Task]:
+    """Yield the items, with a progress bar on stderr."""
+    return track(items, title, total, console=Console(stderr=True))
 
 
 def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
@@ -104,19 +102,16 @@ def speaker_frames(
     stays. Without any sound there is no microphone.
     """
     heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
+    said = None if agent_audio is None else np.pad(agent_audio, (0, FRAME_SAMPLES))[FRAME_SAMPLES:]
     shown = np.asarray(np.isfinite(face).all(axis=1))
     frames = []
     for index, row in enumerate(face):
-        time_s = (index + 1) * FRAME_S
-        now, following = (slice(at * FRAME_SAMPLES, (at + 1) * FRAME_SAMPLES) for at in (index, index + 1))
-        said = None if agent_audio is None else agent_audio[following]
-        if said is not None and len(said) < FRAME_SAMPLES:
-            said = np.pad(said, (0, FRAME_SAMPLES - len(said)))
-        seen = FaceFrame.of(time_s, row) if shown[index] else None
+        time_s, now = (index + 1) * FRAME_S, slice(index * FRAME_SAMPLES, (index + 1) * FRAME_SAMPLES)
         looks = None if attention is None else float(attention[index])
-        if looks is not None and seen is None and not np.isnan(looks):
+        if looks is not None and not shown[index] and not math.isnan(looks):
             looks = None
-        frames.append(SpeakerFrame(time_s, heard[now], seen, said, looks))
+        seen = FaceFrame.of(time_s, row) if shown[index] else None
+        frames.append(SpeakerFrame(time_s, heard[now], seen, None if said is None else said[now], looks))
     return frames
 
 
@@ -185,23 +180,15 @@ def rollout(
     return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
 
 
-def rollouts(
-    listener: Listener,
-    dyads: Sequence[Dyad],
-    seed: int,
-    each: Callable[[], object] = lambda: None,
-    clip_frames: int = 1,
-) -> list[Rollout]:
-    """Play one stream through every dyad from its beginning, with seeds from `seed` on; call `each()` after every one.
+def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: int = 1) -> list[Rollout]:
+    """Play one stream through every dyad from its beginning, with seeds from `seed` on.
 
     A listener that follows events receives those of the dyad's listener. `clip_frames`: see `whole_clips`.
     """
-    found = []
-    for number, dyad in enumerate(dyads):
-        heard = whole_clips(frames_of_dyad(dyad), clip_frames)
-        found.append(rollout(listener, heard, [seed + number], dyad.events or ()))
-        each()
-    return found
+    return [
+        rollout(listener, whole_clips(frames_of_dyad(dyad), clip_frames), [seed + number], dyad.events or ())
+        for number, dyad in enumerate(dyads)
+    ]
 
 
 # --- from arrays ----------------------------------------------------------------------------------------------------

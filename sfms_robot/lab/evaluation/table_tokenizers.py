@@ -258,43 +258,36 @@ class TableModel(nn.Module):
         return (motion - self.motion_mean) / self.motion_std
 
     @torch.no_grad()
-    def mask(self, motion: Tensor, strategy: Strategy | None = None, k: int | None = None) -> Tensor:
-        """Return the keyframes (W, T, G) of standardised windows, with another placement or number if given."""
-        tokenizer, counts = self.sparse(), self._counts(k)
-        return torch.cat([tokenizer.place(some, counts, strategy) for some in torch.split(motion, _CHUNK)])
+    def mask(self, motion: Tensor, strategy: Strategy | None = None) -> Tensor:
+        """Return the keyframes (W, T, G) of standardised windows, with another placement if given."""
+        tokenizer = self.sparse()
+        parts = [tokenizer.place(some, tokenizer.keyframes, strategy) for some in torch.split(motion, _CHUNK)]
+        return torch.cat(parts)
 
     @torch.no_grad()
-    def restore(self, motion: Tensor, strategy: Strategy | None = None, k: int | None = None) -> Tensor:
+    def restore(self, motion: Tensor, strategy: Strategy | None = None) -> Tensor:
         """Encode and decode standardised windows (W, T, C)."""
         tokenizer = self.tokenizer
         if isinstance(tokenizer, DenseTokenizer):
-            parts = [tokenizer.decode(tokenizer.encode(some)) for some in torch.split(motion, _CHUNK)]
-        else:
-            masks = torch.split(self.mask(motion, strategy, k), _CHUNK)
-            both = zip(torch.split(motion, _CHUNK), masks, strict=True)
-            parts = [tokenizer.decode(tokenizer.encode(some, at)) for some, at in both]
-        return torch.cat(parts)
+            return torch.cat([tokenizer.decode(tokenizer.encode(some)) for some in torch.split(motion, _CHUNK)])
+        both = zip(*(torch.split(each, _CHUNK) for each in (motion, self.mask(motion, strategy))), strict=True)
+        return torch.cat([tokenizer.decode(tokenizer.encode(some, at)) for some, at in both])
 
-    def bits(self, strategy: Strategy | None = None, k: int | None = None) -> float:
+    def bits(self, strategy: Strategy | None = None) -> float:
         """Return the bits of a window: codes at fixed length, and the places of keyframes unless they are known."""
         settings = self.recipe.model
         if isinstance(self.tokenizer, DenseTokenizer):
             return self.tokenizer.bits_per_window
         assert isinstance(settings, config.Sfms)
-        counts = zip(self._counts(k), (group.codes for group in settings.groups.values()), strict=True)
-        if (strategy or settings.placement) in _FREE_PLACES:
-            return sum(n * math.log2(size) for n, size in counts)
-        return sum(keyframe_bits(self.window, n, size) for n, size in counts)
+        free = (strategy or settings.placement) in _FREE_PLACES  # then there is one way to choose them
+        counts = zip(self.tokenizer.keyframes, (group.codes for group in settings.groups.values()), strict=True)
+        return sum(keyframe_bits(n if free else self.window, n, size) for n, size in counts)
 
     def sparse(self) -> Tokenizer:
         """Return the tokenizer if it has keyframes. Raises TypeError."""
         if not isinstance(self.tokenizer, Tokenizer):
             raise TypeError(f"{self.recipe.model.kind} has no keyframes")
         return self.tokenizer
-
-    def _counts(self, k: int | None) -> list[int]:
-        counts = self.sparse().keyframes
-        return list(counts) if k is None else [k] * len(counts)
 
 
 def keyframe_bits(frames: int, k: int, codes: int) -> float:
@@ -307,7 +300,7 @@ def keyframe_bits(frames: int, k: int, codes: int) -> float:
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
-def save(folder: Path, model: TableModel) -> None:
+def save_tokenizer(folder: Path, model: TableModel) -> None:
     """Write config.yaml and weights, in half precision: the codes stay the same, and a table needs many tokenizers."""
     folder.mkdir(parents=True, exist_ok=True)
     raw = model.recipe.model_dump(mode="json", exclude_defaults=True)
@@ -317,12 +310,8 @@ def save(folder: Path, model: TableModel) -> None:
     checkpoint.save_weights(folder / checkpoint.WEIGHTS, model, bits=16)
 
 
-def read(folder: Path) -> TableModel:
+def load_tokenizer(folder: Path) -> TableModel:
     """Read the tokenizer of a folder. Raises ConfigError or ModelError."""
     model = TableModel(load(config.Recipe, folder / checkpoint.CONFIG))
     checkpoint.load_weights(folder / checkpoint.WEIGHTS, model)
     return model.eval()
-
-
-def is_there(folder: Path) -> bool:
-    return (folder / checkpoint.CONFIG).is_file() and (folder / checkpoint.WEIGHTS).is_file()

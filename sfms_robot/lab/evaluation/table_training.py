@@ -3,55 +3,48 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Sequence
-from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor
 
 from sfms_robot import config
+from sfms_robot.app.output_paths import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain, save
 from sfms_robot.errors import ModelError
-from sfms_robot.lab.evaluation.listener_evaluation import bar
+from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Doubles, Floats
+from sfms_robot.lab.evaluation.rollout import run_in_processes
 from sfms_robot.lab.evaluation.table_tokenizers import (
     DenseTokenizer,
     SizeName,
     TableModel,
     baseline_loss,
     recipes,
-    save,
+    save_tokenizer,
 )
 from sfms_robot.lab.learning.corpus import first_frames, windows
-from sfms_robot.lab.learning.job import Job, LossOf, Run, Watch, progress_bar
-from sfms_robot.lab.learning.resume import checkpoint_file
+from sfms_robot.lab.learning.job import Job, Run, progress_bar
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.lab.learning.train_runs import device_of
-from sfms_robot.lab.learning.training_loop import fit, optimizer
+from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, place, tracks
-from sfms_robot.processes import process_pool
+from sfms_robot.signals.events import Bools
 from sfms_robot.signals.tracks import Take
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few
 _WATCHED: Final = (0.02, 0.3, 0.6)  # windows with a history, as shares of all by decreasing motion
 _HISTORY: Final = "history.json"
 _SNAPSHOTS_AT: Final = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the steps
-
-
-@dataclass(frozen=True, kw_only=True)
-class _TrainingTask:
-    """One tokenizer to train, sent to another process."""
-
-    name: str
-    recipe: config.Recipe
-    takes: Sequence[Take]
-    out: Path
-    device: str
-    resume: bool
-    watched: Tensor
 
 
 def train_all(
@@ -63,94 +56,92 @@ def train_all(
     size: SizeName,
     steps: int | None,
     jobs: int,
-    device: str,
-    anew: bool,
+    again: bool,
 ) -> None:
-    """Train tokenizers and keep them in `out`, resuming interrupted ones or train all again with `anew`.
+    """Train tokenizers and keep them in `out`; interrupted ones are resumed, or all trained again with `again`.
 
     `examples` (W, T, 58) are windows of which some get a history.
     """
     known = recipes(size, steps)
-    order = examples[..., 6:].var(1).mean(1).argsort(descending=True)
+    order = examples[..., SHAPES].var(1).mean(1).argsort(descending=True)
     watched = examples[order[[round(share * (len(order) - 1)) for share in _WATCHED]]]
     tasks = [
-        _TrainingTask(
-            name=name,
-            recipe=known[name],
-            takes=takes,
-            out=out,
-            device=device,
-            resume=not anew and checkpoint_file(out / name, name).is_file(),
-            watched=watched,
+        (
+            known[name],
+            Run(resume=not again and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
+            name,
         )
         for name in names
     ]
     try:
-        if jobs == 1:
-            with progress_bar() as watch:
-                for task in tasks:
-                    _train(task, watch)
-        else:
-            with bar(f"training {len(tasks)} tokenizers", len(tasks)) as advance, process_pool(jobs) as pool:
-                for done in as_completed([pool.submit(_train, task, _unwatched) for task in tasks]):
-                    done.result()
-                    advance()
+        if jobs > 1:
+            run_in_processes(partial(_train_one, takes, out, watched), tasks, jobs, "tokenizers trained")
+            return
+        with progress_bar() as watch:
+            for recipe, run, name in tasks:
+                train(name, recipe, takes, out, replace(run, watches=(watch,)), watched)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted; {out} keeps the trained tokenizers: without --train the command resumes"
         ) from None
 
 
-def _unwatched(report: object) -> None:
-    """Ignore a report of progress: several trainings share one bar."""
-
-
-def _train(task: _TrainingTask, watch: Watch) -> None:
-    run = Run(resume=task.resume, device=device_of(task.device), watch=watch)
-    train(task.name, task.recipe, task.takes, task.out, run, task.watched)
+def _train_one(takes: Sequence[Take], out: Path, watched: Tensor, task: tuple[config.Recipe, Run, str]) -> None:
+    recipe, run, name = task
+    train(name, recipe, takes, out, run, watched)
 
 
 def train(
     name: str, recipe: config.Recipe, takes: Sequence[Take], out: Path, run: Run, watched: Tensor | None = None
-) -> TableModel:
-    """Train one tokenizer and keep it in `out`/`name`, resuming from its checkpoints if `run` says so.
+) -> None:
+    """Train one tokenizer and keep it in `out`/`name`, resuming from its checkpoint if `run` says so.
 
     `watched` (W, T, 58): windows whose keyframes and errors are recorded while it learns.
     """
     folder = out / name
     torch.manual_seed(recipe.seed)
     model = TableModel(recipe)
-    model.fit_scales(torch.cat([torch.from_numpy(take.motion) for take in takes]))
-    history = ScoreHistory(model, watched) if watched is not None and not run.resume else None
-    fit(job(name, model.to(run.device), takes, history), folder, run)
-    save(folder, model.cpu().eval())
-    checkpoint_file(folder, name).unlink(missing_ok=True)
-    if history is not None:
-        history.save(folder)
-    return model
-
-
-def job(name: str, model: TableModel, takes: Sequence[Take], history: ScoreHistory | None = None) -> Job:
-    """Return the job of the training loop. It holds nothing out: the tables compare the last weights."""
-    recipe = model.recipe
-    phase = recipe.training
     motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
-    lengths = [len(take.motion) for take in takes]
-    loss_of = _loss_of(model, model.standardise(motion.to(model.motion_mean.device)), lengths)
+    model.fit_scales(motion)
+    history: list[Snapshot] = []
+    job = _job(name, model.to(run.device), motion, [len(take.motion) for take in takes])
+    if watched is not None and not run.resume:
+        due = {min(recipe.training.steps - 1, round(share * recipe.training.steps)) for share in _SNAPSHOTS_AT}
+        windows, loss_of = model.standardise(watched.to(run.device)), job.loss_of
 
-    def noted(step: int, generator: torch.Generator, batch: int) -> Tensor:
-        if history is not None:
-            history.take(step, phase.steps)
-        return loss_of(step, generator, batch)
+        def recorded(step: int, generator: torch.Generator, samples: int) -> Tensor:
+            if step in due:
+                history.extend(snapshots(model.tokenizer, windows, step))
+            return loss_of(step, generator, samples)
 
-    tokenizer = model.tokenizer
+        job = replace(job, loss_of=recorded)
+    fit(job, folder, run)
+    save_tokenizer(folder, model.cpu().eval())
+    checkpoint_file(folder, name).unlink(missing_ok=True)
+    if history:
+        (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
+
+
+def _job(name: str, model: TableModel, motion: Tensor, lengths: Sequence[int]) -> Job:
+    """Return the job of the training loop. It holds nothing out: the tables compare the last weights."""
+    recipe, tokenizer, phase = model.recipe, model.tokenizer, model.recipe.training
+    standard, starts = model.standardise(motion.to(model.motion_mean.device)), first_frames(lengths, model.window)
+    if isinstance(tokenizer, Tokenizer):
+        loss_of, optimizers = loss_of_steps(tokenizer, standard, lengths, phase, _GAIN), optimizers_of(tokenizer, phase)
+    else:
+        baseline = tokenizer
+        optimizers = [optimizer(baseline.parameters(), phase.learning_rate, phase.weight_decay)]
+
+        def loss_of(step: int, generator: torch.Generator, samples: int) -> Tensor:
+            chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
+            batch = amplified(windows(standard, chosen, model.window), _GAIN, generator)
+            return baseline_loss(baseline, batch, phase.commitment, generator)
+
     return Job(
         name=name,
         model=model,
-        optimizers=optimizers_of(tokenizer, phase)
-        if isinstance(tokenizer, Tokenizer)
-        else [optimizer(tokenizer.parameters(), phase.learning_rate, phase.weight_decay)],
-        loss_of=noted,
+        optimizers=optimizers,
+        loss_of=loss_of,
         held_out=None,
         frames_per_step=phase.batch * model.window,
         phase=phase,
@@ -161,20 +152,6 @@ def job(name: str, model: TableModel, takes: Sequence[Take], history: ScoreHisto
             "data": hashlib.blake2b(motion.numpy().tobytes(), digest_size=8).hexdigest(),
         },
     )
-
-
-def _loss_of(model: TableModel, motion: Tensor, lengths: Sequence[int]) -> LossOf:
-    tokenizer, phase = model.tokenizer, model.recipe.training
-    if isinstance(tokenizer, Tokenizer):
-        return loss_of_steps(tokenizer, motion, lengths, phase, _GAIN)
-    starts = first_frames(lengths, model.window)
-
-    def everywhere(step: int, generator: torch.Generator, samples: int) -> Tensor:
-        chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
-        batch = amplified(windows(motion, chosen, model.window), _GAIN, generator)
-        return baseline_loss(tokenizer, batch, phase.commitment, generator)
-
-    return everywhere
 
 
 # --- history: figure 7 of the paper ---------------------------------------------------------------------------------
@@ -198,44 +175,30 @@ class Snapshot:
     errors: list[float]
 
 
-class ScoreHistory:
-    """Recorder of a model's scores for some windows (W, T, C) in our units, one busy group of each."""
+_SNAPSHOTS: Final = TypeAdapter(list[Snapshot])
 
-    def __init__(self, model: TableModel, watched: Tensor) -> None:
-        self.model = model
-        self.watched = watched
-        self.snapshots: list[Snapshot] = []
 
-    @torch.no_grad()
-    def take(self, step: int, steps: int) -> None:
-        """Take snapshots before this step if it is one of `_SNAPSHOTS_AT`."""
-        tokenizer = self.model.tokenizer
-        watched = self.model.standardise(self.watched.to(self.model.motion_mean.device))
-        due = {min(steps - 1, round(share * steps)) for share in _SNAPSHOTS_AT}
-        if step not in due or isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
-            return
-        # Keyframes by the scores alone, without the corrections of `sweeps`.
-        mask = place(watched, tokenizer.keyframes, tokenizer.strategy, member=tokenizer.member, score=tokenizer.score)
-        scores = _first_choice(tokenizer, watched)
-        errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)
-        busy = (watched.var(1) @ tokenizer.member.T / tokenizer.member.sum(1)).argmax(1)
-        self.snapshots += [
-            Snapshot(
-                step=step,
-                window=window,
-                group=group,
-                scores=_rounded(scores[window, :, group]),
-                keyframes=mask[window, :, group].nonzero()[:, 0].tolist(),
-                errors=_rounded(errors[window]),
-            )
-            for window, group in enumerate(busy.tolist())
-        ]
-
-    def save(self, folder: Path) -> None:
-        """Write `folder`/history.json if there are snapshots."""
-        if self.snapshots:
-            plain = [asdict(snapshot) for snapshot in self.snapshots]
-            (folder / _HISTORY).write_text(json.dumps(plain), encoding="utf-8")
+@torch.no_grad()
+def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int) -> list[Snapshot]:
+    """Return the scores of a tokenizer before a step, for windows (W, T, C) in our units, one busy group of each."""
+    if isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
+        return []
+    # Keyframes by the scores alone, without the corrections of `sweeps`.
+    mask = place(watched, tokenizer.keyframes, tokenizer.strategy, member=tokenizer.member, score=tokenizer.score)
+    scores = _first_choice(tokenizer, watched)
+    errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)
+    busy = (watched.var(1) @ tokenizer.member.T / tokenizer.member.sum(1)).argmax(1)
+    return [
+        Snapshot(
+            step=step,
+            window=window,
+            group=group,
+            scores=_rounded(scores[window, :, group]),
+            keyframes=mask[window, :, group].nonzero()[:, 0].tolist(),
+            errors=_rounded(errors[window]),
+        )
+        for window, group in enumerate(busy.tolist())
+    ]
 
 
 def load_history(folder: Path) -> list[Snapshot]:
@@ -244,8 +207,8 @@ def load_history(folder: Path) -> list[Snapshot]:
     if not file.is_file():
         return []
     try:
-        return [Snapshot(**snapshot) for snapshot in json.loads(file.read_text(encoding="utf-8"))]
-    except (ValueError, TypeError) as error:
+        return _SNAPSHOTS.validate_json(file.read_bytes())
+    except ValueError as error:
         raise ModelError(f"{file}: not the history of a tokenizer: {error}") from error
 
 
@@ -264,3 +227,137 @@ def _first_choice(tokenizer: Tokenizer, motion: Tensor) -> Tensor:
 
 def _rounded(curve: Tensor) -> list[float]:
     return [round(value, 4) for value in curve.tolist()]
+
+
+# --- Pictures --------------------------------------------------------------------------------------------------------
+
+_TRAJECTORIES_OF: Final = {"keyframes.png": "sparse-all-k10", "keyframes-one-set.png": "sparse-one-k10"}
+_HISTORY_OF: Final = "sparse-all-k7"  # figure 7 has k = 7
+_CURVES: Final = 4  # trajectories drawn of a window
+_BARS: Final = 12  # channels in the bar chart
+
+
+def draw(
+    folder: Path,
+    models: Mapping[str, TableModel],
+    trained: Path,
+    motion: Tensor,
+    takes: Sequence[str],
+    errors: Mapping[str, Doubles],
+) -> None:
+    """Write every picture that these tokenizers allow as PNG files in `folder`. Raises ConfigError, MissingExtra.
+
+    Args:
+        folder: Where to write.
+        models: Tokenizers by name.
+        trained: Folder of their histories.
+        motion: Windows (W, T, 58) in our units.
+        takes: The take of each window.
+        errors: (W,) of the rows of table IV, by label; empty without that table.
+    """
+    for file, name in _TRAJECTORIES_OF.items():
+        if name in models:
+            save(cases(models[name], motion, takes), folder / file)
+    if _HISTORY_OF in models and (history := load_history(trained / _HISTORY_OF)):
+        save(scores_over_steps(history), folder / "scores.png")
+    if errors:
+        save(_quantiles(errors), folder / "quantiles.png")
+
+
+def _quantiles(errors: Mapping[str, Doubles]) -> Figure:
+    """Draw figure 6: the distribution of the error over windows."""
+    figure = new_figure(6.4, 4.0)
+    axes = figure.subplots()
+    share = np.linspace(0, 100, 101)
+    for (label, values), color in zip(errors.items(), SERIES, strict=False):
+        axes.plot(share, np.percentile(values, share), color=color, linewidth=1.8, label=label)
+    axes.axvspan(90, 100, color=RULE, alpha=0.5, linewidth=0)
+    axes.set(yscale="log", xlim=(0, 100))
+    axes.set_xlabel("% of windows with less error; shaded: the worst tenth", color=INK)
+    axes.set_ylabel("MSE, deviations²", color=INK)
+    axes.set_title("Error of windows, sorted (unequal bits)", color=INK, fontsize=10, loc="left")
+    axes.legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left")
+    plain(axes)
+    return figure
+
+
+def cases(model: TableModel, windows: Tensor, takes: Sequence[str]) -> Figure:
+    """Draw figures 4 and 8: the window with the largest error and one with the median error, side by side."""
+    motion, tokenizer = model.standardise(windows), model.sparse()
+    with torch.inference_mode():
+        keyframes, restored = model.mask(motion) > 0.5, model.restore(motion)
+    wrong = (restored - motion).square().mean(1).numpy()  # (W, C)
+    error = wrong.mean(axis=1)
+    order = error.argsort().tolist()
+    figure = new_figure(10.0, 8.4)
+    columns = figure.subplots(_CURVES + 1, 2, squeeze=False, height_ratios=[1.5] + [1.0] * _CURVES)
+    shown = (("worst", order[-1]), ("normal (median error)", order[len(order) // 2]))
+    for (title, at), (bars, *curves) in zip(shown, columns.T, strict=True):
+        worst = np.argsort(wrong[at])[::-1][:_BARS]
+        bars.bar(range(_BARS), wrong[at, worst], color=SERIES[0], width=0.7)
+        bars.set_xticks(range(_BARS), [CHANNELS[channel] for channel in worst], rotation=35, ha="right")
+        bars.set_ylabel("MSE", color=INK, fontsize=8)
+        plain(bars, 7)
+        bars.grid(visible=False, axis="x")
+        bars.set_title(f"{title}: {takes[at]}, MSE {error[at]:.3f}", color=INK, fontsize=10, loc="left")
+        moving = motion[at].var(0).argsort(descending=True)[:_CURVES].tolist()
+        for axes, channel in zip(curves, moving, strict=True):
+            keys = keyframes[at, :, int(tokenizer.quantizer.owner[channel])].numpy()
+            truth, ours = motion[at, :, channel].numpy(), restored[at, :, channel].numpy()
+            _trajectory(axes, CHANNELS[channel], truth, ours, keys)
+        curves[-1].set_xlabel("s", color=INK, fontsize=8)
+    columns[1, 0].legend(frameon=False, fontsize=7, labelcolor=INK)
+    count = len(tokenizer.keyframes)
+    figure.suptitle(
+        f"{count} keyframe set{'s' if count > 1 else ''}, {tokenizer.keyframes[0]} keyframes in "
+        f"{model.window} frames each; deviations of the training motion",
+        color=INK, fontsize=10,
+    )  # fmt: skip
+    return figure
+
+
+def _trajectory(axes: Axes, name: str, truth: Floats, ours: Floats, keys: Bools) -> None:
+    times_s = np.arange(len(truth)) * FRAME_S
+    axes.plot(times_s, truth, color=TRUTH, linewidth=3.2, label="recorded")
+    axes.plot(times_s, ours, color=SERIES[0], linewidth=1.4, label="from its code")
+    axes.plot(times_s[keys], truth[keys], "o", color=KEY, markersize=4.5, markerfacecolor="none", label="keyframe")
+    axes.set_title(name, color=INK, fontsize=8, loc="left", pad=2)
+    plain(axes, 7)
+
+
+def scores_over_steps(snapshots: Sequence[Snapshot]) -> Figure:
+    """Draw figure 7: scores and errors of a few windows while the tokenizer learns, one window a column."""
+    windows = sorted({snapshot.window for snapshot in snapshots})
+    steps = sorted({snapshot.step for snapshot in snapshots})
+    figure = new_figure(3.6 * len(windows), 1.35 * len(steps) + 0.9)
+    grid = figure.subplots(len(steps), len(windows), squeeze=False, sharex=True)
+    for snapshot in snapshots:
+        axes = grid[steps.index(snapshot.step), windows.index(snapshot.window)]
+        _snapshot(axes, snapshot)
+        if snapshot.step == steps[0]:
+            axes.set_title(
+                f"window {snapshot.window + 1}: {CHANNELS[snapshot.group]}", color=INK, fontsize=9, loc="left"
+            )
+        if snapshot.window == windows[0]:
+            axes.set_ylabel(f"step {snapshot.step}", color=INK, fontsize=8)
+        if snapshot.step == steps[-1]:
+            axes.set_xlabel("frame", color=INK, fontsize=8)
+    figure.suptitle(
+        "Log-probability of each frame as the first keyframe (line), keyframes (circles), error (area)",
+        color=INK, fontsize=9,
+    )  # fmt: skip
+    return figure
+
+
+def _snapshot(axes: Axes, snapshot: Snapshot) -> None:
+    scores = np.array(snapshot.scores)
+    axes.plot(scores, color=SERIES[0], linewidth=1.3)
+    axes.plot(snapshot.keyframes, scores[snapshot.keyframes], "o", color=KEY, markersize=4, markerfacecolor="none")
+    beside = axes.twinx()
+    beside.fill_between(range(len(snapshot.errors)), snapshot.errors, color=SERIES[1], alpha=0.35, linewidth=0)
+    beside.set_ylim(bottom=0)
+    plain(axes, 7)
+    beside.tick_params(labelsize=6, colors=FAINT, length=2)
+    for side in ("top", "left", "bottom"):
+        beside.spines[side].set_visible(False)
+    beside.spines["right"].set_color(RULE)

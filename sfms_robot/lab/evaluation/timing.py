@@ -22,10 +22,12 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
-from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_shifts
-from sfms_robot.lab.evaluation.hazard_scores import spans_of
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_rad
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, Ints, ListenerMeeting, frames_before
+from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
+from sfms_robot.lab.evaluation.whole_recordings import event_spans
+from sfms_robot.lab.learning.events.event_trainer import listening_in
 from sfms_robot.signals import phase
 from sfms_robot.signals.events import MOTION_EVENTS, Bools
 
@@ -133,12 +135,12 @@ def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]
     `own_voice`: it spoke when the person did. Shifting its nods by a minute would shift them against that voice too, so
     their contingency on the others is left out.
     """
-    nods = [spans_of(decided, "nod") for decided in streams]
+    nods = [event_spans(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
     if not own_voice:
         sums |= nod_contingency("decided_", nods, one, np.ones(one.frames, bool))
     for kind in (*ANNOTATED, "smile", "blink"):
-        sums |= _other_sums("decided_", one, kind, [spans_of(decided, kind) for decided in streams])
+        sums |= _other_sums("decided_", one, kind, [event_spans(decided, kind) for decided in streams])
     return sums
 
 
@@ -169,7 +171,9 @@ def motion_sums(
         "nod_deg_sizes": np.histogram(sizes, _SIZES_DEG)[0].astype(np.float64),
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
-        "gaze_shifts_per_minute": np.array([sum(len(gaze_shifts(motion)) for motion in motions), minutes]),
+        "gaze_shifts_per_minute": np.array(
+            [sum(len(find_gaze_shifts(gaze_rad(motion), FRAME_HZ)) for motion in motions), minutes]
+        ),
     }
 
 
@@ -242,34 +246,17 @@ def cells(times_s: Doubles) -> Ints:
 
 
 def table_rates(people: Sequence[MeetingPerson]) -> Doubles:
-    """Return nods per minute (CELLS,) over the whole annotated time of all people."""
-    parts = []
+    """Return nods per minute (CELLS,) over the annotated time of all people, each cell with five more at the mean."""
+    nods, minutes = np.zeros((2, CELLS))
     for person in people:
         whole = Stretch(person=person, start_s=0.0, end_s=person.until_s)
-        others, own, unseen = (active(spans, whole) for spans in (person.others, person.talk, person.unseen))
-        listening = phrase_timing.listening_mask(others, FRAME_HZ, own) & ~unseen
-        parts.append(cell_counts(cells(phase.times(others)), frames_before(person.nods[:, 0], len(others)), listening))
-    return smoothed_rates(np.sum([np.zeros((2, CELLS)), *parts], axis=0))
-
-
-def cell_counts(cell: Ints, onsets: Ints, listening: Bools) -> Doubles:
-    """Return nods and minutes of listening (2, CELLS) from cells (N,), onsets (frames), and listening time (N,)."""
-    inside = onsets[(onsets >= 0) & (onsets < len(cell))]
-    nods, frames = (np.bincount(cell[at], minlength=CELLS) for at in (inside[listening[inside]], listening))
-    return np.stack([nods, frames / FRAME_HZ / 60])
-
-
-def smoothed_rates(counts: Doubles) -> Doubles:
-    """Return nods per minute (CELLS,) of counts (2, CELLS), each cell with five more nods at the mean rate."""
-    nods, minutes = counts.sum(axis=1)
-    if not nods or not minutes:
+        others, listening = active(person.others, whole), listening_in(person, whole)
+        cell, onsets = cells(phase.times(others)), frames_before(person.nods[:, 0], len(others))
+        nods += np.bincount(cell[onsets[listening[onsets]]], minlength=CELLS)
+        minutes += np.bincount(cell[listening], minlength=CELLS) / FRAME_HZ / 60
+    if not nods.any():
         return np.zeros(CELLS)
-    return np.asarray((counts[0] + _PRIOR_NODS) / (counts[1] + _PRIOR_NODS * minutes / nods))
-
-
-def table_sums(one: ListenerMeeting, rates: Doubles) -> Sums:
-    """Return how the nod table with these rates ranks the nods."""
-    return {"table_nod_auc": ranked(rates[cells(phase.times(one.others))], one)}
+    return np.asarray((nods + _PRIOR_NODS) / (minutes + _PRIOR_NODS * minutes.sum() / nods.sum()))
 
 
 # --- people and figures ---------------------------------------------------------------------------------------------

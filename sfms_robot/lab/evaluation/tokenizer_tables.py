@@ -18,7 +18,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -34,13 +34,13 @@ from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
     AS_WRITTEN,
     KEYFRAMES,
-    SIZES,
     SizeName,
     TableModel,
-    is_there,
-    read,
+    load_tokenizer,
 )
+from sfms_robot.lab.evaluation.table_training import draw, train_all
 from sfms_robot.lab.learning.corpus import first_frames, windows
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.signals.tracks import Take, folder_takes
 
@@ -65,7 +65,8 @@ class Spec:
     """A row before scoring.
 
     Attributes:
-        placement, k: Where they differ from the tokenizer's; k also where the row should show it.
+        k: Keyframes of a window, where the row shows them.
+        placement: Where it differs from the tokenizer's.
         paper_e2: The paper's MSE, times 100.
         shipped: The tokenizer is in the checkout; others are trained if there is a folder for them.
     """
@@ -79,9 +80,12 @@ class Spec:
     shipped: bool = True
 
 
+_PAPER_3: Final = tuple(zip(KEYFRAMES, (0.89, 0.64, 0.33), (0.15, 0.13, 0.12), strict=True))  # k, static, dynamic
+
+
 def _table_3() -> Iterable[Spec]:
     yield Spec(name="VQ-only (no keyframe)", tokenizer="dense-vq-1024", paper_e2=0.26)
-    for k, static, dynamic in zip(KEYFRAMES, (0.89, 0.64, 0.33), (0.15, 0.13, 0.12), strict=True):
+    for k, static, dynamic in _PAPER_3:
         own = f"sparse-all-k{k}"
         yield Spec(name=_STATIC, tokenizer=f"{own}-static_paper", k=k, paper_e2=static)
         yield Spec(name=_CENTRED, tokenizer=f"{own}-static", k=k)
@@ -115,64 +119,39 @@ def needed(name: str, shipped: bool = False) -> list[str]:
     return list(dict.fromkeys(spec.tokenizer for spec in TABLES[name] if spec.shipped or not shipped))
 
 
-@dataclass(frozen=True)
-class TableRow:
-    """A scored row; `values`: as in JSON; `errors` (W,) of the windows."""
-
-    spec: Spec
-    values: dict[str, Any]
-    errors: Doubles
-
-    @property
-    def mse(self) -> float:
-        return float(self.values["mse"])
-
-
-@dataclass(frozen=True)
-class TokenizerTable:
-    """A scored table; `plain`: as in JSON."""
-
-    name: str
-    rows: Sequence[TableRow]
-    plain: dict[str, Any]
-
-
-def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> TokenizerTable:
-    """Score those tokenizers of a table that are present on these windows."""
-    first = next(iter(models.values()))
-    truth, clusters = _doubles(first.standardise(seen.motion)), None
-    if len(truth) >= 4:
-        clusters = Clusters.of(truth)
-    rows = []
+def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> tuple[dict[str, Any], dict[str, Doubles]]:
+    """Score those tokenizers of a table that are present; return its JSON, and the errors (W,) of its rows by label."""
+    truth = _doubles(next(iter(models.values())).standardise(seen.motion))
+    clusters = cluster(truth) if len(truth) >= 4 else None
+    rows, errors = list[dict[str, Any]](), {}
     for spec in TABLES[name]:
         if spec.tokenizer in models:
-            rows.append(_scored(spec, models[spec.tokenizer], seen, clusters))
-    plain = {
+            row, wrong = _scored(spec, models[spec.tokenizer], seen, clusters)
+            rows.append(row)
+            errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
+    table = {
         "table": int(name),
-        "rows": [row.values for row in rows],
+        "rows": rows,
         "ratios": ratios_3(rows) if name == "3" else ratios_4(rows),
-        "truth_silhouette": None if clusters is None else round(integrity(truth, truth, clusters)[0], 3),
+        "truth_silhouette": clusters and round(integrity(truth, truth, clusters)[0], 3),
     }
-    return TokenizerTable(name, rows, plain)
+    return table, errors
 
 
-def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | None) -> TableRow:
-    k = spec.k if spec.placement is not None else None
+def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | None) -> tuple[dict[str, Any], Doubles]:
+    """Return a row as in JSON, and the squared errors (W,) of the windows."""
     motion = model.standardise(seen.motion)
-    restored = model.restore(motion, spec.placement, k)
+    restored = model.restore(motion, spec.placement)
     errors, angle_rmse_rad, shape_rmse = restoration_errors(model, motion, restored)
-    silhouette = separation = None
-    if clusters is not None:
-        silhouette, separation = (
-            round(value, 3) for value in integrity(_doubles(restored), _doubles(motion), clusters)
-        )
+    shape = (None, None) if clusters is None else integrity(_doubles(restored), _doubles(motion), clusters)
+    silhouette, separation = (value and round(value, 3) for value in shape)
     names = np.array(seen.takes)
-    values = {
+    return {
         "name": spec.name,
         "tokenizer": spec.tokenizer,
         "k": spec.k,
         "params": sum(p.numel() for p in model.tokenizer.parameters()),
-        "bits_per_window": round(model.bits(spec.placement, k), 1),
+        "bits_per_window": round(model.bits(spec.placement), 1),
         "mse": float(errors.mean()),
         "median": float(np.median(errors)),
         "per_take": {take: float(errors[names == take].mean()) for take in dict.fromkeys(seen.takes)},
@@ -182,8 +161,7 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
         "separation": separation,
         "paper_mse_e2": spec.paper_e2,
         "note": spec.note,
-    }
-    return TableRow(spec, values, errors)
+    }, errors
 
 
 def restoration_errors(model: TableModel, motion: Tensor, restored: Tensor) -> tuple[Doubles, float, float]:
@@ -201,66 +179,60 @@ def _doubles(motion: Tensor) -> Doubles:
     return np.asarray(motion.double().numpy(), np.float64)
 
 
-def ratios_3(rows: Sequence[TableRow]) -> dict[str, dict[str, float]]:
+def ratios_3(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     """Return the MSE of dynamic over other placements by k, one keyframe set per channel, here and in the paper."""
-    mse = {(row.spec.name, row.spec.k): row.mse for row in rows if not row.spec.note}
-    others = {"static": _STATIC, "static_centred": _CENTRED, "exact": _EXACT}
+    mse = {(row["name"], row["k"]): row["mse"] for row in rows if not row["note"]}
+    pairs = {"static": (DYNAMIC, _STATIC), "static_centred": (DYNAMIC, _CENTRED), "exact": (DYNAMIC, _EXACT)}
     found = {
-        f"dynamic_to_{key}": {str(k): mse[DYNAMIC, k] / mse[name, k] for k in KEYFRAMES} for key, name in others.items()
+        f"dynamic_to_{key}": {str(k): mse[ours, k] / mse[other, k] for k in KEYFRAMES}
+        for key, (ours, other) in pairs.items()
     }
     if all((DYNAMIC_AS_WRITTEN, k) in mse for k in KEYFRAMES):
         found["as_written_to_static"] = {str(k): mse[DYNAMIC_AS_WRITTEN, k] / mse[_STATIC, k] for k in KEYFRAMES}
-    paper = {(spec.name, spec.k): spec.paper_e2 or 1.0 for spec in TABLES["3"] if spec.paper_e2}
-    found["paper_dynamic_to_static"] = {str(k): round(paper[DYNAMIC, k] / paper[_STATIC, k], 2) for k in KEYFRAMES}
-    return found
+    paper = {str(k): round(dynamic / static, 2) for k, static, dynamic in _PAPER_3}
+    return {**found, "paper_dynamic_to_static": paper}
 
 
-def ratios_4(rows: Sequence[TableRow]) -> dict[str, float]:
+def ratios_4(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return the MSE of Sparse-FSQ-256, ours and as written, over the dense and the grouped tokenizer."""
-    mse = {row.spec.name: row.mse for row in rows}
+    mse = {row["name"]: row["mse"] for row in rows}
     ours = {"sparse_fsq": "Sparse-FSQ-256", "sparse_fsq_as_written": "Sparse-FSQ-256, as written"}
-    others = {"dense": "Dense-FSQ-1024", "l2l": "L2L (VQ-256)"}
+    others = {"dense": ("Dense-FSQ-1024", 0.73), "l2l": ("L2L (VQ-256)", 1.44)}
     return {
         **{
             f"{key}_to_{beside}": mse[name] / mse[other]
             for key, name in ours.items()
             if name in mse
-            for beside, other in others.items()
+            for beside, (other, _) in others.items()
         },
-        "paper_sparse_fsq_to_dense": round(0.03 / 0.73, 3),
-        "paper_sparse_fsq_to_l2l": round(0.03 / 1.44, 3),
+        **{f"paper_sparse_fsq_to_{beside}": round(0.03 / paper_e2, 3) for beside, (_, paper_e2) in others.items()},
     }
 
 
 # --- clusters -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Clusters:
-    """Clusters of windows: the window that is each medoid (K,), and the cluster of each window (W,)."""
+Clusters = tuple[NDArray[np.intp], NDArray[np.intp]]  # the window that is each medoid (K,); each window's cluster (W,)
 
-    medoids: NDArray[np.intp]
-    labels: NDArray[np.intp]
 
-    @classmethod
-    def of(cls, motion: Doubles, count: int = _CLUSTERS) -> Clusters:
-        """Cluster windows (W, T, C): start with medoids far apart, then move each to the centre of its cluster.
+def cluster(motion: Doubles, count: int = _CLUSTERS) -> Clusters:
+    """Cluster windows (W, T, C): start with medoids far apart, then move each to the centre of its cluster.
 
-        At most half as many clusters as windows.
-        """
-        between = warped(motion, motion)
-        chosen = [int(between.sum(1).argmin())]
-        while len(chosen) < min(count, len(motion) // 2):
-            chosen.append(int(between[:, chosen].min(1).argmax()))
-        medoids = np.array(chosen)
-        for _ in range(_ROUNDS):
-            labels = between[:, medoids].argmin(1)
-            own = [np.flatnonzero(labels == cluster) for cluster in range(len(medoids))]
-            central = np.array([rows[between[np.ix_(rows, rows)].sum(1).argmin()] for rows in own])
-            if (central == medoids).all():
-                break
-            medoids = central
-        return cls(medoids, between[:, medoids].argmin(1))
+    At most half as many clusters as windows.
+    """
+    between = warped(motion, motion)
+    chosen = [int(between.sum(1).argmin())]
+    while len(chosen) < min(count, len(motion) // 2):
+        chosen.append(int(between[:, chosen].min(1).argmax()))
+    medoids = np.array(chosen)
+    for _ in range(_ROUNDS):
+        labels = between[:, medoids].argmin(1)
+        own = [np.flatnonzero(labels == cluster) for cluster in range(len(medoids))]
+        central = np.array([rows[between[np.ix_(rows, rows)].sum(1).argmin()] for rows in own])
+        if (central == medoids).all():
+            break
+        medoids = central
+    return medoids, between[:, medoids].argmin(1)
 
 
 def integrity(restored: Doubles, motion: Doubles, clusters: Clusters) -> tuple[float, float]:
@@ -269,17 +241,16 @@ def integrity(restored: Doubles, motion: Doubles, clusters: Clusters) -> tuple[f
     Silhouette: mean of (b - a) / max(a, b), a the distance to the own medoid, b to the nearest other, -1..1.
     Separation: mean distance between medoids, over that before coding.
     """
-    after = warped(restored, restored[clusters.medoids])  # (W, K)
-    rows = np.arange(len(after))
-    own = after[rows, clusters.labels]
-    other = after.copy()
-    other[rows, clusters.labels] = np.inf
+    medoids, labels = clusters
+    after, rows = warped(restored, restored[medoids]), np.arange(len(restored))  # (W, K)
+    own, other = after[rows, labels], after.copy()
+    other[rows, labels] = np.inf
     nearest = other.min(1)
-    others = ~np.isin(rows, clusters.medoids)  # the distance of a medoid to itself is always 0
     widths = (nearest - own) / np.maximum(np.maximum(nearest, own), 1e-12)
-    apart = ~np.eye(len(clusters.medoids), dtype=bool)
-    before = warped(motion[clusters.medoids], motion[clusters.medoids])[apart].mean()
-    return float(widths[others].mean()), float(after[clusters.medoids][apart].mean() / before)
+    apart = ~np.eye(len(medoids), dtype=bool)
+    before = warped(motion[medoids], motion[medoids])[apart].mean()
+    # The distance of a medoid to itself is always 0.
+    return float(np.delete(widths, medoids).mean()), float(after[medoids][apart].mean() / before)
 
 
 def warped(a: Doubles, b: Doubles) -> Doubles:
@@ -309,95 +280,73 @@ class Windows:
         return cls(windows(motion, first_frames(lengths, window, window), window), names)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableOptions:
-    """Options of the command.
+def evaluate_table(
+    table: str,
+    data: Path | None = None,
+    models: Path | None = None,
+    *,
+    train: bool = False,
+    size: SizeName = "small",
+    steps: int | None = None,
+    jobs: int = 1,
+    plots: Path | None = None,
+) -> dict[str, Any]:
+    """Score one table, or all; return the JSON object. Raises ConfigError, ModelError.
 
-    Attributes:
-        table: A key of `TABLES`, or all of them.
+    Args:
+        table: A key of `TABLES`, or `ALL` of them.
         data: Face tracks to score on, all held out; None: the held-out takes of the bundled motion.
         models: Folder of trained tokenizers; None: those of the checkout, without the papers' as written.
         train: Train all of them again, not only the missing ones.
+        size: Of what is trained.
         steps: Of training, in place of the size's.
+        jobs: Processes that train.
         plots: Folder for pictures.
     """
-
-    table: str
-    data: Path | None = None
-    models: Path | None = None
-    train: bool = False
-    size: SizeName = "small"
-    steps: int | None = None
-    jobs: int = 1
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    plots: Path | None = None
-
-
-def evaluate_table(options: TableOptions) -> dict[str, Any]:
-    """Score one table, or all; return the JSON object. Raises ConfigError, ModelError."""
-    chosen = _chosen(options)
-    folder = options.models or data_dir("configs") / "tokenizers"
+    if table not in (*TABLES, ALL):
+        raise ConfigError(f"--table {table!r} is not one of {', '.join((*TABLES, ALL))}")
+    if train and models is None:
+        raise ConfigError("--train needs --models DIR, a folder to keep the tokenizers in")
+    chosen = TABLES if table == ALL else (table,)
+    folder = models or data_dir("configs") / "tokenizers"
     recorded = takes.load(data_dir("sim") / "listeners" / "takes.npz")
-    held_out = recorded[takes.HELD_OUT] if options.data is None else folder_takes(options.data)
-    wanted = list(dict.fromkeys(name for table in chosen for name in needed(table, options.models is None)))
-    train_missing(options, wanted, folder, recorded)
-    loaded = {name: read(folder / name) for name in wanted}
+    held_out = recorded[takes.HELD_OUT] if data is None else folder_takes(data)
+    wanted = list(dict.fromkeys(name for each in chosen for name in needed(each, models is None)))
+    if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
+        examples = Windows.of(recorded[takes.HELD_OUT], _WINDOW_FRAMES).motion
+        train_all(missing, folder, recorded[takes.TRAIN], examples, size=size, steps=steps, jobs=jobs, again=train)
+    loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))
     for name, model in loaded.items():  # errors in different units cannot stand in one table
         if not torch.allclose(model.motion_std, first.motion_std, rtol=1e-2) or model.window != first.window:
             raise ConfigError(f"{folder}: {name} and {first_name} were trained on different motion: add --train")
     seen = Windows.of(held_out, first.window)
     short = [take.name for take in held_out if len(take.motion) < first.window]
-    if options.data is not None and short:
+    if data is not None and short:
         log.warning(
             "%d of %d stretches with a face are shorter than a window of %d frames and left out: %s",
             len(short), len(held_out), first.window, ", ".join(dict.fromkeys(short)),
         )  # fmt: skip
     with Console(stderr=True).status("scoring"), torch.inference_mode():
-        tables = [build(name, loaded, seen) for name in chosen]
-    if options.plots is not None:
-        from sfms_robot.lab.evaluation.table_plots import draw
-
-        errors = {
-            f"{row.spec.name}, {row.values['bits_per_window']:,.0f} bits": row.errors
-            for table in tables
-            for row in table.rows
-            if table.name == "4"
-        }
-        draw(options.plots, loaded, folder, seen.motion, seen.takes, errors)
+        tables = {name: build(name, loaded, seen) for name in chosen}
+    if plots is not None:
+        draw(plots, loaded, folder, seen.motion, seen.takes, tables["4"][1] if "4" in tables else {})
     shared = {
-        "data": "held-out takes of the bundled motion" if options.data is None else str(options.data),
+        "data": "held-out takes of the bundled motion" if data is None else str(data),
         "windows": len(seen.motion),
         "unit": "mean squared error in standard deviations of the training motion",
     }
-    if options.table == ALL:
-        return {"table": ALL, **shared, "tables": [table.plain for table in tables]}
-    return {**tables[0].plain, **shared}
+    found = [each for each, _ in tables.values()]
+    return {"table": ALL, **shared, "tables": found} if table == ALL else {**found[0], **shared}
 
 
-def _chosen(options: TableOptions) -> Sequence[str]:
-    if options.table not in (*TABLES, ALL):
-        raise ConfigError(f"--table {options.table!r} is not one of {', '.join((*TABLES, ALL))}")
-    if options.size not in SIZES:
-        raise ConfigError(f"--size {options.size!r} is not one of {', '.join(SIZES)}")
-    if options.train and options.models is None:
-        raise ConfigError("--train needs --models DIR, a folder to keep the tokenizers in")
-    return list(TABLES) if options.table == ALL else (options.table,)
-
-
-def train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, recorded: dict[str, list[Take]]) -> None:
-    """Train the tokenizers of `wanted` that `folder` lacks. Raises ConfigError if that is the package's folder."""
-    missing = [name for name in wanted if options.train or not is_there(folder / name)]
-    if not missing:
-        return
-    if options.models is None:
+def missing_in(folder: Path, wanted: Sequence[str], may_train: bool) -> list[str]:
+    """Return the tokenizers of `wanted` that `folder` lacks. Raises ConfigError if they must not be trained there."""
+    files = (checkpoint.CONFIG, checkpoint.WEIGHTS)
+    missing = [name for name in wanted if not all((folder / name / file).is_file() for file in files)]
+    if missing and not may_train:
         raise ConfigError(
             f"{folder}: {len(missing)} tokenizers of this table are not there ({missing[0]}, ...): add --models DIR, "
             "which trains what is missing, one to two minutes each, and keeps it in DIR"
         )
-    from sfms_robot.lab.evaluation.table_training import train_all
-
-    train_all(
-        missing, folder, recorded[takes.TRAIN], Windows.of(recorded[takes.HELD_OUT], _WINDOW_FRAMES).motion,
-        size=options.size, steps=options.steps, jobs=options.jobs, device=options.device, anew=options.train,
-    )  # fmt: skip
+    return missing

@@ -1,6 +1,6 @@
 """Evidence and hazards of whole recordings at once: what `EventModel.decide_each` draws step by step.
 
-`heard_in` and `done_in` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
+`heard_in` and `done_at` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
 given nothing has to be decided, so every step is asked together (`hazards_in`). Where none is, `most_in` says how
 likely each kind can be at all, whatever was done: at a step whose draws all lie above that nothing can happen, and only
 the others have to be decided one after the other.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -137,6 +137,13 @@ def counts_in(scene: Scene) -> Bools:
     return counts
 
 
+def unspoken(scene: Scene) -> Scene:
+    """Return the scene without one's own voice."""
+    speaks = scene.speaks.copy()
+    speaks[:, MINE] = False
+    return replace(scene, speaks=speaks)
+
+
 def _since(happens: Bools) -> Doubles:
     """Return (N,) seconds since the newest True."""
     index = np.arange(len(happens))
@@ -214,20 +221,13 @@ _SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
 _SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
 
 
-def done_in(
-    spans_s: Mapping[str, Doubles], frames: int, log_rate: Doubles | float, aside: Bools | None = None
-) -> Doubles:
-    """Return (frames, len(DONE)) from spans (K, 2) by kind of `EVENT_KINDS`; kinds that are not there have never been.
-
-    `aside` (K,): which of the gaze shifts go away from the person.
-    """
-    return done_at(spans_s, np.asarray((np.arange(frames) + 1) * FRAME_S, np.float64), log_rate, aside)
-
-
 def done_at(
     spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
 ) -> Doubles:
-    """Return `done_in` at instants (M,): (M, len(DONE))."""
+    """Return the rows (M, len(DONE)) at instants (M,) from spans (K, 2) by kind of `EVENT_KINDS`.
+
+    Kinds that are not there have never been. `aside` (K,): which of the gaze shifts go away from the person.
+    """
     columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
     for kind in _SINCE_END:
         columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
@@ -269,14 +269,10 @@ def hazards_in(
     """Return `Decision.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
     steps = steps_in(len(heard))
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
-    spans_s = {kind: _spans(own, kind) for kind in EVENT_KINDS}
+    spans_s = {kind: event_spans(own, kind) for kind in EVENT_KINDS}
     away = np.array([event.target_rad != AT_PERSON for event in own if event.kind == "gaze_shift"], bool)
-    log_rate = _log_rate(model, calmness)
-    odds = [
-        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done_at(spans_s, at_s, log_rate, away)], 1)))
-        for rows, at_s in zip(_blocks(heard[steps]), _blocks(now_s), strict=True)
-    ]
-    asked_hz = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness))) / STEP_S
+    done = done_at(spans_s, now_s, _log_rate(model, calmness), away)
+    asked_hz = _chances(model, heard[steps], done, calmness) / STEP_S
     may = _may_happen(heard[steps], spans_s, away, now_s)
     hazards_hz = {kind: np.zeros(len(heard)) for kind in EVENT_KINDS}
     for at, kind in enumerate(model.bank.kinds):
@@ -292,17 +288,29 @@ def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
     Over all that the stream may have done before: each term is taken at its greatest knot.
     """
     nothing = np.full((len(heard), len(DONE)), np.nan)
-    odds = [
-        model.bank.log_odds(model.bank.contributions(np.concatenate([rows, done], 1)) + _most_by_doing(model, calmness))
-        for rows, done in zip(_blocks(heard), _blocks(nothing), strict=True)
-    ]
-    most = 1 / (1 + np.exp(-np.concatenate(odds) - model.asked_odds(calmness) - _MARGIN))
+    most = _chances(model, heard, nothing, calmness, _most_by_doing(model, calmness), _MARGIN)
     listening = _listening(heard)
     for at, kind in enumerate(model.bank.kinds):
         most[:, at] *= calmness.per_minute(kind) != 0
         if kind not in ALWAYS:
             most[~listening, at] = 0.0
-    return np.asarray(most)
+    return most
+
+
+def _chances(
+    model: EventModel,
+    heard: Doubles,
+    done: Doubles,
+    calmness: Calmness,
+    terms: Doubles | float = 0.0,
+    odds: float = 0.0,
+) -> Doubles:
+    """Return the probabilities (M, kinds) of evidence of the others and of own events; `terms` and `odds` are added."""
+    found = []
+    for rows in np.array_split(np.concatenate([heard, done], axis=1), len(heard) // _TOGETHER + 1):
+        log_odds = model.bank.log_odds(model.bank.contributions(rows) + terms)
+        found.append(1 / (1 + np.exp(-log_odds - model.asked_odds(calmness) - odds)))
+    return np.concatenate(found)
 
 
 def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
@@ -321,11 +329,8 @@ def _log_rate(model: EventModel, calmness: Calmness) -> float:
     return math.log(calmness.nod or model.tables.hazards["nod"].per_minute)
 
 
-def _blocks(rows: Doubles) -> list[Doubles]:
-    return np.array_split(rows, len(rows) // _TOGETHER + 1)
-
-
-def _spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
+def event_spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
+    """Return (K, 2) start, end of the events of a kind."""
     return np.array([(one.start_s, one.end_s) for one in events if one.kind == kind], np.float64).reshape(-1, 2)
 
 

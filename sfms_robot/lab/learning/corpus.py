@@ -8,26 +8,36 @@ a frame with its neighbour asks `Corpus.steps`.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sfms_robot import config
 from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
-from sfms_robot.lab.learning.staged_frames import Scratch, StagedFrames, read_staged
+from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals.control import control_track
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
+    from sfms_robot.listeners.arig.model import ArigModel
+    from sfms_robot.listeners.sfms.model import SfmsModel
 
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
@@ -46,7 +56,7 @@ class Corpus(Generic[Frames]):
         frames: tensors (N, ...).
         lengths: frames of each dyad.
         scenes: the kind of conversation each dyad is of.
-        staged: they lie on disk, and only what is cut out of them goes to another device.
+        staged: The frames lie on disk, and only windows of them go to another device.
     """
 
     frames: Frames
@@ -56,31 +66,35 @@ class Corpus(Generic[Frames]):
 
     @cached_property
     def begins(self) -> Tensor:
-        """(N,) bool, the first frame of a dyad."""
+        """Return (N,) bool, True in the first frame of a dyad."""
         firsts = torch.zeros(sum(self.lengths), dtype=torch.bool)
         firsts[torch.tensor([0, *self.lengths[:-1]]).cumsum(0)] = True
         return firsts.to(getattr(self.frames, fields(self.frames)[0].name).device)
 
+    def by_dyad(self, values: Tensor) -> list[Tensor]:
+        """Split values (N, ...) of all frames into those of each dyad."""
+        return list(torch.split(values, list(self.lengths)))
+
     def steps(self, values: Tensor) -> Tensor:
-        """Differences (N - dyads, C) of values (N, C) from each frame to the next of the same dyad."""
-        return torch.cat([dyad.diff(dim=0) for dyad in torch.split(values, list(self.lengths))])
+        """Return the differences (N - dyads, C) of values (N, C) from each frame to the next of the same dyad."""
+        return torch.cat([dyad.diff(dim=0) for dyad in self.by_dyad(values)])
 
     def starts(self, window: int) -> Tensor:
-        """First frames of every window that lies in one dyad."""
+        """Return the first frame of every window that lies in one dyad."""
         return first_frames(self.lengths, window)
 
     def starts_by_scene(self, window: int) -> dict[str, Tensor]:
-        """`starts`, those of each scene apart; scenes without any are left out."""
+        """Return `starts` by scene; scenes without any are left out."""
         starts = self.starts(window)
         scene = np.repeat(np.array(self.scenes), self.lengths)[starts.numpy()]
         return {name: starts[torch.from_numpy(scene == name)] for name in dict.fromkeys(scene.tolist())}
 
     def cut(self, starts: Tensor, window: int) -> Frames:
-        """The windows (B, window, ...) at (B,) starts, on their device."""
+        """Return the windows (B, window, ...) at (B,) starts, on the device of the starts."""
         return _each(self.frames, lambda part: windows(part, starts.to(part.device), window).to(starts.device))
 
     def to(self, device: torch.device) -> Corpus[Frames]:
-        """The same frames on another device; staged ones stay where they are."""
+        """Return the same frames on another device; staged ones stay on disk."""
         if self.staged:
             return self
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
@@ -109,23 +123,10 @@ def gather(
 
     Raises ConfigError when none is left, and whatever `frames_of` raises.
     """
-    if scratch is None or scratch.group.local_rank == 0:
-        corpus = _read(scenes, window, frames_of, scratch)
-    if scratch is None:
-        return corpus
-    scratch.group.wait()
-    if scratch.group.local_rank == 0:
-        return corpus
-    like = frames_of(next(iter(usable(next(iter(scenes.values()))))))
-    found, lengths, named = read_staged(scratch.folder)
-    return Corpus(replace(like, **found), lengths, named, staged=True)
-
-
-def _read(
-    scenes: Mapping[str, Sequence[Dyad]], window: int, frames_of: Callable[[Dyad], Frames], scratch: Scratch | None
-) -> Corpus[Frames]:
+    if scratch is not None and scratch.group.local_rank:
+        scratch.group.wait()
+        return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), scratch.folder)
     parts: list[Frames] = []
-    files = None if scratch is None else StagedFrames(scratch.folder)
     lengths: list[int] = []
     named: list[str] = []
     short = 0
@@ -135,29 +136,29 @@ def _read(
                 short += 1
                 continue
             one = frames_of(dyad)
-            if files is None:
+            if scratch is None:
                 parts.append(one)
             else:
-                files.add(one)
-                parts = [one]
+                _stage(one, scratch.folder, first=not lengths)
             lengths.append(len(dyad.listener))
             named.append(scene)
-    total = sum(len(dyads) for dyads in scenes.values())
+    total = sum(map(len, scenes.values()))
     left_out = f"{short} are shorter than a window of {window} frames, {total - len(lengths) - short} cannot be read"
     if not lengths:
         raise ConfigError(f"none of {total} dyads can be used: {left_out}")
     if len(lengths) < total:
         log.warning("%d of %d dyads are used: %s", len(lengths), total, left_out)
-    if files is not None and scratch is not None:
-        files.close(lengths, named)
-        found, _, _ = read_staged(scratch.folder)
-        return Corpus(replace(parts[0], **found), tuple(lengths), tuple(named), staged=True)
-    joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(parts[0])}
-    return Corpus(replace(parts[0], **joined), tuple(lengths), tuple(named))
+    if scratch is not None:
+        with _writing(scratch.folder):
+            (scratch.folder / _INDEX).write_text(json.dumps({"lengths": lengths, "scenes": named}), encoding="utf-8")
+        scratch.group.wait()
+        return read_staged(one, scratch.folder)
+    joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(one)}
+    return Corpus(replace(one, **joined), tuple(lengths), tuple(named))
 
 
 def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
-    """First frames of the windows that lie in one dyad, dyads of those lengths one after another."""
+    """Return the first frames of the windows that lie in one dyad, dyads of these lengths one after another."""
     firsts, at = [torch.empty(0, dtype=torch.int64)], 0
     for length in lengths:
         firsts.append(torch.arange(at, max(at, at + length - window + 1), hop))
@@ -166,12 +167,12 @@ def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
 
 
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
-    """(N, ...) cut at (B,) starts -> (B, length, ...)."""
+    """Cut values (N, ...) at (B,) starts into (B, length, ...)."""
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
 
 
 def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
-    """Motion (N, D) of a dyad -> (N, C) in the space; rows that are not finite stay so.
+    """Encode motion (N, D) of a dyad in the space, (N, C); rows that are not finite stay so.
 
     Raises ConfigError for a dyad in a space that cannot be turned into the wanted one.
     """
@@ -200,6 +201,34 @@ def without_gaze(dyad: Dyad) -> Dyad:
     return replace(dyad, listener=motion, head_of_gaze_rad=None)
 
 
+def shared_frames(
+    dyad: Dyad, space: MotionSpace, settings: config.Sfms | config.Arig | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return what every family takes of a dyad of N frames.
+
+    The speaker's face (N, C), 0 where unknown, and where it is known (N,); the listener's motion (N, C), its sway
+    (N, S), where that is not in the motion, and the control rows (N, K) of its events. S and K are 0 without.
+
+    `settings`: of the listener; None: one without events and sway. Raises ConfigError for a motion space that cannot be
+    converted, and for a listener with events where the dyad has none, or not at our rate.
+    """
+    frames = len(dyad.listener)
+    control, sway = torch.zeros(frames, 0), torch.zeros(frames, 0)
+    if settings is not None and settings.events:
+        if dyad.events is None:
+            raise ConfigError(f"dyad {dyad.name}: expected events of its listener, which a listener with events needs")
+        if dyad.fps != FRAME_HZ:
+            raise ConfigError(
+                f"dyad {dyad.name}: {dyad.fps:g} frames a second; a listener with events needs {FRAME_HZ}"
+            )
+        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
+    face, motion = in_space(dyad, dyad.speaker, space), in_space(dyad, dyad.listener, space)
+    known = face.isfinite().all(-1)
+    if settings is not None and settings.sway:
+        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
+    return torch.where(known[:, None], face, 0.0), known, motion, sway, control
+
+
 def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return mean and deviation (C,) of motion (N, C).
 
@@ -210,26 +239,27 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
     return motion.mean(0), motion.std(0).clamp(min=least, max=most)
 
 
-def some_sound(*tracks: tuple[Tensor, Tensor]) -> Tensor:
-    """Rows (M, ...) of sounds (N, ...) where they are heard (N,), as many as `sound_scales` looks at and as evenly."""
+def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> None:
+    """Set the means and deviations of the sound of tracks: sound (N, ..., A) where it is heard (N,).
+
+    A feature that hardly moves is not amplified. Without any sound the model's stay.
+    """
     at = [heard.nonzero()[:, 0] for _, heard in tracks]
-    step = max(1, sum(map(len, at)) // SOUND_SAMPLE)
-    found, before = [], 0
+    total = sum(map(len, at))
+    if not total:
+        return
+    step, some, before = max(1, total // SOUND_SAMPLE), [], 0
     for (sound, _), index in zip(tracks, at, strict=True):
-        found.append(sound[index[-before % step :: step]])
+        some.append(sound[index[-before % step :: step]])
         before += len(index)
-    return torch.cat(found)
-
-
-def sound_scales(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (A,) of sound features (M, ..., A), M > 0; a feature that hardly moves is not blown up."""
-    some = rows[:: max(1, len(rows) // SOUND_SAMPLE)].float().flatten(0, -2)
-    spread = some.std(0)
-    return some.mean(0), spread.clamp(min=max(LEAST_SOUND_SPREAD, 0.2 * float(spread.median())))
+    rows = torch.cat(some).float().flatten(0, -2)
+    spread = rows.std(0)
+    model.sound_mean.copy_(rows.mean(0))
+    model.sound_std.copy_(spread.clamp(min=max(LEAST_SOUND_SPREAD, 0.2 * float(spread.median()))))
 
 
 def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Least and largest deviation (C,) that a channel is divided by: blendshapes, rotations [rad], places [m]."""
+    """Return the least and largest deviations (C,) to divide by: of blendshapes, rotations [rad], places [m]."""
     bounds = []
     for name in channels:
         if name in BLENDSHAPES:
@@ -242,3 +272,155 @@ def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
             bounds.append((0.01, 0.01))
     least, most = torch.tensor(bounds).T
     return least, most
+
+
+# --- Frames on disk --------------------------------------------------------------------------------------------------
+#
+# The processes of a machine share the system's file cache; the first process writes. A folder with frames of an earlier
+# run is written again.
+
+_INDEX = "index.json"
+
+
+def _stage(frames: DataclassInstance, folder: Path, first: bool) -> None:
+    """Append the tensors (N, ...) of one dyad to the files of a folder; `first`: in place of what they hold."""
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, tensor in vars(frames).items():
+            with (folder / f"{name}.frames").open("wb" if first else "ab") as opened:
+                opened.write(tensor.contiguous().numpy().tobytes())
+
+
+def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
+    """Return the corpus whose frames lie in a folder, with the fields and types of `like`. Raises ConfigError."""
+    try:
+        index: dict[str, Any] = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{folder}: the first process of this machine has staged no frames ({error})") from error
+    rows, found = sum(index["lengths"]), {}
+    for name, tensor in vars(like).items():
+        shape = (rows, *tensor.shape[1:])
+        flat, size = torch.zeros(0, dtype=tensor.dtype), math.prod(shape)
+        if size:
+            flat = torch.from_file(str(folder / f"{name}.frames"), shared=False, size=size, dtype=tensor.dtype)
+        found[name] = flat.view(shape)
+    return Corpus(replace(like, **found), tuple(index["lengths"]), tuple(index["scenes"]), staged=True)
+
+
+@contextmanager
+def _writing(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"--scratch: {file} cannot be written: {error.strerror or error}") from error
+
+
+# --- Slow motion of a head -------------------------------------------------------------------------------------------
+
+CUT_HZ: Final = 1.0
+HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
+MARGIN_FRAMES: Final = 2  # around an event that may still be it
+UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen: below 0.1 Hz it still counts
+LONGEST: Final = 2048  # frames of a spectrum
+ROUNDS: Final = 8  # to choose between people and mirror images, at most
+
+
+def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
+    """Return the slow part (N, S) of motion (N, S): below `CUT_HZ`, and smooth across the events that move the head.
+
+    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. Frames of a nod weigh
+    nothing: sway cannot be seen in them, a low-pass alone would take the mean of a nod for sway, and give the nod a
+    swing in the opposite direction before it begins.
+    """
+    from scipy.linalg import solveh_banded
+
+    n = len(motion)
+    if n < 3:
+        return motion.copy()
+    weight = np.ones(n)
+    for event in events:
+        if event.kind in HEAD_KINDS:
+            first = int(np.floor(event.start_s * FRAME_HZ)) - MARGIN_FRAMES
+            last = int(np.ceil(event.end_s * FRAME_HZ)) + MARGIN_FRAMES
+            weight[max(0, first) : max(0, last)] = UNKNOWN
+    mu = (2 * np.sin(np.pi * CUT_HZ / FRAME_HZ)) ** -4.0  # half of it passes at the cut
+    bands = np.zeros((3, n))
+    difference = (1.0, -2.0, 1.0)
+    for a, left in enumerate(difference):
+        for b, right in enumerate(difference[a:]):
+            bands[b, a : n - 2 + a] += mu * left * right
+    bands[0] += weight
+    slow: Doubles = solveh_banded(bands, weight[:, None] * motion.astype(np.float64), lower=True)
+    return slow.astype(np.float32)
+
+
+def without_sway(
+    motion: Tensor, space: MotionSpace, channels: Sequence[str], events: Sequence[ListenerEvent]
+) -> tuple[Tensor, Tensor]:
+    """Return motion (N, C) of a space less the sway of its head, and that sway (N, S) relative to neutral."""
+    head = head_channels(channels)
+    slow = torch.from_numpy(slow_part(motion[:, head].numpy(), events))
+    sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
+    fast = motion.clone()
+    fast[:, head] -= sway
+    return fast, sway
+
+
+def fit_sway(model: SfmsModel | ArigModel, slow: Sequence[Tensor], lateral: Sequence[int]) -> None:
+    """Set a model's sway by `sway_of` slow motion (N, S) of people."""
+    mixture, spread = sway_of(slow, lateral)
+    model.sway_mixture.copy_(mixture)
+    model.sway_spread.copy_(spread)
+
+
+def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+    """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
+
+    Each person is scaled to the mean size before powers are taken; `spread` holds the sizes. Of a person and the mirror
+    image, with `lateral` channels inverted, the one nearer to the other people counts.
+    """
+    tracks = [one.double() - one.double().mean(0) for one in slow if len(one) >= 2 * FRAME_HZ]
+    if not tracks:
+        raise ValueError("no motion of 2 s or more to fit sway on")
+    sizes = torch.stack([track.square().mean(0).sqrt().clamp(min=1e-9).log() for track in tracks])  # (K, S)
+    common = (sizes - sizes.mean(0)).mean(1)  # of the whole head
+    weight = torch.tensor([float(len(track)) for track in tracks], dtype=torch.float64)
+    spread = common.std(correction=0) if len(tracks) > 1 else torch.zeros((), dtype=torch.float64)
+    powers = torch.stack(
+        [band_powers(track / one.exp()) * weight_ for track, one, weight_ in zip(tracks, common, weight, strict=True)]
+    )
+    powers = _one_side(powers, lateral).sum(0) / weight.sum()
+    value, vector = torch.linalg.eigh(powers)
+    root = vector * value.clamp(min=0).sqrt()[:, None] @ vector.mT  # symmetric
+    return root.float(), spread.float()
+
+
+def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
+    """Return powers (K, BANDS, S, S) of people or of their mirror images, whichever are more alike."""
+    turned = torch.ones(powers.shape[-1], dtype=powers.dtype)
+    turned[list(lateral)] = -1
+    mirror = turned[:, None] * turned
+    size = powers.sum((0, 1)).diagonal().clamp(min=1e-30).sqrt()
+    alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel as much as any other
+    mirrored = torch.zeros(len(powers), 1, 1, dtype=torch.bool)
+    for _ in range(ROUNDS):
+        mean = torch.where(mirrored, alike * mirror, alike).sum(0)
+        likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of what a mirror changes, as each stands
+        before, mirrored = mirrored, (likeness < 0)[:, None, None]
+        if torch.equal(before, mirrored):
+            break
+    return torch.where(mirrored[:, None], powers * mirror, powers)
+
+
+def band_powers(track: Tensor) -> Tensor:
+    """Return the co-spectrum (BANDS, S, S) of a track (N, S) by band of `BANDS_HZ`; slower parts count in the first."""
+    from scipy import signal
+
+    length = min(len(track), LONGEST)
+    values = track.numpy()
+    how = {"fs": FRAME_HZ, "nperseg": length, "detrend": "constant"}
+    frequency_hz, density = signal.csd(values.T[:, None], values.T[None], **how)
+    band = np.clip(np.searchsorted(BANDS_HZ, frequency_hz, side="right") - 1, 0, BANDS)
+    powers = np.zeros((BANDS + 1, *density.shape[:2]))
+    np.add.at(powers, band, np.moveaxis(density.real, -1, 0) * (frequency_hz[1] - frequency_hz[0]))
+    return torch.from_numpy(powers[:BANDS])

@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -26,10 +25,9 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, MOTION_DIM, ListenerEvent
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.learning.arig import features as arig
-from sfms_robot.lab.learning.arig.losses import Student
-from sfms_robot.lab.learning.arig.trainer import arig_job
-from sfms_robot.lab.learning.job import Job
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.arig.trainer import Student, arig_job
+from sfms_robot.lab.learning.corpus import fit_sound
+from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.sfms import features as sfms
 from sfms_robot.lab.learning.sfms.predictor_trainer import listener_job
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import tokenizer_job
@@ -68,7 +66,7 @@ ASSUMED: Final = (
 
 
 def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
-    """Figures of every stage, and hours of all their steps.
+    """Return figures of every stage, and hours of all their steps.
 
     Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
     """
@@ -78,7 +76,7 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
 
 
 def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[str, Job, int]]:
-    """Name, job and steps of each stage, on weights as they begin and made-up frames."""
+    """Yield name, job and steps of each stage, on initial weights and made-up frames."""
     cpu = torch.device("cpu")
     torch.manual_seed(settings.seed)
     listener = settings.listener
@@ -98,12 +96,12 @@ def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[s
     sfms.fit_scales(model, plain, settings.listener.channels)
     yield "tokenizer", tokenizer_job(settings, model, plain, plain, cpu), settings.tokenizer.steps
     heard = sfms.gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
-    sfms.fit_sound_scales(model, heard)
+    fit_sound(model, (heard.frames.sound, heard.frames.heard))
     yield "listener", listener_job(settings, model, heard, heard, cpu), settings.predictor.steps
 
 
 def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
-    """Conversations of noise: what a step costs does not depend on what is in them. `ours`: in arkit58."""
+    """Make conversations of noise: the cost of a step does not depend on the content. `ours`: in arkit58."""
     rng = np.random.default_rng(0)
     name, rest = ("arkit58", np.full(MOTION_DIM, 0.1)) if ours else (space.name, space.neutral)
     found = []
@@ -111,22 +109,18 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
         motion, face = (rng.normal(rest, 0.05, (frames, len(rest))).astype(np.float32) for _ in range(2))
         voice, own = (rng.normal(0, 0.05, samples_of(frames, FRAME_HZ)).astype(np.float32) for _ in range(2))
         sizes = {"wav2vec2": 768, "agent_wav2vec2": 768, "mfcc78": 78}
-        made = Dyad(
-            name=f"made up {index}",
-            audio=voice,
-            speaker=face,
-            listener=motion,
-            listening=np.ones(frames, bool),
-            space=name,
-            agent_audio=own,
-        )
-        events = tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS))
         found.append(
-            replace(
-                made,
+            Dyad(
+                name=f"made up {index}",
+                audio=voice,
+                speaker=face,
+                listener=motion,
+                listening=np.ones(frames, bool),
+                space=name,
+                agent_audio=own,
                 features={key: rng.normal(size=(frames, size)).astype(np.float32) for key, size in sizes.items()},
                 states=rng.integers(0, len(STATES), frames).astype(np.int8),
-                events=events,
+                events=tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS)),
                 head_of_gaze_rad=np.zeros((frames, 3), np.float32),
             )
         )
@@ -134,17 +128,16 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
 
 
 def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
-    """One piece of a batch and the update after it, made here; the pieces of a batch are all alike."""
+    """Measure one piece of a batch and the update after it; all pieces of a batch are alike."""
     batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
     samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
     pieces = batch // samples
     piece = replace(job, phase=job.phase.model_copy(update={"batch": samples}))
     job.model.train()
     began_s = time.perf_counter()
-    with TemporaryDirectory() as scratch:
-        gradients = Gradients(piece, ProcessGroup(), 1, Path(scratch))
-        with OperationCount() as count:
-            loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
+    gradients = Gradients(piece, ProcessGroup(), 1, Path())
+    with OperationCount() as count:
+        loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
     with OperationCount() as update:
         for one in job.optimizers:
             one.step()

@@ -10,14 +10,12 @@ rest, and where people do, are quantiles of all frames of these windows.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from scipy.optimize import nnls
 
 from sfms_robot.config import find
@@ -26,7 +24,7 @@ from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doub
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import rollouts
+from sfms_robot.lab.evaluation.rollout import rollouts, spread, tracked
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.idle import FILE, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
 from sfms_robot.listeners.registry import load_folder, one_thread
@@ -46,15 +44,8 @@ AT: Final = (0.01, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99)  # quantiles
 _SOUND: Final = 1e-3
 
 
-@dataclass(frozen=True)
-class Resting:
-    """Windows (W, 50, 52) of one face at rest."""
-
-    windows: Floats
-
-
-def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats | None = None) -> Resting:
-    """Those of a motion (N, 58), its events, and what it says (N * 640,)."""
+def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats | None = None) -> Floats:
+    """Return the windows (W, 50, 52) at rest of a motion (N, 58), by its events and its own voice (N * 640,)."""
     still = np.ones(len(motion), bool)
     for event in events:
         if event.kind in FACE_KINDS:
@@ -66,14 +57,15 @@ def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats |
     found = [
         motion[at : at + WINDOW, SHAPES] for start, end in runs(still) for at in range(start, end - WINDOW + 1, WINDOW)
     ]
-    return Resting(np.array(found, np.float32).reshape(-1, WINDOW, len(BLENDSHAPES)))
+    return np.array(found, np.float32).reshape(-1, WINDOW, len(BLENDSHAPES))
 
 
-def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
-    """Return the idle motion that `ours` lack beside `theirs`; one entry a person. Raises ValueError without any
-    window.
+def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
+    """Return the idle motion that windows `ours` lack beside `theirs`, an array (W, 50, 52) per person.
+
+    Raises ValueError without any window.
     """
-    people, listener = ([one.windows for one in faces if len(one.windows)] for faces in (theirs, ours))
+    people, listener = ([one for one in faces if len(one)] for faces in (theirs, ours))
     if not people or not listener:
         raise ValueError("no two seconds in which a face rests")
     lacking = covariances(people) - covariances(listener)  # (IDLE_BANDS, C, C)
@@ -84,7 +76,7 @@ def fit_idle(theirs: Sequence[Resting], ours: Sequence[Resting]) -> IdleMotion:
         for value, pattern in sorted(zip(power.tolist(), patterns.T, strict=True), key=lambda one: -one[0])[:PATTERNS]:
             if value < LEAST**2:
                 break
-            by_band = unleaked(np.einsum("c,bcd,d->b", pattern, part, pattern))
+            by_band = nnls(_leakage(), np.einsum("c,bcd,d->b", pattern, part, pattern))[0]
             loading = np.zeros(len(BLENDSHAPES))
             loading[rows] = np.sqrt(by_band.sum()) * pattern
             loadings.append(loading)
@@ -104,8 +96,9 @@ def _of_region(region: str) -> NDArray[np.intp]:
 
 
 def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """(KNOTS, C) each: of the listener's windows with what it lacks, and of people's; where eyes look is not the
-    face's, and stays. Neighbours of people's are no further apart than a map may be steep, told from the middle.
+    """Return quantiles (KNOTS, C) of the listener's windows with the motion they lack, and of people's.
+
+    The channels of gaze stay. Neighbours of people's, from the middle on, are no further apart than a map may be steep.
     """
     rng = np.random.default_rng(0)
     rest = np.concatenate(listener).reshape(-1, len(BLENDSHAPES)).astype(np.float64)
@@ -122,16 +115,11 @@ def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Fl
     return held.astype(np.float32), shown.astype(np.float32)
 
 
-def unleaked(seen: Doubles) -> Doubles:
-    """(IDLE_BANDS,) powers of a process of which windows of two seconds show `seen` (IDLE_BANDS,): none is negative.
+def _leakage() -> Doubles:
+    """Return what `covariances` finds in each band (IDLE_BANDS, IDLE_BANDS), mean over windows, of power 1 in another.
 
     A line of a band is seen in others too, above all one that is slower than a window is long.
     """
-    return np.asarray(nnls(_leakage(), seen)[0], np.float64)
-
-
-def _leakage() -> Doubles:
-    """(IDLE_BANDS, IDLE_BANDS): what `covariances` finds in each band, mean over windows, of power 1 in another."""
     edges = np.array(IDLE_BANDS_HZ)
     hz = edges[:-1] + (np.arange(64)[:, None] + 0.5) / 64 * np.diff(edges)  # (64, IDLE_BANDS)
     turn = np.exp(2j * np.pi * hz.T[:, :, None] / FRAME_HZ * np.arange(WINDOW))  # (IDLE_BANDS, 64, 50)
@@ -146,7 +134,7 @@ def _leakage() -> Doubles:
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
-    """(IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
+    """Return (IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
     windows = np.concatenate(faces)
     hz = np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ)
     band = np.searchsorted(IDLE_BANDS_HZ, hz, side="right") - 1
@@ -163,19 +151,14 @@ def covariances(faces: Sequence[Floats]) -> Doubles:
 
 
 def _spread(faces: Sequence[Floats]) -> float:
-    """Deviation of the logarithm of how much people move, of those seen for ten seconds and more."""
+    """Return the deviation of the logarithm of how much people move, of those seen for ten seconds or more."""
     sizes = [np.log(windows.std(axis=(0, 1)).mean() + 1e-9) for windows in faces if len(windows) * 2 >= 10]
     return float(np.clip(np.std(sizes), 0, 1)) if len(sizes) > 1 else 0.0
 
 
-def explained(idle: IdleMotion) -> NDArray[np.float64]:
-    """(52,) deviation of every channel that it adds."""
-    return np.asarray(np.sqrt((idle.loadings.astype(np.float64) ** 2).sum(0)), np.float64)
-
-
 # --- Behind `train idle`: what a trained listener leaves out of the small motion of resting faces, into its folder
 
-TOLD: Final = 8  # channels that move most, in the figures
+SHOWN: Final = 8  # channels that move most, in the figures
 
 
 def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
@@ -192,34 +175,27 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
             f"{folder}: expected a listener with events; without them rest and events cannot be separated"
         )
     every = open_for("arkit58", data, "train")
-    rows = np.linspace(0, len(every) - 1, min(clips, len(every))).round().astype(int).tolist()
-    chosen = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(every.clips[row] for row in rows)))]
+    chosen = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(spread(every.clips, clips))))]
     if not chosen or any(dyad.events is None for dyad in chosen):
         raise ConfigError(
             f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
         )
     how = load_folder(folder)
-    with Progress(console=Console(stderr=True)) as progress:
-        playing = progress.add_task(f"{name} listens", total=len(chosen))
-        shown = rollouts(how, chosen, seed, lambda: progress.advance(playing))
-    theirs = [resting(dyad.listener, dyad.events or (), dyad.agent_audio) for dyad in chosen]
-    ours = [
-        resting(one.motion[0], dyad.events or (), dyad.agent_audio) for one, dyad in zip(shown, chosen, strict=True)
-    ]
+    shown = rollouts(how, tracked(chosen, f"{name} listens"), seed)
+    theirs, ours = (
+        [resting(motion, dyad.events or (), dyad.agent_audio) for motion, dyad in zip(motions, chosen, strict=True)]
+        for motions in ([dyad.listener for dyad in chosen], [one.motion[0] for one in shown])
+    )
     try:
         idle = fit_idle(theirs, ours)
     except ValueError as error:
         raise ConfigError(f"{data}: {error}") from None
     idle.save(folder / FILE)
-    return {"out": str(folder / FILE), "dyads": len(chosen), **figures(idle)}
-
-
-def figures(idle: IdleMotion) -> dict[str, Any]:
-    """Return the number of patterns, the spread over people, and the largest deviations that it adds."""
-    added = explained(idle)
-    most = np.argsort(-added)[:TOLD]
+    added = np.sqrt((idle.loadings.astype(np.float64) ** 2).sum(0))  # deviation of every channel
     return {
+        "out": str(folder / FILE),
+        "dyads": len(chosen),
         "patterns": len(idle.loadings),
         "spread": round(idle.spread, 3),
-        "deviation": {BLENDSHAPES[at]: round(float(added[at]), 4) for at in most},
+        "deviation": {BLENDSHAPES[at]: round(float(added[at]), 4) for at in np.argsort(-added)[:SHOWN]},
     }

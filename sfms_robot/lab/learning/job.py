@@ -19,7 +19,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
 
 Five duties make a resumed run bit-identical on a CPU:
  - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
-   or from torch's global one (dropout); never from numpy, the clock or a generator of its own;
+   or from torch's global one (dropout); never from numpy, the clock or another generator;
  - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
@@ -30,21 +30,125 @@ Five duties make a resumed run bit-identical on a CPU:
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.distributed as dist
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
 
 from sfms_robot import config
-from sfms_robot.errors import optional
-from sfms_robot.lab.learning.process_group import ProcessGroup
-from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.errors import ConfigError, GroupError, optional
+
+PATIENCE = timedelta(minutes=30)  # a process looks at held-out data, or stages files, while others wait
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process among `size` that train together; `local_rank` among those on its machine."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+    restarts: int = 0
+
+    @property
+    def first(self) -> bool:
+        """Return whether this process writes files and prints."""
+        return self.rank == 0
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        """Return the means over all processes. Raises GroupError when one of them is gone."""
+        if self.size == 1:
+            return list(values)
+        sums = torch.tensor(values, dtype=torch.float64, device=_device())
+        with self.talking():
+            dist.all_reduce(sums)
+        return [float(each) / self.size for each in sums]
+
+    def from_first(self, find: Callable[[], float]) -> float:
+        """Return what the first process finds; the others wait for it."""
+        if self.size == 1:
+            return find()
+        found = torch.tensor([find() if self.first else 0.0], dtype=torch.float64, device=_device())
+        with self.talking():
+            dist.broadcast(found, 0)
+        return float(found)
+
+    def wait(self) -> None:
+        """Wait for all processes."""
+        self.mean([0.0])
+
+    @contextmanager
+    def talking(self) -> Iterator[None]:
+        """Run a part that talks to the other processes. Raises GroupError if one of them is gone."""
+        try:
+            yield
+        except RuntimeError as error:  # gloo and NCCL raise this and its children
+            if self.size == 1 or isinstance(error, torch.cuda.OutOfMemoryError):
+                raise
+            said = f"process {self.rank} of {self.size} has lost another one: {_first_line(error)}"
+            raise GroupError(said) from error
+
+
+@contextmanager
+def joined(device: torch.device) -> Iterator[ProcessGroup]:
+    """Join the group that `torchrun` names in the environment; yield it, or this process alone.
+
+    Raises ConfigError, GroupError.
+    """
+    size = _number("WORLD_SIZE", 1)
+    if size == 1:
+        yield ProcessGroup(restarts=_number("TORCHELASTIC_RESTART_COUNT", 0))
+        return
+    group = ProcessGroup(_number("RANK", 0), size, local_rank(), _number("TORCHELASTIC_RESTART_COUNT", 0))
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    with group.talking():
+        store, _, _ = next(rendezvous("env://", timeout=PATIENCE))
+        # torchrun goes on with a store that holds addresses of the dead.
+        store = dist.PrefixStore(f"restart {group.restarts}", store)  # type: ignore[attr-defined]
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=PATIENCE, world_size=size, rank=group.rank, store=store)
+    try:
+        yield group
+    finally:
+        dist.destroy_process_group()
+
+
+def local_rank() -> int:
+    """Return the number of this process among those on its machine, which is that of its GPU."""
+    return _number("LOCAL_RANK", 0)
+
+
+def _number(name: str, otherwise: int) -> int:
+    text = os.environ.get(name, str(otherwise))
+    if not text.isdecimal():
+        raise ConfigError(f"{name}={text} in the environment: expected a number, as torchrun sets it")
+    return int(text)
+
+
+def _device() -> torch.device:
+    return torch.device("cuda", torch.cuda.current_device()) if dist.get_backend() == "nccl" else torch.device("cpu")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+# --- Trainer's side --------------------------------------------------------------------------------------------------
+#
+# A step's batch is cut into pieces, each drawn with its own generator; process r of W takes pieces r, r + W, ...
+# A piece is the same in every process, so the losses of a run do not depend on the number of processes, up to the order
+# of summation. One process with one piece computes what plain training does.
 
 LossOf = Callable[[int, torch.Generator, int], Tensor]
 
@@ -102,8 +206,12 @@ class Report:
     looked: bool
 
 
-def unwatched(report: Report) -> None:
-    """Shows nothing to anybody."""
+@dataclass(frozen=True)
+class Scratch:
+    """Folder of staged frames, and the processes that read them."""
+
+    folder: Path
+    group: ProcessGroup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +219,7 @@ class Run:
     """Settings of running a job that do not change its weights.
 
     Attributes:
+        watches: called after every step.
         group: the processes that run it together.
         accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
             The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
@@ -120,13 +229,13 @@ class Run:
 
     resume: bool = False
     device: torch.device = torch.device("cpu")
-    watch: Callable[[Report], None] = unwatched
+    watches: Sequence[Callable[[Report], None]] = ()
     group: ProcessGroup = ProcessGroup()
     accumulate: int | None = None
     scratch: Path | None = None
 
     def staging(self, name: str) -> Scratch | None:
-        """Where frames of this name are staged, if they are."""
+        """Return where frames of this name are staged, if they are."""
         return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
@@ -144,15 +253,16 @@ class TrainingOutcome:
     resumed_at: int | None
 
 
-# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. They are told; nothing waits
+# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. Nothing waits for them
 
 Watch = Callable[[Report], None]
 CURVES_EVERY = 10  # steps
+_CURVES = ("loss", "gradient_norm", "learning_rate", "frames_per_s")
 
 
 @contextmanager
 def progress_bar() -> Iterator[Watch]:
-    """A bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
+    """Show a bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
     tasks: dict[str, TaskID] = {}
     with Progress(
         TextColumn("{task.description}"),
@@ -165,25 +275,18 @@ def progress_bar() -> Iterator[Watch]:
 
         def watch(report: Report) -> None:
             at = report.position
-            if report.name not in tasks:  # a resumed run begins where it was, so that the time left counts from there
-                tasks[report.name] = bar.add_task(
-                    report.name, total=report.steps, completed=at.step - 1, figures="", start=True
-                )
-            bar.update(tasks[report.name], completed=at.step, figures=figures(report))
+            if report.name not in tasks:  # of a resumed run the time left counts from its checkpoint
+                tasks[report.name] = bar.add_task(report.name, total=report.steps, completed=at.step - 1, figures="")
+            held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
+            figures = f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
+            bar.update(tasks[report.name], completed=at.step, figures=figures)
 
         yield watch
 
 
-def figures(report: Report) -> str:
-    """Loss, held-out loss once there is one, and speed."""
-    at = report.position
-    held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
-    return f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
-
-
 @contextmanager
 def tensorboard(folder: Path) -> Iterator[Watch]:
-    """Curves of loss, held-out loss, gradient norm, learning rate and speed in `folder`/NAME. Raises MissingExtra."""
+    """Write loss, held-out loss, gradient norm, learning rate and speed to `folder`/NAME. Raises MissingExtra."""
     with optional("--tensorboard"):
         from torch.utils.tensorboard import SummaryWriter
     writers: dict[str, SummaryWriter] = {}
@@ -191,15 +294,12 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
     def watch(report: Report) -> None:
         step = report.position.step
         if report.name not in writers:
-            # Whatever an interrupted run drew past its checkpoint is drawn again.
+            # An interrupted run's curves past its checkpoint are drawn again.
             writers[report.name] = SummaryWriter(str(folder / report.name), purge_step=step)
         curves = {}
         if step % CURVES_EVERY == 0 or report.position.finished:
             curves = {
-                "loss": report.loss,
-                "gradient_norm": report.gradient_norm,
-                "learning_rate": report.learning_rate,
-                "frames_per_s": report.frames_per_s,
+                name: getattr(report, name) for name in ("loss", "gradient_norm", "learning_rate", "frames_per_s")
             }
         if report.looked and report.position.held_out is not None:
             curves["held_out_loss"] = report.position.held_out
@@ -211,13 +311,3 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
     finally:
         for writer in writers.values():
             writer.close()
-
-
-def together(watches: Sequence[Watch]) -> Watch:
-    """One watcher that tells several."""
-
-    def watch(report: Report) -> None:
-        for one in watches:
-            one(report)
-
-    return watch

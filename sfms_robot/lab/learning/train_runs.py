@@ -3,40 +3,51 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import Progress
+from torch import Tensor
 
 from sfms_robot import config
 from sfms_robot.config import load_training, parse_training
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.corpora.collection import Order
-from sfms_robot.lab.evaluation.sampling_calibration import calibrate, rounds
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import Dataset, Order, usable
+from sfms_robot.lab.corpora.formats import open_for
+from sfms_robot.lab.evaluation.rollout import offline_rollout, tracked
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.job import Run, Watch, progress_bar, tensorboard, together
-from sfms_robot.lab.learning.process_group import joined, local_rank
-from sfms_robot.lab.learning.resume import checkpoint_file
+from sfms_robot.lab.learning.corpus import without_gaze
+from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
+from sfms_robot.lab.learning.sfms.features import gather, tokenise
+from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
+from sfms_robot.lab.learning.training_loop import checkpoint_file
 from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.sfms.model import SfmsModel
+from sfms_robot.listeners.sfms.stream import SfmsListener
+from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.torch_engine import torch_engine
 
 DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """Options of the command line. `steps` and `placement` replace the file's; `tensorboard` None: if installed.
+    """Options of the command line.
 
-    `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an earlier training left in
-    `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
+    `steps`, and `changes` of the listener, replace the file's; `tensorboard` None: if installed. `order` is that of the
+    channels in the data, if not its layout's own. `overwrite`: what an earlier training left in `out` may be lost.
+    `accumulate` and `scratch`: of `learning.job.Run`.
 
     Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
     starts again after one of them died resumes from the checkpoint.
@@ -48,7 +59,7 @@ class TrainOptions:
     resume: bool = False
     device: str = "auto"
     steps: int | None = None
-    placement: str | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
     tensorboard: bool | None = None
     order: Order | None = None
     overwrite: bool = False
@@ -57,24 +68,22 @@ class TrainOptions:
 
 
 def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
-    """Phase 1. Returns its figures and minutes."""
-    settings = train_settings(options, "tokenizer")
+    """Train phase 1. Returns its figures and minutes."""
+    settings, began_s = train_settings(options, "tokenizer"), time.monotonic()
     if isinstance(settings, config.ArigTraining):
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
-    began_s = time.monotonic()
     with run_of(options) as run:
         run = _begun(run, options, tokenizer.WEIGHTS, "tokenizer", checkpoint.WEIGHTS, checkpoint.CONFIG)
         figures = tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order)
-    return _timed(figures, began_s) if run.group.first else {}
+    return {**figures, "minutes": _minutes(began_s)} if run.group.first else {}
 
 
 def train_listener(options: TrainOptions) -> dict[str, Any]:
-    """SFMS: phase 2, on the tokenizer in `options.out`. ARIG: all of it. Returns its figures and minutes."""
-    settings = train_settings(options, "predictor")
-    if isinstance(settings, config.ArigTraining) and options.order is not None:
-        raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
+    """Train SFMS: phase 2, on the tokenizer in `options.out`; or all of ARIG. Returns its figures and minutes."""
+    settings, began_s = train_settings(options, "predictor"), time.monotonic()
     arig = isinstance(settings, config.ArigTraining)
-    began_s = time.monotonic()
+    if arig and options.order is not None:
+        raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
     with run_of(options) as run:
         run = _begun(run, options, checkpoint.WEIGHTS, "arig" if arig else "listener")
         if isinstance(settings, config.ArigTraining):
@@ -84,14 +93,12 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     if not run.group.first:
         return {}
     if isinstance(settings, config.Training):
-        _calibrate(settings, options)
-    return _timed(figures, began_s)
+        calibrate(settings, options.data, options.out, options.order)
+    return {**figures, "minutes": _minutes(began_s)}
 
 
-def _calibrate(settings: config.Training, options: TrainOptions) -> None:
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("calibrating by roll-outs", total=rounds(settings))
-        calibrate(settings, options.data, options.out, options.order, partial(progress.advance, task))
+def _minutes(began_s: float) -> float:
+    return round((time.monotonic() - began_s) / 60, 2)
 
 
 def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str) -> Run:
@@ -111,7 +118,7 @@ def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str
 
 
 def device_of(name: str) -> torch.device:
-    """`cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
+    """Return the device of `cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
     if name not in DEVICES:
         raise ConfigError(f"--device {name!r} is not one of {', '.join(DEVICES)}")
     if name == "cuda" and not torch.cuda.is_available():
@@ -120,13 +127,12 @@ def device_of(name: str) -> torch.device:
 
 
 def train_settings(options: TrainOptions, phase: str = "training") -> config.Training | config.ArigTraining:
-    """The training file with what the command line changes, `phase` being the one whose steps it means."""
+    """Read the training file and apply the options; `phase` is the one whose steps they mean."""
     settings = load_training(options.file)
     raw = settings.model_dump(mode="json")
     if isinstance(settings, config.ArigTraining):
         phase = "training"
-    if options.placement is not None:
-        raw["listener"]["placement"] = options.placement
+    raw["listener"] |= options.changes
     if options.steps is not None:
         raw[phase]["steps"] = options.steps
     return parse_training(raw, options.file)
@@ -149,12 +155,113 @@ def run_of(options: TrainOptions) -> Iterator[Run]:
         yield Run(
             resume=options.resume,
             device=device,
-            watch=together(watches),
+            watches=tuple(watches),
             group=group,
             accumulate=options.accumulate,
             scratch=options.scratch,
         )
 
 
-def _timed(figures: dict[str, Any], began_s: float) -> dict[str, Any]:
-    return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)}
+# --- Calibration of sampling -----------------------------------------------------------------------------------------
+#
+# Teacher forcing never shows the model its own mistakes, so in a roll-out it places keyframes somewhat too often or too
+# rarely, and looks restless or frozen. A bias on class 0 per group corrects that rate. For a listener with a fixed
+# course of nods and smiles, the course is the median of the data's.
+
+DYADS = 8  # that are rolled out
+COURSE_DYADS = 128  # for their nods and smiles, without roll-outs
+LEAST = 10  # of a kind, to know its course
+LARGEST_STEP = 1.0  # of a bias, per round
+STREAMS = 4  # of every dyad, side by side
+
+
+def calibrate(training: config.Training, data: Path, out: Path, order: Order | None = None) -> None:
+    """Calibrate the listener trained in `out` on some training dyads, and rewrite `out`/config.yaml.
+
+    Blocks for minutes and shows its progress.
+    """
+    settings, space = training.listener, MotionSpace.of(training.listener)
+    model = SfmsModel(settings)
+    checkpoint.load_weights(out / checkpoint.WEIGHTS, model)
+    every = open_for(space.name, data, "train", order, [settings.audio])
+    some, rounds = _some(every, settings.window_frames), training.predictor.calibration_rounds
+    found = corrected(training)
+    for _ in tracked(range(rounds), "calibrating by roll-outs"):
+        found = placing(found, model, some)
+    if rounds and found.events:
+        found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
+    checkpoint.save_config(out, found)
+
+
+def _some(dyads: Dataset, window: int, count: int = DYADS) -> list[Dyad]:
+    """Return a few dyads, spread over a set, that are as long as a window; or else the first one that is."""
+    chosen = [*usable(dyads[:: max(1, len(dyads) // count)])][:count]
+    long = [dyad for dyad in chosen if len(dyad.listener) >= window]
+    return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
+
+
+def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad]) -> config.Sfms:
+    """Return `settings` with biases that would have given a roll-out the keyframe rates of the data.
+
+    The model is left in evaluation mode.
+    """
+    listener = SfmsListener(settings, torch_engine(model.eval()))
+    wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
+    rolled = [
+        offline_rollout(listener, dyad, range(1 + STREAMS * index, 1 + STREAMS * (index + 1)))
+        for index, dyad in enumerate(dyads)
+    ]
+    rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in rolled]))
+    groups = {}
+    for (name, group), has, wants in zip(settings.groups.items(), rates, wanted, strict=True):
+        step = math.log(max(has, 1e-4) / (1 - has) * (1 - wants) / wants)
+        bias = group.transition_bias + max(-LARGEST_STEP, min(LARGEST_STEP, step))
+        groups[name] = group.model_copy(update={"transition_bias": round(bias, 3)})
+    return settings.model_copy(update={"groups": groups})
+
+
+def coursed(settings: config.Sfms, dyads: Sequence[Dyad]) -> config.Sfms:
+    """Return `settings` with the median course of nods and smiles of `dyads`, for kinds that have enough of them."""
+    nod, smile = settings.sampling.nod, settings.sampling.smile
+    if nod is not None:
+        falls = [fall for dyad in dyads for fall in _falls(dyad)]
+        if len(falls) >= LEAST:
+            nod = config.NodCourse(spread=nod.spread, fall=round(float(np.clip(np.median(falls), 0, 1)), 3))
+    if smile is not None:
+        found = [np.array(rows) for rows in zip(*(row for dyad in dyads for row in _smiles(dyad)), strict=True)]
+        if found and len(found[0]) >= LEAST:
+            rise, fall = (np.clip(np.median(rows, axis=0), 0, 1).round(3).tolist() for rows in found)
+            smile = config.SmileCourse(spread=smile.spread, rise=tuple(rise), fall=tuple(fall))
+    sampling = settings.sampling.model_copy(update={"nod": nod, "smile": smile})
+    return settings.model_copy(update={"sampling": sampling})
+
+
+def _falls(dyad: Dyad) -> Iterator[float]:
+    """Yield the size of the second swing over that of the first, of each nod that has one."""
+    pitch = without_gaze(dyad).listener[:, CHANNEL_INDEX["pitch"]]
+    for event in dyad.events or ():
+        swing = event.duration_s / event.swings / FRAME_S
+        bounds = [round(event.start_s / FRAME_S + swing * number) for number in range(3)]
+        if event.kind == "nod" and event.swings > 1 and bounds[0] >= 0 and bounds[2] <= len(pitch):
+            first, second = (float(np.ptp(pitch[low:high])) for low, high in pairwise(bounds))
+            yield second / max(first, 1e-6)
+
+
+def _smiles(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
+    """Yield the shares of its size at `RISE_S` and `FALL_S` of each smile long enough for both, without a laugh."""
+    corners = dyad.listener[:, [CHANNEL_INDEX[name] for name in SMILE_CORNERS]].mean(axis=1)
+    times_s = (1 + np.arange(len(corners))) * FRAME_S
+    rise_s, fall_s = np.array(config.SmileCourse.RISE_S), np.array(config.SmileCourse.FALL_S)
+    laughs = [event for event in dyad.events or () if event.kind == "laugh"]
+    for event in dyad.events or ():
+        whole = event.duration_s >= rise_s[-1] + fall_s[-1] and event.start_s >= 0 and event.end_s <= times_s[-1]
+        alone = not any(one.start_s < event.end_s and one.end_s > event.start_s for one in laughs)
+        if event.kind == "smile" and whole and alone:
+            at = (event.start_s + rise_s, event.end_s - fall_s)
+            first, last = (np.interp(when, times_s, corners) / event.size for when in at)
+            yield first, last
+
+
+def _rates(tokens: Tensor) -> list[float]:
+    """Return keyframes per frame of each group, in tokens (N, G)."""
+    return [float(rate) for rate in (tokens > 0).float().mean(0)]

@@ -7,36 +7,37 @@ early stop, and checkpoints from which a run continues bit for bit (on a CPU). H
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import math
+import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError
-from sfms_robot.lab.learning import resume
-from sfms_robot.lab.learning.job import Job, LossOf, Position, Report, Run, TrainingOutcome
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.job import Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
-SPEED_SMOOTHING = 0.9
 
 log = logging.getLogger(__name__)
 
 
 def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
-    """AdamW with the paper's betas (V-A)."""
+    """Return AdamW with the paper's betas (V-A)."""
     return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
 
 
@@ -51,26 +52,20 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
     it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
     """
-    file = resume.checkpoint_file(out, job.name)
+    file, phase = checkpoint_file(out, job.name), job.phase
     group, pieces = run.group, pieces_of(job, run, file)
-    if pieces > 1:
-        job = replace(job, identity={**job.identity, "pieces": pieces})
-    try:
-        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+    job = replace(job, identity={**job.identity, **({"pieces": pieces} if pieces > 1 else {})})
+    _make_folder(out)  # hours before it is needed
     generator = torch.Generator().manual_seed(job.seed)
     torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
     base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
     position, best = Position(), None
     if run.resume:
-        position, best = resume.load(file, job, generator)
-    elif group.first and (left := resume.peek(file)) is not None and not left.finished:
-        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left.step)
+        position, best = load_checkpoint(file, job, generator)
+    elif group.first and (left := peek(file)) and not left[0].finished:
+        log.warning("%s: was at step %d, starts again; --resume would have continued", file, left[0].step)
     began_at = position.step
-
-    saved_s = before_s = clock()
-    frames_per_s = 0.0
+    saved_s = began_s = clock()
     job.model.train()
     gradients = Gradients(job, group, pieces, file)
     with _interruptions(patient=group.size > 1) as pressed:
@@ -79,55 +74,55 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             loss, norm, interrupted = make_step(gradients, position.step, generator, pressed())
             smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
             position = replace(position, step=position.step + 1, loss=smooth)
-            looked = _look_is_due(job, position.step)
+            every = phase.evaluate_every if job.held_out else 0
+            looked = every > 0 and (position.step % every == 0 or position.step == phase.steps)
             if looked:
-                position = _compared(position, group.told_by_first(partial(_held_out, job)))
-                best = resume.weights_of(job) if position.worse == 0 else best
-            position = replace(position, finished=_over(job.phase, position))
-
+                position = _compared(position, group.from_first(partial(_held_out, job)))
+                best = weights_of(job) if position.worse == 0 else best
+            impatient = phase.patience is not None and position.worse >= phase.patience
+            position = replace(position, finished=impatient or position.step >= phase.steps)
             now_s = clock()
-            frames_per_s = _speed(frames_per_s, job.frames_per_step, now_s - before_s)
-            before_s = now_s
-            run.watch(
-                Report(
-                    name=job.name,
-                    steps=job.phase.steps,
-                    position=position,
-                    loss=loss,
-                    gradient_norm=norm,
-                    learning_rate=rate,
-                    frames_per_s=frames_per_s,
-                    looked=looked,
-                )
+            report = Report(
+                name=job.name,
+                steps=phase.steps,
+                position=position,
+                loss=loss,
+                gradient_norm=norm,
+                learning_rate=rate,
+                frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
+                looked=looked,
             )
-            interrupted = interrupted or (group.size == 1 and pressed())
-            if group.first and (interrupted or _save_is_due(job.phase, position, now_s - saved_s)):
-                resume.save(file, job, position, generator, best)
+            for watch in run.watches:
+                watch(report)
+            interrupted |= group.size == 1 and pressed()
+            due = position.step % phase.checkpoint_every == 0 or now_s - saved_s >= 60 * phase.checkpoint_minutes
+            if group.first and (interrupted or position.finished or due):
+                save_checkpoint(file, job, position, generator, best)
                 saved_s = now_s
             if interrupted:
-                raise KeyboardInterrupt(
-                    f"{job.name}: interrupted after step {position.step} of {job.phase.steps}, saved in {file}; "
-                    "the same command with --resume continues"
-                )
+                at = f"{job.name}: interrupted after step {position.step} of {phase.steps}, saved in {file}"
+                raise KeyboardInterrupt(f"{at}; the same command with --resume continues")
     if best is not None:
         job.model.load_state_dict(best)
-    return _outcome(job, position, best is not None, began_at if run.resume else None)
-
-
-def _outcome(job: Job, position: Position, restored: bool, resumed_at: int | None) -> TrainingOutcome:
-    """Return the result of a run; `restored`: the model holds the weights of its best held-out loss."""
     return TrainingOutcome(
         loss=math.nan if position.loss is None else position.loss,
         held_out=position.best,
         steps=position.step,
-        best_step=position.best_step if restored else position.step,
-        stopped="steps" if position.step == job.phase.steps else "patience",
-        resumed_at=resumed_at,
+        best_step=position.step if best is None else position.best_step,
+        stopped="steps" if position.step == phase.steps else "patience",
+        resumed_at=began_at if run.resume else None,
     )
 
 
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+
+
 def schedule(step: int, phase: config.Phase) -> float:
-    """Share of the learning rate at `step`: linear warm-up, then cosine to zero (V-A; the warm-up is ours)."""
+    """Return the share of the learning rate at `step`: linear warm-up, cosine to zero (V-A; the warm-up is ours)."""
     warm = min(phase.warm_up_steps, max(1, phase.steps // 10))
     if step < warm:
         return (step + 1) / warm
@@ -135,7 +130,7 @@ def schedule(step: int, phase: config.Phase) -> float:
 
 
 def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
-    """Rates of `step` from those the optimizers were made with; returns the first."""
+    """Set the rates of `step` from those of the new optimizers; return the first."""
     share = schedule(step, job.phase)
     for one, rates in zip(job.optimizers, base, strict=True):
         for group, rate in zip(one.param_groups, rates, strict=True):
@@ -146,7 +141,7 @@ def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
 def make_step(
     gradients: Gradients, step: int, generator: torch.Generator, pressed: bool = False
 ) -> tuple[float, float, bool]:
-    """One update of the weights; returns loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
+    """Update the weights once; return loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
 
     Raises ModelError when loss or norm is not finite, and nothing is updated then; GroupError.
     """
@@ -167,8 +162,8 @@ def make_step(
 
 
 def _kept(file: Path) -> str:
-    left = resume.peek(file)
-    return f"{file} holds step {left.step}" if left is not None else "there is no checkpoint yet"
+    left = peek(file)
+    return f"{file} holds step {left[0].step}" if left else "there is no checkpoint yet"
 
 
 def _clip(one: torch.optim.Optimizer, norm: float) -> float:
@@ -176,14 +171,8 @@ def _clip(one: torch.optim.Optimizer, norm: float) -> float:
     return float(nn.utils.clip_grad_norm_(parameters, norm)) if parameters else 0.0
 
 
-def _look_is_due(job: Job, step: int) -> bool:
-    if job.held_out is None or job.phase.evaluate_every == 0:
-        return False
-    return step % job.phase.evaluate_every == 0 or step == job.phase.steps
-
-
 def _held_out(job: Job) -> float:
-    """The held-out loss, leaving random states and the model's mode as they were. Raises ModelError if not finite."""
+    """Return the held-out loss; random states and the model's mode stay. Raises ModelError if it is not finite."""
     if job.held_out is None:
         raise ValueError(f"{job.name} has nothing held out")
     job.model.eval()
@@ -200,21 +189,6 @@ def _compared(position: Position, held_out: float) -> Position:
     if position.best is None or held_out < position.best:
         return replace(position, held_out=held_out, best=held_out, best_step=position.step, worse=0)
     return replace(position, held_out=held_out, worse=position.worse + 1)
-
-
-def _over(phase: config.Phase, position: Position) -> bool:
-    return position.step >= phase.steps or (phase.patience is not None and position.worse >= phase.patience)
-
-
-def _save_is_due(phase: config.Phase, position: Position, since_s: float) -> bool:
-    return position.finished or position.step % phase.checkpoint_every == 0 or since_s >= 60 * phase.checkpoint_minutes
-
-
-def _speed(frames_per_s: float, frames: int, took_s: float) -> float:
-    if took_s <= 0:
-        return frames_per_s
-    now = frames / took_s
-    return now if frames_per_s == 0 else SPEED_SMOOTHING * frames_per_s + (1 - SPEED_SMOOTHING) * now
 
 
 @contextmanager
@@ -245,15 +219,18 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
 
 
 def pieces_of(job: Job, run: Run, file: Path) -> int:
-    """Into how many pieces every batch is cut: as the checkpoint in `file` says on resuming, else as the run asks.
+    """Return into how many pieces every batch is cut: on resuming as in the checkpoint `file`, else as the run sets.
 
     Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
     """
     size, batch = run.group.size, job.phase.batch
-    begun = resume.pieces(file) if run.resume else None
-    pieces = size * (run.accumulate or 1) if begun is None or run.accumulate else begun
-    if begun is not None and pieces != begun:
-        raise ConfigError(f"{file}: was begun with {begun} pieces a step, --accumulate {run.accumulate} makes {pieces}")
+    pieces = size * (run.accumulate or 1)
+    if run.resume and (left := peek(file)):
+        pieces = pieces if run.accumulate else left[1]
+        if pieces != left[1]:
+            raise ConfigError(
+                f"{file}: was begun with {left[1]} pieces a step, --accumulate {run.accumulate} makes {pieces}"
+            )
     if pieces % size:
         shares = ", ".join(str(count) for count in range(1, pieces + 1) if pieces % count == 0)
         raise ConfigError(f"{file}: a step has {pieces} pieces; {size} processes cannot share them ({shares} can)")
@@ -276,7 +253,7 @@ class Gradients:
         self._loss = loss
 
     def of(self, step: int, generator: torch.Generator) -> float:
-        """The loss of this process' pieces, after its gradients: of all processes, for all. Raises GroupError."""
+        """Return the loss of this process' pieces; set the gradients of all processes. Raises GroupError."""
         if self._pieces == 1:
             return self._piece(step, generator, 1)
         mine = range(self.group.rank, self._pieces, self.group.size)
@@ -316,3 +293,132 @@ def multiplies_bf16(device: torch.device) -> bool:
 def _seed(seed: int, step: int, piece: int) -> int:
     digest = hashlib.blake2b(f"{seed} {step} {piece}".encode(), digest_size=7)
     return int.from_bytes(digest.digest(), "big")
+
+
+# --- Checkpoints -----------------------------------------------------------------------------------------------------
+#
+# `checkpoint-NAME.safetensors` holds tensors `model.*`, `optimizer.I.J.*` (optimizer I, its parameter J), `random.*`
+# (states of the run's own generator and of torch's) and `best.*` (weights of the best held-out loss); its metadata hold
+# the position and the identity of the job as JSON.
+
+Weights = dict[str, Tensor]
+
+
+def checkpoint_file(out: Path, name: str) -> Path:
+    """Return the checkpoint file of a job of this name."""
+    return out / f"checkpoint-{name}.safetensors"
+
+
+def weights_of(job: Job) -> Weights:
+    """Return a copy of the model's state, on the CPU."""
+    return {name: value.detach().cpu().clone() for name, value in job.model.state_dict().items()}
+
+
+def digest_of(module: nn.Module) -> str:
+    """Return a digest of the weights, for the identity of a job that builds on them."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().data)
+    return digest.hexdigest()
+
+
+def save_checkpoint(file: Path, job: Job, position: Position, generator: torch.Generator, best: Weights | None) -> None:
+    """Write a checkpoint, replacing `file` in one move: a crash leaves the old one. Raises ConfigError."""
+    tensors = {f"model.{name}": value for name, value in weights_of(job).items()}
+    tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
+    for index, one in enumerate(job.optimizers):
+        for parameter, state in one.state_dict()["state"].items():
+            for key, value in state.items():
+                tensors[f"optimizer.{index}.{parameter}.{key}"] = value.detach().cpu().clone()
+    tensors |= {"random.data": generator.get_state(), "random.torch": torch.get_rng_state()}
+    if job.device.type == "cuda":
+        tensors["random.cuda"] = torch.cuda.get_rng_state(job.device)
+    metadata = {"position": json.dumps(asdict(position)), "identity": json.dumps(job.identity)}
+    part = file.with_suffix(".part")
+    try:
+        save_file(tensors, part, metadata)
+        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
+        part.replace(file)
+    except (SafetensorError, OSError) as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
+
+
+def load_checkpoint(file: Path, job: Job, generator: torch.Generator) -> tuple[Position, Weights | None]:
+    """Put model, optimizers and all random states where `file` left them.
+
+    Raises:
+        ConfigError: there is no checkpoint, or it is of another job; names the first key that differs.
+        ModelError: the file is corrupt or of another version of the model's code.
+    """
+    if not file.is_file():
+        raise ConfigError(f"{file}: no checkpoint to resume from; leave out --resume to start")
+    metadata, tensors = _read(file)
+    try:
+        position, identity = Position(**json.loads(metadata["position"])), json.loads(metadata["identity"])
+        _same(file, identity, json.loads(json.dumps(job.identity)))
+        job.model.load_state_dict(_under(tensors, "model."))
+        for index, one in enumerate(job.optimizers):
+            state: dict[int, Weights] = {}
+            for name, value in _under(tensors, f"optimizer.{index}.").items():
+                parameter, key = name.split(".")
+                state.setdefault(int(parameter), {})[key] = value
+            one.load_state_dict({"state": state, "param_groups": one.state_dict()["param_groups"]})
+        generator.set_state(tensors["random.data"])
+        torch.set_rng_state(tensors["random.torch"])
+        if job.device.type == "cuda" and "random.cuda" in tensors:
+            torch.cuda.set_rng_state(tensors["random.cuda"], job.device)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        first = str(error).splitlines()[0]
+        raise ModelError(f"{file}: does not fit this version of the model: {first}") from error
+    return position, _under(tensors, "best.") or None
+
+
+def peek(file: Path) -> tuple[Position, int] | None:
+    """Return the position of the checkpoint in `file`, and into how many pieces its batches are cut.
+
+    None if there is no readable one.
+    """
+    try:
+        metadata, _ = _read(file, tensors=False)
+        identity = json.loads(metadata["identity"])
+        return Position(**json.loads(metadata["position"])), int(identity.get("pieces", 1))
+    except (ModelError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _read(file: Path, tensors: bool = True) -> tuple[Mapping[str, str], Weights]:
+    try:
+        with safe_open(file, framework="pt") as opened:
+            names = list(opened.keys()) if tensors else []
+            return opened.metadata() or {}, {name: opened.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"{file}: not a readable checkpoint: {error}") from error
+
+
+def _under(tensors: Weights, prefix: str) -> Weights:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _same(file: Path, theirs: object, ours: object) -> None:
+    """Raise ConfigError with the first key whose value differs."""
+    then, now = dict(_flat(theirs)), dict(_flat(ours))
+    for key in [*now, *then]:
+        if then.get(key, "not given") != now.get(key, "not given"):
+            was, is_now = (values.get(key, "not given") for values in (then, now))
+            raise ConfigError(
+                f"{file}: belongs to another run: {key} = {was!r} there, {is_now!r} now; "
+                "resume with the same, or leave out --resume"
+            )
+
+
+def _flat(value: object, key: str = "") -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict) and value:
+        for name, inner in value.items():
+            yield from _flat(inner, f"{key}.{name}" if key else name)
+    else:
+        yield key, value

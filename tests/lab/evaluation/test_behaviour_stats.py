@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, MOTION_DIM
-from sfms_robot.lab.evaluation.behaviour_stats import (
+from sfms_robot.lab.evaluation.detection import (
     SWAY_BANDS_HZ,
+    gaze_rad,
     looks_s,
     movement,
     nods_of,
@@ -11,7 +12,6 @@ from sfms_robot.lab.evaluation.behaviour_stats import (
     slow_poses_deg,
     sway_db,
 )
-from sfms_robot.lab.evaluation.detection import gaze_rad
 
 
 def still(seconds):

@@ -9,7 +9,6 @@ from sfms_robot.lab.evaluation.detection import (
     Detected,
     DetectorCalibration,
     Sightings,
-    added_up,
     asked_and_seen,
     paired,
     seen,
@@ -110,12 +109,6 @@ def test_each_is_in_one_pair_and_the_nearest_go_together():
     assert paired(np.array([1.0, 1.3]), np.array([1.25]), 0.5) == [(1, pytest.approx(-0.05))]
     assert paired(np.array([1.0, 5.0]), np.array([1.1, 1.2, 9.0]), 0.5) == [(0, pytest.approx(0.1))]
     assert paired(np.zeros(0), np.array([1.0]), 0.5) == []
-
-
-def test_motions_add_up():
-    asked, motion = nodding(STARTS)
-    once, twice = (added_up([asked_and_seen(asked, Detected.of(motion))] * count)["nod"] for count in (1, 2))
-    assert len(twice.sizes) == 2 * len(once.sizes) and twice.seen == 2 * once.seen and twice.recall == once.recall
 
 
 def test_recall_for_other_sizes_goes_by_the_recall_at_each_size():

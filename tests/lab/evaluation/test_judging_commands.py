@@ -11,9 +11,9 @@ from tiny_arig_training import dyad
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.evaluation import naturalness
-from sfms_robot.lab.evaluation.behaviour_stats import movement
+from sfms_robot.lab.evaluation.detection import movement
 from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, notes
-from sfms_robot.lab.evaluation.robustness import RANGES, UnseenSpeaker, cases
+from sfms_robot.lab.evaluation.robustness import CONDITIONS, RANGES, cases
 
 LEAST = 2 * FOLDS
 SERIES = {"train": "ES2008a", "validation": "IS1000a", "test": "ES2003a"}
@@ -183,8 +183,8 @@ def test_tables_of_which_one_is_missing_name_it(command_line, tmp_path):
 def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line):
     words = ("evaluate", "robustness", "--speakers", 1, "--minutes", 0.1, "--seeds", 2, "--jobs", 1, "--json")
     found = command_line(*words).told
-    ways = list(cases(UnseenSpeaker("any", np.zeros(1, np.float32), np.zeros((1, 58), np.float32))))
-    assert [(row["inputs"], row["condition"]) for row in found["rows"]] == [(one, how.name) for one, how in ways]
+    ways = [(inputs, CONDITIONS[number].name) for inputs, number in cases()]
+    assert [(row["inputs"], row["condition"]) for row in found["rows"]] == ways
     for kind in RANGES:
         rates = [row[f"{kind}s_per_minute"] for row in found["rows"]]
         assert found[f"{kind}s_per_minute"] == [min(rates), max(rates)]

@@ -11,7 +11,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, fit_sound_scales, gather
+from sfms_robot.lab.learning.corpus import fit_sound
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, keyframe_scores
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -54,7 +55,7 @@ def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:
 def test_the_context_of_a_window_is_what_a_stream_remembers_there(changes, start):
     one = listener(hop=1, **changes)  # memory is as of the newest plan
     corpus = corpus_of(one, dyad(60), dyad(60))
-    fit_sound_scales(one.model, corpus)
+    fit_sound(one.model, (corpus.frames.sound, corpus.frames.heard))
     memory = one.start(1)
     for frame in frames_of_dyad(dyad(60))[: start + 40]:
         _, memory = one.step(frame, memory)
@@ -125,8 +126,3 @@ def test_wav2vec2_that_ships_with_the_data_needs_no_model_to_train_and_one_to_st
     for use in (lambda: corpus_of(one, dyad()), lambda: one.step(frames_of_dyad(dyad())[0], one.start(1))):
         with pytest.raises(ConfigError, match="wav2vec2: expected the folder of a model"):
             use()
-
-
-def test_a_model_for_sound_that_is_not_taken_is_refused():
-    with pytest.raises(ConfigError, match="wav2vec2: audio is mel, which needs no model"):
-        listener(wav2vec2="somewhere")

@@ -11,8 +11,7 @@ from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, Dataset
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.listener_evaluation import collect, shared_space, spread_clips
-from sfms_robot.lab.evaluation.listener_tables import Clips, heuristics, table
+from sfms_robot.lab.evaluation.listener_tables import Clips, collect, heuristics, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
 from sfms_robot.listeners.sfms.model import SfmsModel

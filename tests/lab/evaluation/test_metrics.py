@@ -19,17 +19,6 @@ def test_frechet_equals_the_matrix_root():
     assert metrics.frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
 
 
-def test_frechet_of_a_set_with_itself_is_zero_and_of_a_shift_its_square():
-    a = RNG.normal(size=(2, 100, 4))
-    assert metrics.frechet_distance(a, a) == pytest.approx(0.0, abs=1e-9)
-    assert metrics.frechet_distance(a, a + [1.0, 0, 2.0, 0]) == pytest.approx(5.0)
-
-
-def test_too_few_frames_are_said(caplog):
-    metrics.frechet_distance(RNG.normal(size=(5, 9)), RNG.normal(size=(5, 9)))
-    assert "singular" in caplog.text
-
-
 def test_paired_frechet_sees_what_frechet_cannot():
     speaker = RNG.normal(size=(4, 500, 2))
     target, other = speaker.copy(), RNG.normal(size=(4, 500, 2))
@@ -72,15 +61,6 @@ def test_shannon_index_counts_nearest_centres():
         metrics.cluster_centres(reference, 201)
     with pytest.raises(ValueError, match="200 frames differ too little to make 3 clusters"):
         metrics.cluster_centres(np.zeros_like(reference), 3)
-
-
-def test_centres_are_the_means_of_what_is_nearest_to_them():
-    frames = RNG.normal(size=(2, 400, 2))
-    centres = metrics.cluster_centres(frames, 5)
-    pooled = frames.reshape(-1, 2)
-    nearest = np.linalg.norm(pooled[:, None] - centres, axis=2).argmin(axis=1)
-    means = np.stack([pooled[nearest == label].mean(axis=0) for label in range(5)])
-    np.testing.assert_allclose(centres, means, atol=0.02)
 
 
 def test_rpcc():
@@ -172,12 +152,6 @@ def test_ccc_equals_its_definition_and_counts_constant_channels_as_zero():
     assert metrics.ccc(x, x) == pytest.approx(4 / 5, abs=1e-6)
 
 
-def test_ccc_of_many_tracks_is_the_mean_of_theirs():
-    x, y = RNG.normal(size=(2, 3, 40, 5)), RNG.normal(size=(2, 3, 40, 5))
-    each = [metrics.ccc(a, b) for a, b in zip(x.reshape(6, 40, 5), y.reshape(6, 40, 5), strict=True)]
-    assert metrics.ccc(x, y) == pytest.approx(np.mean(each), rel=1e-12)
-
-
 @pytest.mark.parametrize("as_challenge", [True, False])
 def test_frsyn_equals_the_loop_over_lags(as_challenge):
     pred, speaker = RNG.normal(size=(2, 3, 70, 4)).cumsum(axis=2), RNG.normal(size=(2, 70, 4)).cumsum(axis=1)
@@ -194,11 +168,6 @@ def test_frsyn_equals_the_loop_over_lags(as_challenge):
                 means.append(np.mean(of) if as_challenge else np.nanmean(of))
             offsets.append(abs(49 - int(np.argmax(means))))
     assert metrics.frsyn(pred, speaker, as_challenge) == pytest.approx(np.mean(offsets))
-
-
-def test_dtw_of_a_track_with_itself_is_exactly_zero_wherever_it_lies():
-    x = np.pi + 1e-3 * RNG.normal(size=(40, 3))
-    assert metrics.dtw(x, x[None]) == 0.0
 
 
 def test_frc_and_frd_are_means_over_samples_and_contexts():
@@ -218,16 +187,9 @@ def test_frc_and_frd_are_means_over_samples_and_contexts():
 
 
 def test_reactface_scales_by_ten_and_takes_any_width():
-    pred, target = RNG.random((2, 10, 58)), RNG.random((2, 10, 58))
-    expected = np.mean([naive_dtw(target[n], pred[n]) for n in range(2)])
+    pred, target = RNG.random((2, 1, 10, 58)), RNG.random((2, 10, 58))
+    expected = np.mean([naive_dtw(target[n], pred[n, 0]) for n in range(2)])
     assert metrics.reactface_frd(pred, target) == pytest.approx(10 * expected, rel=1e-9)
-
-
-def test_uniform_noise_has_the_analytic_diversities():
-    noise = RNG.random((40, 10, 100, 25))
-    assert metrics.frvar(noise) == pytest.approx(1 / 12, rel=0.01)
-    assert metrics.frdiv(noise) == pytest.approx(1 / 6, rel=0.01)
-    assert metrics.frdvs(noise) == pytest.approx(1 / 6, rel=0.01)
 
 
 def test_diversities_equal_the_sums_over_pairs():
@@ -239,14 +201,6 @@ def test_diversities_equal_the_sums_over_pairs():
     assert metrics.frdiv(x[:, :1]) == 0.0
 
 
-@pytest.mark.parametrize("lag", [-20, -3, 0, 5, 49])
-def test_frsyn_finds_the_lag(lag):
-    speaker = RNG.normal(size=(1, 400, 3))
-    pred = np.roll(speaker, lag, axis=1)
-    for as_challenge in (True, False):
-        assert metrics.frsyn(pred, speaker, as_challenge) == abs(lag)
-
-
 def test_one_constant_channel_makes_the_challenges_frsyn_49_and_is_skipped_by_the_other():
     speaker = RNG.normal(size=(2, 300, 3))
     pred = np.repeat(np.roll(speaker, 4, axis=1)[:, None], 2, axis=1)
@@ -254,10 +208,3 @@ def test_one_constant_channel_makes_the_challenges_frsyn_49_and_is_skipped_by_th
     assert metrics.frsyn(pred, speaker) == 49.0
     assert metrics.frsyn(pred, speaker, as_challenge=False) == 4.0
     assert np.isnan(metrics.frsyn(np.zeros_like(pred), speaker, as_challenge=False))
-
-
-def test_wrong_shapes_are_refused():
-    with pytest.raises(ValueError, match="25 attributes"):
-        metrics.frd(np.zeros((2, 5, 58)), np.zeros((2, 5, 58)))
-    with pytest.raises(ValueError, match="target: expected shape"):
-        metrics.frc(np.zeros((2, 5, 25)), np.zeros((3, 5, 25)))

@@ -1,6 +1,5 @@
 """`sfms-robot evaluate metrics`: anybody's motion, from files, by the metrics that have tests of their own."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.motion_metrics import MetricFiles, evaluate_metrics
+from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 from sfms_robot.signals.tracks import Track, write_track
 
 N, K, T = 3, 2, 80
@@ -21,21 +20,21 @@ def motion(seed: int, *shape: int) -> np.ndarray:
 
 
 @pytest.fixture
-def arrays(tmp_path: Path) -> MetricFiles:
+def arrays(tmp_path: Path) -> dict[str, Path]:
     for name, clips in {"truth": motion(1, N, T, 58), "speaker": motion(2, N, T, 58)}.items():
         np.save(tmp_path / f"{name}.npy", clips)
     np.save(tmp_path / "prediction.npy", motion(3, N, K, T, 58))
-    return MetricFiles(**{name: tmp_path / f"{name}.npy" for name in ("truth", "prediction", "speaker")})
+    return {name: tmp_path / f"{name}.npy" for name in ("truth", "prediction", "speaker")}
 
 
 def values(result: dict, part: str) -> dict[str, float]:
     return {f"{row['name']}: {row['definition']}": row["value"] for row in result["rows"] if row["part"] == part}
 
 
-def test_rows_are_the_metrics_of_the_package_averaged_over_the_answers(arrays: MetricFiles) -> None:
-    result = evaluate_metrics(arrays)
+def test_rows_are_the_metrics_of_the_package_averaged_over_the_answers(arrays: dict[str, Path]) -> None:
+    result = evaluate_metrics(**arrays)
     assert (result["space"], result["clips"], result["frames"], result["samples"]) == ("arkit58", N, T, K)
-    truth, answers = np.load(arrays.truth)[..., 6:], np.load(arrays.prediction)[..., 6:]
+    truth, answers = np.load(arrays["truth"])[..., 6:], np.load(arrays["prediction"])[..., 6:]
     found = values(result, "expression")
     assert found["L2: distance over channels"] == pytest.approx(
         np.mean([metrics.l2(truth, answers[:, k]) for k in range(K)])
@@ -43,11 +42,13 @@ def test_rows_are_the_metrics_of_the_package_averaged_over_the_answers(arrays: M
     assert found["FD: of all frames"] == pytest.approx(
         np.mean([metrics.frechet_distance(truth, answers[:, k]) for k in range(K)])
     )
-    assert values(result, "all")["FRDiv: between answers"] == pytest.approx(metrics.frdiv(np.load(arrays.prediction)))
+    assert values(result, "all")["FRDiv: between answers"] == pytest.approx(
+        metrics.frdiv(np.load(arrays["prediction"]))
+    )
 
 
-def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: MetricFiles) -> None:
-    result = evaluate_metrics(replace(arrays, prediction=arrays.truth))
+def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: dict[str, Path]) -> None:
+    result = evaluate_metrics(**arrays | {"prediction": arrays["truth"]})
     for part in ("expression", "rotation"):
         found = values(result, part)
         for name in ("L2: distance over channels", "FD: of all frames", "P-FD: of all frames", "RPCC: flattened"):
@@ -56,8 +57,8 @@ def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: Metr
     assert counts["blinks a minute: prediction"] == counts["blinks a minute: truth"]
 
 
-def test_a_mean_over_clips_has_an_interval_around_it_and_what_pools_them_has_none(arrays: MetricFiles) -> None:
-    rows = evaluate_metrics(arrays)["rows"]
+def test_a_mean_over_clips_has_an_interval_around_it_and_what_pools_them_has_none(arrays: dict[str, Path]) -> None:
+    rows = evaluate_metrics(**arrays)["rows"]
     by_clip = next(row for row in rows if row["name"] == "L2")
     assert by_clip["interval"][0] <= by_clip["value"] <= by_clip["interval"][1]
     assert next(row for row in rows if row["definition"] == "of all frames")["interval"] is None
@@ -69,18 +70,18 @@ def test_folders_of_tracks_go_by_name_and_are_cut_alike(tmp_path: Path) -> None:
         for seed, name in enumerate(("a.csv", "b.csv.gz")):
             clip = motion(seed, frames, 58).astype(np.float32)
             write_track(tmp_path / folder / name, Track(FRAME_S * np.arange(frames), clip, frozenset(CHANNELS)))
-    result = evaluate_metrics(MetricFiles(truth=tmp_path / "truth", prediction=tmp_path / "ours", frames=30))
+    result = evaluate_metrics(truth=tmp_path / "truth", prediction=tmp_path / "ours", frames=30)
     assert (result["clips"], result["frames"]) == (4, 30)
     assert values(result, "expression")["L2: distance over channels"] == pytest.approx(0.0, abs=1e-4)
     (tmp_path / "ours" / "b.csv.gz").unlink()
     with pytest.raises(ConfigError, match=r"its clips \(a\) are not those of .*truth \(a, b\)"):
-        evaluate_metrics(MetricFiles(truth=tmp_path / "truth", prediction=tmp_path / "ours"))
+        evaluate_metrics(truth=tmp_path / "truth", prediction=tmp_path / "ours")
 
 
 def test_attributes_of_the_challenge_have_its_own_distances(tmp_path: Path) -> None:
     np.save(tmp_path / "truth.npy", motion(1, N, T, 25))
     np.save(tmp_path / "ours.npy", motion(2, N, K, T, 25))
-    result = evaluate_metrics(MetricFiles(truth=tmp_path / "truth.npy", prediction=tmp_path / "ours.npy"))
+    result = evaluate_metrics(truth=tmp_path / "truth.npy", prediction=tmp_path / "ours.npy")
     found = values(result, "all")
     assert result["space"] == "attributes25"
     assert found["FRDist: sum of the answers"] == pytest.approx(K * found["FRDist: mean of the answers"])
@@ -98,14 +99,14 @@ def test_an_array_that_cannot_be_scored_is_refused_by_name(tmp_path: Path, shape
     np.save(tmp_path / "truth.npy", np.zeros(shape))
     np.save(tmp_path / "ours.npy", motion(1, shape[0], T, 58) if len(shape) == 4 else np.zeros(shape))
     with pytest.raises(ConfigError, match=said):
-        evaluate_metrics(MetricFiles(truth=tmp_path / "truth.npy", prediction=tmp_path / "ours.npy"))
+        evaluate_metrics(truth=tmp_path / "truth.npy", prediction=tmp_path / "ours.npy")
 
 
-def test_a_lost_face_and_too_long_a_cut_are_refused(arrays: MetricFiles, tmp_path: Path) -> None:
+def test_a_lost_face_and_too_long_a_cut_are_refused(arrays: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--frames 81: the shortest clip has 80"):
-        evaluate_metrics(replace(arrays, speaker=None, frames=T + 1))
-    broken = np.load(arrays.truth)
+        evaluate_metrics(arrays["truth"], arrays["prediction"], frames=T + 1)
+    broken = np.load(arrays["truth"])
     broken[1, 5] = np.nan
     np.save(tmp_path / "lost.npy", broken)
     with pytest.raises(ConfigError, match=r"lost\.npy: clip 1 has values that are not finite"):
-        evaluate_metrics(replace(arrays, truth=tmp_path / "lost.npy", speaker=None))
+        evaluate_metrics(tmp_path / "lost.npy", arrays["prediction"])

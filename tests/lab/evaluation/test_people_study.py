@@ -15,13 +15,11 @@ from sfms_robot.lab.evaluation.people_study import (
     QUESTIONS,
     Preference,
     Study,
-    StudyOptions,
     bradley_terry,
     clip_name,
     prepare,
     read_answers,
     summary,
-    table,
     trials,
 )
 
@@ -35,9 +33,10 @@ def study(folder):
 
 
 def options_for(tmp_path, conditions, data=None, voices=1, seed=1):
-    return StudyOptions(
-        conditions=conditions, data=data, voices=voices, seconds=2.0, seed=seed, folder=tmp_path / "study"
-    )
+    folder = tmp_path / "study"
+    return {
+        "conditions": conditions, "data": data, "voices": voices, "seconds": 2.0, "seed": seed, "folder": folder
+    }  # fmt: skip
 
 
 def test_answers_are_kept_as_they_are_given_and_a_person_goes_on(tmp_path):
@@ -49,7 +48,7 @@ def test_answers_are_kept_as_they_are_given_and_a_person_goes_on(tmp_path):
     again = Study(tmp_path)  # the program was started anew
     assert again.next(me)["answered"] == 1 and again.next(me)["trial"] != before["trial"]
     assert again.next(again.begin())["answered"] == 0
-    told = table(tmp_path / "answers.csv")
+    told = summary(read_answers(tmp_path / "answers.csv"))
     assert told["answers"] == 4 and told["participants"] == 1 and told["sides"] == {"left": 4, "right": 0}
 
 
@@ -77,16 +76,16 @@ def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
         [Dyad(name="one", audio=audio, speaker=speaker, listener=listener, listening=np.ones(frames, bool))],
     )
     options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5)
-    made = prepare(options)
+    made = prepare(**options)
     shown = {
         name: np.fromfile(made.clips / f"{clip_name(5, name, 0)}.f32", "<f4").reshape(-1, 58)
-        for name in options.conditions
+        for name in options["conditions"]
     }
     np.testing.assert_allclose(shown["recorded"], listener[-50:], atol=1e-3)
     assert shown["sfms-small"].shape == (50, 58) and np.isfinite(shown["sfms-small"]).all()
     voice, rate_hz = soundfile.read(made.clips / "voice-0.wav")
     assert (len(voice), rate_hz) == (32_000, 16_000)
-    assert prepare(options).conditions == ["sfms-small", "recorded"]  # it goes on
+    assert prepare(**options).conditions == ["sfms-small", "recorded"]  # it goes on
 
 
 @pytest.mark.parametrize(
@@ -117,7 +116,7 @@ def test_a_file_that_holds_something_else_is_one_line(tmp_path, text, told):
     file = tmp_path / "answers.csv"
     file.write_text(text.replace("{head}", "participant,trial,voice,question,left,right,chosen"))
     with pytest.raises(ConfigError) as caught:
-        table(file)
+        read_answers(file)
     assert str(caught.value).startswith(str(file)) and told in str(caught.value)
 
 
@@ -132,22 +131,22 @@ def test_a_file_that_holds_something_else_is_one_line(tmp_path, text, told):
 )
 def test_what_cannot_be_compared_is_said_before_anything_is_made(tmp_path, conditions, told):
     with pytest.raises(ConfigError, match=told.replace("(", r"\(")):
-        prepare(options_for(tmp_path, conditions))
+        prepare(**options_for(tmp_path, conditions))
     assert not (tmp_path / "study").exists()
 
 
 @pytest.mark.slow
 def test_clips_are_made_once(tmp_path):
     options = options_for(tmp_path, ("sfms-small", "arig-small"), voices=2)
-    made = prepare(options)
+    made = prepare(**options)
     shown = made.next("me")
     motion = np.fromfile(made.clips / shown["left"], "<f4").reshape(-1, 58)
     assert motion.shape == (50, 58) and np.isfinite(motion).all() and np.ptp(motion, axis=0).max() > 0.01
     files = {file.name: file.stat().st_mtime_ns for file in made.clips.iterdir()}
-    prepare(options)
+    prepare(**options)
     assert files == {file.name: file.stat().st_mtime_ns for file in made.clips.iterdir()}
     with pytest.raises(ConfigError, match="another study"):
-        prepare(options_for(tmp_path, ("sfms-small", "arig-small"), voices=2, seed=2))
+        prepare(**options_for(tmp_path, ("sfms-small", "arig-small"), voices=2, seed=2))
 
 
 def answers(counts, question="person", left="a", right="b", people=1):

@@ -22,17 +22,20 @@ from sfms_robot.lab.learning.arig.features import (
     open_scenes,
     reflection,
 )
-from sfms_robot.lab.learning.arig.losses import (
+from sfms_robot.lab.learning.arig.trainer import (
     GLIDE,
     Student,
     _glided,
     augment,
     channel_weights,
+    draw,
     group_of,
     loss_parts,
     previous_states,
+    starts_by_event,
+    train_arig,
+    weights_of,
 )
-from sfms_robot.lab.learning.arig.trainer import draw, starts_by_event, train_arig, weights_of
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.listeners import audio_frontend, checkpoint
 from sfms_robot.listeners.arig.event_curves import features
@@ -100,12 +103,6 @@ def test_losses_fall(data, tmp_path):
         assert more[f"held_out_{part}"] < 0.9 * few[f"held_out_{part}"]
 
 
-def test_training_repeats_bit_for_bit(data, tmp_path):
-    for name in "ab":
-        train_arig(settings(steps=5), data, tmp_path / name)
-    assert (tmp_path / "a" / checkpoint.WEIGHTS).read_bytes() == (tmp_path / "b" / checkpoint.WEIGHTS).read_bytes()
-
-
 def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path):
     def stop(report):
         if report.position.step == 3:
@@ -113,7 +110,7 @@ def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path
 
     train_arig(settings(steps=6), data, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt, match="--resume continues"):
-        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watch=stop))
+        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watches=(stop,)))
     train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
     whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
     assert whole == parts
@@ -130,18 +127,6 @@ def test_the_curriculum_decides_where_windows_come_from(corpus):
     late = draw(starts, weights_of(phase.stage(99), starts), 300, generator)
     shares = [((late >= low) & (late <= high)).float().mean() for low, high in first_of.values()]
     assert min(shares) > 0.05 and sum(shares) == pytest.approx(1)
-
-
-@pytest.mark.parametrize("step", [0, 14, 15, 49, 50, 99])
-def test_stages_follow_one_another(step):
-    phase = settings(steps=100).training
-    assert phase.stage(step) is phase.stages[0 if step < 15 else 1 if step < 50 else 2]
-
-
-def test_windows_never_cross_from_one_dyad_into_the_next(corpus):
-    ends = np.cumsum(corpus.lengths)
-    for start in torch.cat(list(corpus.starts_by_scene(WINDOW).values())).tolist():
-        assert np.searchsorted(ends, start, side="right") == np.searchsorted(ends, start + WINDOW - 1, side="right")
 
 
 def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data, tmp_path, caplog):
@@ -236,10 +221,6 @@ def test_grain_is_drawn_anew_for_every_band_and_row(corpus):
     assert abs(float((off[..., 1:] * off[..., :-1]).mean())) < 0.02 * float(off.square().mean())
 
 
-def test_features_that_are_no_logarithms_of_power_are_left_as_they_are(corpus):
-    assert not sounds_off(corpus, sound="wav2vec2", gain_db=6.0, colour_db=6.0, grain_db=6.0).any()
-
-
 def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_back(corpus):
     model = a_student().model
     fit_scales(model, corpus, settings().listener.channels)
@@ -307,25 +288,17 @@ def test_a_step_never_leads_out_of_the_range_of_the_motion():
 
 def test_lost_states_are_drawn_and_unknown_ones_wait():
     states = torch.tensor([[3, -1] * 500])
-    assert torch.equal(previous_states(states, 0, torch.Generator())[0, :2], torch.tensor([3, FIRST]))
-    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0))[:, ::2] == 3
+    assert torch.equal(previous_states(states, 0, torch.Generator(), 7)[0, :2], torch.tensor([3, FIRST]))
+    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0), 7)[:, ::2] == 3
     assert float(kept.float().mean()) == pytest.approx(0.3 + 0.7 / 7, abs=0.05)
 
 
 def test_unlabelled_frames_have_no_state_loss(corpus):
     student = a_student()
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:3], WINDOW)
-    states = told.states
-    unknown = torch.full_like(states, -1)
-    parts = loss_parts(
-        student, told, unknown, told.agent_motion, 1, torch.Generator().manual_seed(0), states.clamp(min=0)
-    )
+    unknown = torch.full_like(told.states, -1)
+    parts = loss_parts(student, told, unknown, told.agent_motion, settings().training, torch.Generator().manual_seed(0))
     assert float(parts.state) == 0
-
-
-def test_only_short_dyads_are_refused(data):
-    with pytest.raises(ConfigError, match=r"none of \d+ dyads can be used: \d+ are shorter than a window of 9000"):
-        gather(open_scenes(data, "train"), 9000, ARKIT, A_LISTENER)
 
 
 def test_agent_and_user_keep_their_tracks():
@@ -361,7 +334,7 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
 
 def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
     blank = replace(dyad("blank", "listening", 0), events=None)
-    with pytest.raises(ConfigError, match="blank: what the listener did is not known"):
+    with pytest.raises(ConfigError, match="blank: expected events of its listener"):
         gather({"listening": [blank]}, WINDOW, ARKIT, A_TOLD)
     assert gather({"listening": [blank]}, WINDOW, ARKIT, A_LISTENER).frames.control.shape[-1] == 0
 
@@ -413,20 +386,6 @@ def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():
     of = {group: float(weights[[one == group for one in groups]].sum()) for group in set(groups)}
     assert of == pytest.approx({"head": 2 / 4.5, "lids": 1 / 4.5, "brows": 0.5 / 4.5, "mouth": 1 / 4.5})
     assert not weights[[name.startswith("eyeLook") for name in CHANNELS]].any()
-
-
-@pytest.mark.parametrize("discrete", [False, True])
-def test_the_loss_is_the_mean_of_its_groups(corpus, discrete: bool):
-    """Equal weights of channels are no weights."""
-    student = a_student(discrete=discrete)
-    told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:2], WINDOW)
-    z = student.model.condition(told, told.states.clamp(min=0)).z.flatten(0, 1)
-    motion = student.model.standardise(told.agent_motion[:, 1:]).flatten(0, 1)
-    one, all_alike = (
-        student.model.head.loss(z, motion, torch.Generator().manual_seed(0), weights)
-        for weights in (None, torch.full((58,), 1 / 58))
-    )
-    assert torch.allclose(one, all_alike, atol=1e-5)
 
 
 def test_the_fitted_autoregression_is_that_of_the_motion():

@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, SHAPES, ListenerEvent
-from sfms_robot.lab.learning.idle_fit import Resting, explained, fit_idle, resting
+from sfms_robot.lab.learning.idle_fit import fit_idle, resting
 from sfms_robot.listeners.idle import IDLE_BANDS, KNOTS, IdleMotion
 
 SMILES = [BLENDSHAPES.index(f"mouthSmile{side}") for side in ("Left", "Right")]
 FROWN = BLENDSHAPES.index("mouthFrownLeft")
 HELD = np.repeat(np.linspace(0.3, 0.7, KNOTS, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
+
+
+def explained(idle):
+    """(52,) deviation of every channel that it adds."""
+    return np.sqrt((idle.loadings.astype(np.float64) ** 2).sum(0))
 
 
 def learned():
@@ -50,11 +55,11 @@ def test_what_a_listener_shows_already_is_not_added_twice():
 def test_where_people_rest_elsewhere_and_how_unevenly_is_shown():
     """People whose muscles are slack a third of the time, and a listener that rests somewhere else, as bells do."""
     elsewhere = replace(learned(), shown=HELD + np.linspace(-0.1, 0.1, len(BLENDSHAPES), dtype=np.float32))
-    slack = [Resting(np.maximum(one.windows, 0.5).astype(np.float32)) for one in people(learned())]
+    slack = [np.maximum(one, 0.5).astype(np.float32) for one in people(learned())]
     found = fit_idle(slack, people(elsewhere))
-    shown = [Resting(with_idle(found, seed, one.windows)) for seed, one in enumerate(people(elsewhere))]
+    shown = [with_idle(found, seed, one) for seed, one in enumerate(people(elsewhere))]
     for channel in (*SMILES, FROWN):
-        ours, theirs = (np.concatenate([one.windows for one in faces])[..., channel] for faces in (shown, slack))
+        ours, theirs = (np.concatenate([one for one in faces])[..., channel] for faces in (shown, slack))
         np.testing.assert_allclose(
             *(np.quantile(one, [0.1, 0.3, 0.5, 0.8, 0.95]) for one in (ours, theirs)), atol=0.006
         )
@@ -77,7 +82,7 @@ def test_slow_motion_is_not_taken_for_faster_motion_nor_for_less_than_it_is():
 
 
 def test_people_who_rest_apart_from_one_another_differ_slowly():
-    still = [Resting(np.full((9, 50, 52), 0.5 + off, np.float32)) for off in (-0.03, 0.03)]
+    still = [np.full((9, 50, 52), 0.5 + off, np.float32) for off in (-0.03, 0.03)]
     found = fit_idle(still, people(None))
     assert explained(found)[FROWN] > 0.02 and np.square(found.amplitude[0]).min() > 0.99
 
@@ -89,7 +94,7 @@ def test_a_face_that_smiles_blinks_or_talks_does_not_rest():
     motion[5 * FRAME_HZ : 6 * FRAME_HZ, SHAPES] = 1.0
     motion[12 * FRAME_HZ : 13 * FRAME_HZ, SHAPES] = 1.0
     found = resting(motion, [ListenerEvent("smile", 5.0, 1.0, 0.5), ListenerEvent("nod", 8.0, 1.0, 0.1)], said)
-    assert len(found.windows) == 7 and not found.windows.any()
+    assert len(found) == 7 and not found.any()
 
 
 def test_without_rest_there_is_nothing_to_learn_from():

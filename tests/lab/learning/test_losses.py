@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from sfms_robot.lab.learning.sfms.losses import masking, next_tokens, reconstruction
+from sfms_robot.lab.learning.sfms.predictor_trainer import next_tokens
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import masking, reconstruction
 
 MEMBER = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
 

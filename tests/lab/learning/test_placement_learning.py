@@ -6,7 +6,7 @@ import torch
 from sfms_robot import config
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import imitation, lively, regrets, states, tokenizer_loss
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.piecewise_linear import best_frames, completion_errors, mask_cost
+from sfms_robot.listeners.sfms.piecewise_linear import best_frames, mask_cost
 from sfms_robot.listeners.sfms.placement import ConditionalScore, choose, place_static, tracks
 
 ONE = torch.ones(1, 1)
@@ -70,14 +70,6 @@ def test_lively_tracks_are_drawn_before_still_ones():
     found = lively(motion, torch.eye(2), 1, 4, torch.Generator().manual_seed(0))
     assert len(found.curves) == 4
     assert (found.curves.square().sum((1, 2)) > 1).sum() >= 3
-
-
-def test_teacher_errors_never_fall_as_more_is_chosen():
-    track = tracks(torch.randn(5, 16, 1).cumsum(1), ONE, 1)
-    nothing, one = torch.zeros(5, 16), torch.zeros(5, 16)
-    one[:, 8] = 1.0
-    free, bound = (completion_errors(track.cost, state, 5)[:, 4].amin(1) for state in (nothing, one))
-    assert (bound >= free - 1e-6).all()
 
 
 @pytest.mark.slow

@@ -15,10 +15,9 @@ from safetensors.torch import load_file
 
 import sfms_robot
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.learning import resume
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.job import Run
-from sfms_robot.lab.learning.process_group import ProcessGroup
+from sfms_robot.lab.learning.job import ProcessGroup, Run
+from sfms_robot.lab.learning.training_loop import checkpoint_file, peek
 
 TESTS = Path(tiny_arig_training.__file__).parent
 ENVIRONMENT = {
@@ -71,7 +70,7 @@ def test_a_run_of_two_processes_goes_on_in_one_and_staged_on_disk(data, tmp_path
     half = tmp_path / "half"
     done = train(2, data=data, out=half, every=4, dies_at=5)
     assert done.returncode != 0
-    assert resume.peek(resume.checkpoint_file(half, "arig")).step == 4, "the last checkpoint stands"
+    assert peek(checkpoint_file(half, "arig"))[0].step == 4, "the last checkpoint stands"
     rest = trained(1, data=data, out=half, resume=True)
     assert rest["resumed_at"] == 4
     np.testing.assert_allclose(rest["losses"], alone["losses"][4:], rtol=SAME)
@@ -99,8 +98,8 @@ def test_a_batch_that_cannot_be_shared_is_refused(data, tmp_path, size, accumula
 
 def test_pieces_are_part_of_a_run_and_processes_that_cannot_share_them_are_told_who_can(data, tmp_path):
     train_arig(settings(), data, tmp_path, Run(accumulate=4))
-    file = resume.checkpoint_file(tmp_path, "arig")
-    assert resume.pieces(file) == 4
+    file = checkpoint_file(tmp_path, "arig")
+    assert peek(file)[1] == 4
     with pytest.raises(ConfigError, match=r"4 pieces; 3 processes cannot share them \(1, 2, 4 can\)"):
         train_arig(settings(), data, tmp_path, Run(resume=True, group=ProcessGroup(size=3)))
     with pytest.raises(ConfigError, match="begun with 4 pieces a step, --accumulate 2 makes 2"):
@@ -118,7 +117,7 @@ def test_staged_frames_teach_the_same(data, tmp_path):
 def test_a_disk_that_is_full_leaves_the_last_checkpoint_and_says_so(data, tmp_path):
     """A limit on the size of files stands for the disk."""
     train_arig(settings(), data, tmp_path, Run())
-    file = resume.checkpoint_file(tmp_path, "arig")
+    file = checkpoint_file(tmp_path, "arig")
     before, limits = file.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sfms_robot.frames import ListenerEvent
-from sfms_robot.lab.learning.slow_motion import fit_sway, slow_part
+from sfms_robot.lab.learning.corpus import slow_part, sway_of
 from sfms_robot.listeners.idle import BANDS_HZ, draw_sway, sway_at
 
 TIMES_S = np.arange(1500) * 0.04
@@ -40,10 +40,6 @@ def test_a_motion_of_a_few_frames_is_slow(frames: int):
     np.testing.assert_allclose(slow_part(motion, [NOD]), motion, atol=1e-6)
 
 
-def test_a_head_that_nods_all_the_time_has_some_slow_part():
-    assert np.isfinite(slow_part(nodded(), [ListenerEvent("nod", -1.0, 100.0, 0.1)])).all()
-
-
 def swaying(mixture: torch.Tensor, count: int, lateral=()) -> list[torch.Tensor]:
     times_s = 5 + np.arange(6000) * 0.04
     every = (draw_sway(mixture.numpy(), 0.3, seed, lateral) for seed in range(count))
@@ -58,7 +54,7 @@ def test_what_is_fitted_on_sway_is_its_amplitudes():
     hz = torch.tensor(BANDS_HZ)
     amplitude = torch.linspace(0.02, 0.004, len(hz) - 1)[:, None] * torch.tensor([1.0, 0.5])
     people = swaying(torch.diag_embed(amplitude), 80)
-    found, spread = fit_sway(people)
+    found, spread = sway_of(people)
     torch.testing.assert_close(powers(found)[1:], amplitude[1:].square(), rtol=0.5, atol=2e-6)
     assert 0.2 < float(spread) < 0.5  # that of 0.3, and of how much each is seen to sway in four minutes
 
@@ -68,7 +64,7 @@ def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral
     """Two channels that go opposite ways, the second one lateral or not; the third by itself."""
     together = torch.tensor([[0.01, 0.0, 0.0], [-0.008, 0.006, 0.0], [0.0, 0.0, 0.005]])
     people = swaying(together.expand(len(BANDS_HZ) - 1, 3, 3), 60, lateral)
-    found, _ = fit_sway(people, lateral)
+    found, _ = sway_of(people, lateral)
     covariance = (found @ found.mT).sum(0)
     r = covariance / covariance.diagonal().sqrt() / covariance.diagonal().sqrt()[:, None]
     assert abs(float(r[0, 1])) == pytest.approx(0.8, abs=0.1) and abs(float(r[0, 2])) < 0.15
@@ -78,10 +74,10 @@ def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral
 
 def test_a_border_between_dyads_is_no_motion():
     """Each dyad is fitted by itself: two heads at rest far apart do not sway."""
-    amplitude, _ = fit_sway([torch.zeros(200, 6), torch.ones(200, 6)])
+    amplitude, _ = sway_of([torch.zeros(200, 6), torch.ones(200, 6)])
     assert float(amplitude.max()) < 1e-4
 
 
 def test_too_little_motion_is_refused():
     with pytest.raises(ValueError, match="2 s or more"):
-        fit_sway([torch.zeros(10, 6)])
+        sway_of([torch.zeros(10, 6)])

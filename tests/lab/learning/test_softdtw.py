@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.lab.evaluation.metrics import dtw
-from sfms_robot.lab.learning.sfms.losses import keyframe_dtw, soft_dtw
+from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_dtw, soft_dtw
 
 
 def cost_of(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -24,17 +24,6 @@ def test_with_hard_minima_it_is_the_squared_dtw(rows: int, columns: int, seed: i
     a, b = rng.normal(size=(rows, 1)), rng.normal(size=(columns, 1))
     cost = cost_of(torch.from_numpy(a[None, :, 0]), torch.from_numpy(b[None, :, 0]))
     assert float(soft_dtw(cost, 1e-4)) == pytest.approx(dtw(a, b[None])[0] ** 2, abs=5e-3)
-
-
-def test_softer_minima_lie_lower():
-    cost = torch.rand(16, 8, 8, generator=torch.Generator().manual_seed(1))
-    values = torch.stack([soft_dtw(cost, gamma) for gamma in (0.01, 0.1, 1.0)])
-    assert (values.diff(dim=0) < 0).all()
-
-
-def test_a_batch_is_its_samples():
-    cost = torch.rand(5, 8, 8, generator=torch.Generator().manual_seed(2))
-    torch.testing.assert_close(soft_dtw(cost, 0.1), torch.cat([soft_dtw(one[None], 0.1) for one in cost]))
 
 
 def test_a_keyframe_one_frame_late_costs_less_than_none_and_more_than_in_time():

@@ -12,7 +12,6 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CH
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import rollouts
-from sfms_robot.lab.evaluation.sampling_calibration import calibrate
 from sfms_robot.lab.learning.corpus import GAZE, without_gaze
 from sfms_robot.lab.learning.sfms import predictor_trainer, tokenizer_trainer
 from sfms_robot.lab.learning.sfms.features import (
@@ -27,6 +26,7 @@ from sfms_robot.lab.learning.sfms.features import (
 )
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, starts_with_events
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import batches
+from sfms_robot.lab.learning.train_runs import calibrate
 from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace
@@ -93,11 +93,6 @@ def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them()
     np.testing.assert_array_equal(without_gaze(one).listener, one.listener)
 
 
-def test_a_head_that_is_not_known_apart_stays():
-    one = replace(dyad(), head_of_gaze_rad=None)
-    np.testing.assert_array_equal(without_gaze(one).listener[:, :6], one.listener[:, :6])
-
-
 def test_gaze_is_taken_out_of_our_motion_alone():
     with pytest.raises(ConfigError, match="dyad a is in deca56: gaze can be taken out of arkit58 alone"):
         without_gaze(replace(dyad(), space="deca56", speaker=np.zeros((500, 56), np.float32),
@@ -118,8 +113,8 @@ def test_motion_and_sway_of_a_dyad_are_its_motion_without_gaze():
 @pytest.mark.parametrize(
     "changes, text",
     [
-        ({"events": None}, "does not say when its listener nods"),
-        ({"fps": 30.0, "audio": None}, "has 30 frames a second"),
+        ({"events": None}, "expected events of its listener"),
+        ({"fps": 30.0, "audio": None}, "dyad a: 30 frames a second"),
     ],
 )
 def test_a_dyad_without_events_at_our_rate_is_refused(changes, text):

@@ -15,9 +15,8 @@ from torch import nn
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, ModelError
-from sfms_robot.lab.learning import resume
 from sfms_robot.lab.learning.job import Job, Run
-from sfms_robot.lab.learning.training_loop import fit, optimizer, schedule
+from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer, peek, schedule
 
 
 def toy(identity=None, loss=None, held_out=None, seed=3, **phase) -> Job:
@@ -78,7 +77,7 @@ def left_alone(tmp_path_factory):
 def test_interrupted_anywhere_and_resumed_equals_left_alone(left_alone, tmp_path, stops):
     for stop in stops:
         with pytest.raises(KeyboardInterrupt, match=f"after step {stop} of 12.*--resume continues"):
-            fit(toy(evaluate_every=3), tmp_path, Run(resume=stop != stops[0], watch=interrupt_after(stop)))
+            fit(toy(evaluate_every=3), tmp_path, Run(resume=stop != stops[0], watches=(interrupt_after(stop),)))
         torch.manual_seed(99)  # another process would not have these random numbers
     job = toy(evaluate_every=3)
     outcome = fit(job, tmp_path, Run(resume=True))
@@ -94,7 +93,7 @@ def test_resumed_from_a_checkpoint_before_a_crash_equals_left_alone(left_alone, 
             raise RuntimeError("power cut")
 
     with pytest.raises(RuntimeError):
-        fit(toy(evaluate_every=3, checkpoint_every=every), tmp_path, Run(watch=crash))
+        fit(toy(evaluate_every=3, checkpoint_every=every), tmp_path, Run(watches=(crash,)))
     job = toy(evaluate_every=3)  # how often to save is no part of what a run is
     outcome = fit(job, tmp_path, Run(resume=True))
     assert outcome.resumed_at == 8 // every * every
@@ -105,7 +104,7 @@ def test_looking_at_the_held_out_loss_changes_no_weight(tmp_path):
     never, often = toy(evaluate_every=0), toy(evaluate_every=1)
     fit(never, tmp_path / "never")
     fit(often, tmp_path / "often")
-    last = load_file(resume.checkpoint_file(tmp_path / "often", "toy"))
+    last = load_file(checkpoint_file(tmp_path / "often", "toy"))
     assert same(weights(never), [last[f"model.{name}"] for name in often.model.state_dict()])
 
 
@@ -114,10 +113,10 @@ def test_minutes_alone_make_checkpoints(tmp_path):
     steps_saved = []
 
     def look(report):
-        at = resume.peek(resume.checkpoint_file(tmp_path, "toy"))
-        steps_saved.append(at.step if at else 0)
+        left = peek(checkpoint_file(tmp_path, "toy"))
+        steps_saved.append(left[0].step if left else 0)
 
-    fit(toy(checkpoint_minutes=2.0), tmp_path, Run(watch=look), clock=lambda: next(seconds))
+    fit(toy(checkpoint_minutes=2.0), tmp_path, Run(watches=(look,)), clock=lambda: next(seconds))
     assert steps_saved == [0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, 9]  # 40 s a step
 
 
@@ -130,7 +129,7 @@ def test_patience_stops_early_and_keeps_the_best_weights(tmp_path):
         if report.position.step == 4:
             at_best.extend(weights(job))
 
-    outcome = fit(job, tmp_path, Run(watch=remember))
+    outcome = fit(job, tmp_path, Run(watches=(remember,)))
     assert (outcome.stopped, outcome.steps, outcome.best_step, outcome.held_out) == ("patience", 8, 4, 3.0)
     assert same(weights(job), at_best)
 
@@ -153,9 +152,9 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_weights_and_the_last_checkpo
         before[:] = weights(job)
 
     with pytest.raises(ModelError, match=r"toy: loss .* at step 7: not finite \(.*checkpoint-toy.* holds step 5\)"):
-        fit(job, tmp_path, Run(watch=remember))
+        fit(job, tmp_path, Run(watches=(remember,)))
     assert same(weights(job), before)
-    saved = load_file(resume.checkpoint_file(tmp_path, "toy"))
+    saved = load_file(checkpoint_file(tmp_path, "toy"))
     assert all(value.isfinite().all() for value in saved.values())
 
 
@@ -194,7 +193,7 @@ def test_nothing_to_resume_is_said(tmp_path):
 @pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[: len(whole) // 2], lambda whole: b"x" * 99])
 def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
     fit(toy(), tmp_path)
-    file = resume.checkpoint_file(tmp_path, "toy")
+    file = checkpoint_file(tmp_path, "toy")
     file.write_bytes(damage(file.read_bytes()))
     with pytest.raises(ModelError, match="checkpoint-toy.safetensors: not a readable checkpoint"):
         fit(toy(), tmp_path, Run(resume=True))
@@ -210,17 +209,12 @@ def test_a_checkpoint_of_another_model_under_the_same_identity_is_refused(tmp_pa
 
 def test_beginning_anew_over_an_unfinished_run_is_warned_of(tmp_path, caplog):
     with pytest.raises(KeyboardInterrupt):
-        fit(toy(), tmp_path, Run(watch=interrupt_after(4)))
+        fit(toy(), tmp_path, Run(watches=(interrupt_after(4),)))
     fit(toy(), tmp_path)
     assert "was at step 4, starts again; --resume would have continued" in caplog.text
     caplog.clear()
     fit(toy(), tmp_path)  # a finished one may be trained again without a word
     assert not caplog.text
-
-
-def test_no_unfinished_file_is_left_beside_the_checkpoint(tmp_path):
-    fit(toy(checkpoint_every=1), tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["checkpoint-toy.safetensors"]
 
 
 def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
@@ -232,7 +226,7 @@ def test_a_folder_that_cannot_be_made_is_said_before_the_first_step(tmp_path):
 def test_a_folder_that_vanishes_is_one_line(tmp_path):
     folder = tmp_path / "out"
     with pytest.raises(ConfigError, match="checkpoint-toy.safetensors: cannot be written"):
-        fit(toy(checkpoint_every=3), folder, Run(watch=lambda report: shutil.rmtree(folder, ignore_errors=True)))
+        fit(toy(checkpoint_every=3), folder, Run(watches=(lambda report: shutil.rmtree(folder, ignore_errors=True),)))
 
 
 def test_gradients_are_clipped_for_each_optimizer(tmp_path):
@@ -245,14 +239,14 @@ def test_gradients_are_clipped_for_each_optimizer(tmp_path):
             gradients = [p.grad for group in one.param_groups for p in group["params"]]
             assert nn.utils.get_total_norm(gradients) <= 0.5 + 1e-4
 
-    fit(job, tmp_path, Run(watch=look))
+    fit(job, tmp_path, Run(watches=(look,)))
     assert max(seen) > 0.5  # the report tells the norm before
 
 
 def test_the_interrupt_handler_is_put_back(tmp_path):
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        fit(toy(), tmp_path, Run(watch=interrupt_after(1)))
+        fit(toy(), tmp_path, Run(watches=(interrupt_after(1),)))
     assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -269,7 +263,7 @@ def test_the_rate_warms_up_to_one_and_falls_to_nearly_nothing(steps, warm_up):
 
 def test_both_optimizers_follow_the_schedule_from_their_own_rate(tmp_path):
     job, seen = toy(steps=20), []
-    fit(job, tmp_path, Run(watch=lambda report: seen.append([o.param_groups[0]["lr"] for o in job.optimizers])))
+    fit(job, tmp_path, Run(watches=(lambda report: seen.append([o.param_groups[0]["lr"] for o in job.optimizers]),)))
     assert seen == [[0.05 * schedule(s, job.phase), 0.02 * schedule(s, job.phase)] for s in range(20)]
 
 

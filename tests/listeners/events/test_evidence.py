@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, ListenerEvent
-from sfms_robot.lab.evaluation.whole_recordings import Scene, done_in, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in
 from sfms_robot.listeners.events.evidence import (
     AT,
     DONE,
@@ -151,7 +151,7 @@ def as_events(spans, aside):
 def test_done_one_by_one_equals_done_in_whole(seed):
     spans, aside = deeds(seed)
     events = as_events(spans, aside)
-    whole = done_in(spans, 2500, 0.8, aside)
+    whole = done_at(spans, (np.arange(2500) + 1) * FRAME_S, 0.8, aside)
     for frame in range(0, 2500, 37):
         now_s = (frame + 1) * FRAME_S
         row = done(begun_before(events, now_s), now_s, 0.8)

@@ -18,15 +18,20 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
+from sfms_robot.frames import FRAME_HZ, LATERAL_POSE
 from sfms_robot.lab.corpora.clips import Dyad as Conversation
 from sfms_robot.lab.corpora.collection import Dataset
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.learning import corpus as dyads
-from sfms_robot.lab.learning.corpus import Corpus, in_space, motion_scales, some_sound, sound_scales, without_gaze
-from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
-from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.lab.learning.corpus import (
+    Corpus,
+    fit_sound,
+    fit_sway,
+    motion_scales,
+    shared_frames,
+)
+from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
@@ -36,7 +41,6 @@ from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANT
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
-from sfms_robot.signals.control import control_track
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.voice_activity import levels_db
 
@@ -69,7 +73,7 @@ ArigCorpus = Corpus[LabelledDyad]
 
 
 def open_scenes(data: Path, split: str) -> dict[str, Dataset]:
-    """The set in `data` is listening; data/speaking and data/interaction, where they are, the other two."""
+    """Open the sets of a split by scene: `data` itself is listening, data/speaking and data/interaction the others."""
     found = {"listening": open_dataset(data, split)}
     for scene in ("speaking", "interaction"):
         if any((data / scene).glob(f"{split}/*.npz")):
@@ -86,41 +90,32 @@ def gather(
     settings: config.Arig,
     scratch: Scratch | None = None,
 ) -> ArigCorpus:
-    """`corpus.gather` in one motion space, for a listener of such settings."""
+    """Run `corpus.gather` in one motion space, for a listener of these settings."""
     return dyads.gather(scenes, window, partial(frames_of, space=space, settings=settings), scratch)
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
-    """Windows at (B,) starts as the model takes them."""
+    """Return the windows at (B,) starts as the model takes them."""
     found = corpus.cut(starts, window)
     return replace(found, user_sound=found.user_sound.float(), agent_sound=found.agent_sound.float())
 
 
 def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> LabelledDyad:
-    """One conversation (N, ...). Raises ConfigError for a motion space, sound or events that do not fit."""
+    """Return the frames of one conversation. Raises ConfigError for a motion space, sound or events that do not fit."""
     frames, width = len(dyad.listener), audio_frontend.WIDTHS[settings.sound]
-    control = torch.zeros(frames, 0)
-    if settings.events:
-        if dyad.events is None:
-            raise ConfigError(f"{dyad.name}: what the listener did is not known, which events: true needs")
-        control, dyad = torch.from_numpy(control_track(dyad.events, 0, frames)), without_gaze(dyad)
-    face = in_space(dyad, dyad.speaker, space)
-    seen = face.isfinite().all(-1)
+    face, seen, motion, sway, control = shared_frames(dyad, space, settings)
     user, user_voiced, heard = _audio_features(dyad, "user", width)
     agent, agent_voiced, says = _audio_features(dyad, "agent", width)
     states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
     if settings.events:
         quiet = torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states)
         states = torch.from_numpy(with_feedback(quiet.numpy(), control.numpy()))
-    motion, sway = in_space(dyad, dyad.listener, space), torch.zeros(frames, 0)
-    if settings.sway:
-        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
     return LabelledDyad(
         user_sound=user,
         user_heard=torch.full((frames,), heard),
         agent_sound=agent,
         agent_heard=torch.full((frames,), says),
-        user_motion=torch.where(seen[:, None], face, 0.0),
+        user_motion=face,
         user_seen=seen,
         agent_motion=motion,
         voiced=torch.stack([agent_voiced, user_voiced], dim=-1),
@@ -142,7 +137,8 @@ def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor,
         audio = None
     shipped = dyad.features.get("wav2vec2" if track == "user" else "agent_wav2vec2")
     if width != audio_frontend.WIDTHS["mel"] and shipped is not None:
-        rows = _beside_phase(shipped, audio)
+        place = np.zeros((frames, phase.FEATURES), np.float32) if audio is None else phase.of_audio(audio)
+        rows = np.concatenate([shipped, place], axis=1).astype(np.float32)
         voiced = np.zeros(frames, bool) if audio is None else np.array(phase.hear(levels_db(audio)))
     elif width != audio_frontend.WIDTHS["mel"] and audio is not None:
         raise ConfigError(f"{dyad.name}: sound = wav2vec2 needs the feature wav2vec2, agent_wav2vec2 with the data")
@@ -153,11 +149,6 @@ def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor,
     else:
         return torch.zeros(frames, width, dtype=torch.half), torch.zeros(frames, dtype=torch.bool), False
     return torch.from_numpy(rows).half(), torch.from_numpy(voiced), True
-
-
-def _beside_phase(rows: Floats, audio: Floats | None) -> Floats:
-    place = np.zeros((len(rows), phase.FEATURES), np.float32) if audio is None else phase.of_audio(audio)
-    return np.concatenate([rows, place], axis=1).astype(np.float32)
 
 
 def reflection(before: Tensor, after: Tensor) -> Tensor:
@@ -173,11 +164,11 @@ def reflection(before: Tensor, after: Tensor) -> Tensor:
 
 
 def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | None) -> Tensor:
-    """Fit the steps on standardised motion (M, C) of every dyad without its events; `drawn` (N, C) is the rest to draw.
+    """Fit the steps on standardised motion (M, C) of every dyad without its events; return the part (N, C) to draw.
 
     `remains` (N, C): of `told`; None without events.
     """
-    last, now = _pairs(of_dyads)
+    last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(None, -1), slice(1, None)))
     if remains is not None:
         last = remains * last
     if model.settings.draws != "innovation":
@@ -191,54 +182,34 @@ def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | N
     return model.companded(left / model.step_std)
 
 
-def _pairs(of_dyads: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Rows of every dyad but its last, and those after them."""
-    return torch.cat([one[:-1] for one in of_dyads]), torch.cat([one[1:] for one in of_dyads])
+def _fit_events(model: ArigModel, standard: Tensor, control: Tensor, corpus: ArigCorpus) -> tuple[list[Tensor], Tensor]:
+    """Fit what events do to a face on average, and how far a face at rest, without events and speech, is from that.
 
-
-def _remains(model: ArigModel, corpus: ArigCorpus) -> Tensor | None:
-    """Return `event_curves.remains` of every frame but the first of a dyad (N, C); None for a model without events."""
-    control = corpus.frames.control
-    if not model.is_told or control is None:
-        return None
-    of_dyads = torch.split(control, list(corpus.lengths))
-    return torch.cat([event_curves.remains(rows[:-1], rows[1:], model.moves) for rows in of_dyads])
-
-
-def _fit_rest(model: ArigModel, of_dyads: Sequence[Tensor], corpus: ArigCorpus) -> None:
-    """Return how far a resting face differs from its event curves: (M, C) of every dyad, without events and speech."""
-    control, talks = corpus.frames.control, corpus.frames.voiced[:, 0].float()
-    if not model.is_told or control is None:
-        return
-    lengths, still = list(corpus.lengths), []
-    for rows, talk in zip(torch.split(control, lengths), torch.split(talks, lengths), strict=True):
+    Return the motion (M, C) of every dyad less its events, of standardised motion (N, C), and
+    `event_curves.remains` of every frame but the first of a dyad.
+    """
+    model.told.copy_(event_curves.fit(control, standard))
+    sides = [name in LATERAL_POSE for name in model.settings.channels]
+    model.told[:, sides] = 0.0  # no input says to which side a shake begins, so none is on average
+    controls, still = corpus.by_dyad(control), []
+    of_dyads = [motion - event_curves.features(rows) @ model.told
+                for motion, rows in zip(corpus.by_dyad(standard), controls, strict=True)]  # fmt: skip
+    for rows, talk in zip(controls, corpus.by_dyad(corpus.frames.voiced[:, 0].float()), strict=True):
         near = F.max_pool1d(talk[None], 2 * PAUSE_FRAMES + 1, 1, PAUSE_FRAMES)[0] > 0
         still.append(~(event_curves.moved_channels(rows, model.moves) | near[:, None]))
-    rests, off = torch.cat(still), torch.cat(list(of_dyads)).abs()
+    rests, off = torch.cat(still), torch.cat(of_dyads).abs()
     for channel in range(model.channels):
         found = off[rests[:, channel], channel]
         if len(found) >= LEAST_REST:
             model.rest_range[channel] = found.kthvalue(math.ceil(AT_REST * len(found))).values
-
-
-def _beside_events(model: ArigModel, standard: Tensor, corpus: ArigCorpus) -> Tensor:
-    """Standardised motion (N, C) less what its events do to a face on average, which is fitted first."""
-    control = corpus.frames.control
-    if not model.is_told or control is None:
-        return standard
-    model.told.copy_(event_curves.fit(control, standard))
-    sides = [name in LATERAL_POSE for name in model.settings.channels]
-    model.told[:, sides] = 0.0  # nobody tells to which side a shake begins, so none is on average
-    lengths = list(corpus.lengths)
-    of_dyads = zip(torch.split(standard, lengths), torch.split(control, lengths), strict=True)
-    return torch.cat([motion - event_curves.features(rows) @ model.told for motion, rows in of_dyads])
+    return of_dyads, torch.cat([event_curves.remains(rows[:-1], rows[1:], model.moves) for rows in controls])
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
     """Return how long each of the paper's states lasts, and which states occur with which voices."""
     labels = corpus.frames.states
     labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
-    of_dyads = torch.split(labels, list(corpus.lengths))
+    of_dyads = corpus.by_dyad(labels)
     places = torch.linspace(0, 1, QUANTILES)
     for state in range(len(STATES)):
         lasted = [float(end - start) for one in of_dyads for start, end in runs(one == state)]
@@ -250,17 +221,6 @@ def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
     found.index_put_((voices[:, 0], voices[:, 1], labels[known]), torch.ones(()), accumulate=True)
     share = found / found.sum(-1, keepdim=True).clamp(min=1)
     states.possible.copy_((share >= RARE) | (share == share.amax(-1, keepdim=True)))
-
-
-def _fit_sway(model: ArigModel, corpus: ArigCorpus) -> None:
-    """Fit the sway on frames of listening where there are any: speakers sway further, and no input here tells them
-    apart.
-    """
-    of_dyads = torch.split(corpus.frames.sway, list(corpus.lengths))
-    listening = [slow for slow, scene in zip(of_dyads, corpus.scenes, strict=True) if scene == "listening"]
-    mixture, sizes = fit_sway(listening or of_dyads, lateral_channels(model.settings.channels))
-    model.sway_mixture.copy_(mixture)
-    model.sway_spread.copy_(sizes)
 
 
 def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) -> None:
@@ -275,18 +235,17 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     standard = model.standardise(frames.agent_motion)
     model.motion_low.copy_(standard.amin(0))
     model.motion_high.copy_(standard.amax(0))
-    of_dyads = torch.split(_beside_events(model, standard, corpus), list(corpus.lengths))
-    drawn = _fit_steps(model, of_dyads, _remains(model, corpus))
-    _fit_rest(model, of_dyads, corpus)
-    if model.settings.sway:
-        _fit_sway(model, corpus)
+    of_dyads, remains = corpus.by_dyad(standard), None
+    if model.is_told and frames.control is not None:
+        of_dyads, remains = _fit_events(model, standard, frames.control, corpus)
+    drawn = _fit_steps(model, of_dyads, remains)
+    if model.settings.sway:  # of listening where there is any: speakers sway further, and no input tells them apart
+        slow = corpus.by_dyad(frames.sway)
+        listening = [one for one, scene in zip(slow, corpus.scenes, strict=True) if scene == "listening"]
+        fit_sway(model, listening or slow, lateral_channels(channels))
     if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))
     if model.settings.events and model.states is not None:
         _fit_states(model.states, corpus)
-    rows = some_sound((frames.user_sound, frames.user_heard), (frames.agent_sound, frames.agent_heard))
-    if len(rows):
-        mean, spread = sound_scales(rows)
-        model.sound_mean.copy_(mean)
-        model.sound_std.copy_(spread)
+    fit_sound(model, (frames.user_sound, frames.user_heard), (frames.agent_sound, frames.agent_heard))

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
+from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
-from sfms_robot.lab.learning.arig.losses import LossParts, Student, augment, loss_parts, previous_states
 from sfms_robot.lab.learning.job import Job, Run
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
+from sfms_robot.listeners.arig.stream import FIRST
+from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
+from sfms_robot.listeners.layers import weighted_mean
 from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.signals import mel
 from sfms_robot.signals.control import COLUMNS
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
@@ -63,7 +71,7 @@ def train_arig(
 def arig_job(
     settings: config.ArigTraining, student: Student, corpus: ArigCorpus, held_out: ArigCorpus, device: torch.device
 ) -> Job:
-    """The training as the loop takes it, on a model whose scales are set; moves it to `device`."""
+    """Return the job of a model whose scales are set; move the model to `device`."""
     phase = settings.training
     starts = corpus.starts_by_scene(phase.window_frames)
     eventful = starts_by_event(corpus, starts, phase.window_frames) if phase.event_windows else {}
@@ -77,7 +85,7 @@ def arig_job(
         chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
         dyad = cut(corpus, chosen.to(device), phase.window_frames)
         told, truth = augment(dyad, student.model, phase, generator)
-        return _loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
+        return loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
 
     return Job(
         name="arig",
@@ -98,7 +106,7 @@ def arig_job(
 
 
 def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
-    """(3,) how likely a window is of each of `SCENES`; those without windows are left out. Raises ConfigError."""
+    """Return the probabilities (3,) of windows of `SCENES`, 0 for those without windows. Raises ConfigError."""
     weights = torch.tensor([getattr(stage, scene) * (scene in starts) for scene in SCENES], dtype=torch.float64)
     if not weights.any():
         wanted = ", ".join(scene for scene in SCENES if getattr(stage, scene))
@@ -107,7 +115,7 @@ def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
 
 
 def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: int) -> dict[str, list[Tensor]]:
-    """By scene, of every kind of event but blinks that there is in it, those of the `starts` whose window has one."""
+    """Return by scene, for every kind of event but blinks in it, those of the `starts` whose window has one."""
     control, found = corpus.frames.control, {}
     if control is None or not control.shape[-1]:
         return {}
@@ -128,7 +136,7 @@ def draw(
     eventful: Mapping[str, Sequence[Tensor]] = MappingProxyType({}),
     share: float = 0.0,
 ) -> Tensor:
-    """(count,) first frames: a scene by its weight, then any of its windows.
+    """Draw first frames (count,): a scene by its weight, then any of its windows.
 
     `share` of them are of one of its `eventful` sets instead, any of these and then any of the set.
     """
@@ -144,7 +152,7 @@ def draw(
 
 @torch.no_grad()
 def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> LossParts:
-    """Losses on windows drawn with a fixed seed as the last stage draws them, without augmentation."""
+    """Return the losses, without augmentation, on windows drawn with a fixed seed as the last stage draws them."""
     student.eval()
     generator = torch.Generator().manual_seed(0)
     starts = corpus.starts_by_scene(phase.window_frames)
@@ -152,14 +160,209 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
         dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
-        found.append(_loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
+        found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
     return LossParts(**mean)
 
 
-def _loss_parts(
+# --- Losses ----------------------------------------------------------------------------------------------------------
+#
+# loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - motion|^2 (3.4)
+#
+# Every frame gets the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
+# is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
+# sounds within fewer steps. So are weights of groups of channels: by number, (3) is about the mouth.
+
+RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
+COLOURS = 4  # waves over the bands that make up another microphone's colour
+JUMPS = 0.04  # of frames at which the slow part goes elsewhere
+GLIDE = 12  # frames that it takes for that, at most
+COLD = 0.5  # share of windows whose past is exact
+SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
+# Groups of channels, by how their names begin; the mouth has the rest.
+GROUPS: Final = {
+    "head": (*POSE_CHANNELS, "rotation", "translation", "head"),
+    "lids": ("eye",),
+    "brows": ("brow",),
+    "mouth": ("",),
+}
+
+
+class Student(nn.Module):
+    """The model, and the layer that reads motion off its coarse motion while it learns."""
+
+    def __init__(self, model: ArigModel) -> None:
+        super().__init__()
+        self.model = model
+        self.readout = nn.Linear(model.settings.width, model.channels)
+
+
+@dataclass(frozen=True)
+class LossParts:
+    """Means over frames: equation (3), cross-entropy of labelled frames, squared error of the coarse motion."""
+
+    motion: Tensor
+    state: Tensor
+    coarse: Tensor
+
+    def total(self, phase: config.ArigPhase) -> Tensor:
+        return self.motion + phase.state_weight * self.state + phase.coarse_weight * self.coarse
+
+
+def loss_parts(
     student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
 ) -> LossParts:
-    """`losses.loss_parts` as the phase says, previous states drawn."""
-    previous = previous_states(states, phase.state_noise, generator, len(student.model.settings.states))
-    return loss_parts(student, told, states, truth, phase.draws, generator, previous, phase.group_weights)
+    """Return the losses of frames 1..N-1.
+
+    Args:
+        student: The model and its readout.
+        told: Inputs of the model, the past possibly noisy.
+        states: (B, N) int64, -1 where not labelled.
+        truth: (B, N, C) motion to be predicted after this past.
+        phase: Its `group_weights` are of `GROUPS` in equation (3); None: every channel counts the same.
+        generator: Of noise levels and of the previous states.
+    """
+    model = student.model
+    weights = channel_weights(model.settings, phase.group_weights).to(truth.device) if phase.group_weights else None
+    found = model.condition(told, previous_states(states, phase.state_noise, generator, len(model.settings.states)))
+    target = model.standardise(truth[:, 1:])
+    to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
+    motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), phase.draws, generator, weights).mean()
+    coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
+    known = states[:, 1:] >= 0
+    state = motion.new_zeros(())
+    if found.states is not None and bool(known.any()):
+        state = F.cross_entropy(found.states[known], states[:, 1:][known])
+    return LossParts(motion, state, coarse)
+
+
+def group_of(channel: str) -> str:
+    """Return the group of `GROUPS` that a channel belongs to."""
+    return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
+
+
+def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
+    """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
+    drawn = set(settings.drawn_channels)
+    members = Counter(group_of(name) for name in drawn)
+    weights = torch.zeros(len(settings.channels))
+    for index, name in enumerate(settings.channels):
+        if name in drawn:
+            weights[index] = getattr(groups, group_of(name)) / members[group_of(name)]
+    return weights / weights.sum()
+
+
+def augment(
+    dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[ArigDyad, Tensor]:
+    """Return windows with missing modalities, other microphones and a noisy past; and the motion (B, N, C) after it.
+
+    The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
+    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. A
+    head whose past is not told is as it was.
+    Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
+    in every window, and all of it is taken back at once.
+    """
+    b, n = dyad.user_heard.shape
+    device = dyad.agent_motion.device
+
+    def dropped(share: float) -> Tensor:
+        return (torch.rand(b, 1, generator=generator) < share).to(device)
+
+    deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
+    silent = dropped(phase.silent_user)
+    mute = dropped(phase.drop_agent) & ~dyad.voiced[..., 0].any(1, keepdim=True)
+    voiced = torch.stack([dyad.voiced[..., 0], dyad.voiced[..., 1] & ~deaf & ~silent], dim=-1)
+    user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
+    off = model.motion_std * model.is_recalled
+    slow, fast = (each.to(device) * off for each in _wander(b, n, model.channels, phase, generator))
+    lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
+    spoken = dyad.voiced[..., :1] & lips
+    missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
+    missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
+    told = replace(
+        dyad,
+        user_sound=_in_a_room(dyad.user_sound + user_off, voiced[..., 1:], silent, model, phase, generator),
+        agent_sound=dyad.agent_sound + agent_off,
+        user_heard=dyad.user_heard & ~deaf,
+        agent_heard=dyad.agent_heard & ~mute,
+        user_seen=dyad.user_seen & ~blind,
+        agent_motion=dyad.agent_motion + slow + fast * model.step_std + torch.where(spoken, missed, 0.0),
+        voiced=voiced,
+    )
+    carried = (1 - RETURN) * torch.cat([slow[:, :1], slow[:, :-1]], dim=1)
+    return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
+
+
+def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
+    """Draw what another microphone would add (B, N, A) to logarithms of power; nothing to other features."""
+    off = torch.zeros(b, n, model.sound_width)
+    if model.settings.sound != "mel":
+        return off
+    size = torch.rand(b, 1, 2, generator=generator) * mel.LN_PER_DB
+    waves = torch.randn(b, 1, COLOURS, generator=generator) / COLOURS**0.5
+    place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
+    colour = waves @ torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
+    grain = torch.randn(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS, generator=generator)
+    gain = torch.rand(b, 1, 1, generator=generator) * 2 - 1
+    bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
+    off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
+    return off
+
+
+def _in_a_room(
+    sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+) -> Tensor:
+    """Return sound (B, N, A) of the user with some non-speech (voiced (B, N, 1)) or all of it (silent (B, 1)) removed.
+
+    Silence has the features of a stream's start. Features other than logarithms of power are unchanged.
+    """
+    if model.settings.sound != "mel":
+        return sound
+    b, n = sound.shape[:2]
+    share = torch.rand(b, 1, 1, generator=generator) * (torch.rand(b, 1, 1, generator=generator) < phase.quiet_room)
+    bands = sound[..., :MEL_WIDTH]
+    less = share.to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
+    quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
+    silence = torch.from_numpy(track(np.zeros(n * FRAME_SAMPLES, np.float32))[0]).to(sound.device)
+    return torch.where(silent[..., None], silence, quieter)
+
+
+def _wander(
+    b: int, n: int, channels: int, phase: config.ArigPhase, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of
+    steps.
+
+    The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
+    the drift of a stream: its speed does not continue in the frames after it.
+    """
+    size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
+    size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
+    jumps = torch.randn(b, n, channels, generator=generator)
+    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS), generator)
+    fast = torch.randn(b, n, channels, generator=generator)
+    slow = jumps.clone()
+    for frame in range(1, n):
+        slow[:, frame] += (1 - RETURN) * slow[:, frame - 1]
+    return size * slow, size * fast
+
+
+def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
+    """Spread jumps (B, N, C) evenly over the frames from each on: 1 to `GLIDE`, drawn for each window."""
+    b, n = jumps.shape[:2]
+    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator)
+    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
+    before = (torch.arange(1, n + 1) - frames).clamp(min=0)
+    ended = total.gather(1, before[..., None].expand(-1, -1, jumps.shape[2]))
+    return (total[:, 1:] - ended) / frames[..., None]
+
+
+def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int) -> Tensor:
+    """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
+    `count`.
+    """
+    known = torch.where(states < 0, FIRST, states)
+    drawn = torch.randint(count, states.shape, generator=generator).to(states.device)
+    replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)
+    return torch.where(replaced, drawn, known)

@@ -1,34 +1,38 @@
-"""Teaches hazards from meetings: evidence of every step, onsets against the steps in which nothing began.
+"""Fits of hazards on meetings: evidence of every step, onsets against the steps in which nothing began.
 
-Of the steps without an onset one in six is kept and counts six times. How good a hazard is: does it rank the onsets of
-a person above the other steps in which he might have, his own history as it was (AUC, mean over people).
+    nod, shake, tilt, laugh, mm_hm     as annotated
+    smile, brow_raise                  not annotated: drawn as in composed dyads, from laughs of others, own
+                                       "mm-hm" and nods, and from questions asked; a reaction late
+    gaze_shift                         a look away from a person who speaks or has the floor, where annotated
+
+A hazard is evaluated every 80 ms; an event belongs to the step in which it begins. Of the steps without an onset one in
+six is kept and counts six times. A hazard is judged by how it ranks the onsets of a person above the other steps in
+which they were possible, given the person's history (AUC, mean over people).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
-from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Scene, counts_in, done_in, heard_in
-from sfms_robot.lab.learning.events.labels import (
-    Lesson,
-    Looks,
-    MeetingEvidence,
-    lesson,
-    looks_of,
-    meeting_evidence,
-    minutes,
-    spans_of,
-    steps_of,
+from sfms_robot.lab.corpora.compose.composed import Stretch, active
+from sfms_robot.lab.evaluation.intervals import Sums
+from sfms_robot.lab.evaluation.phrase_timing import (
+    listening_mask,
+    near,
+    phrase_end_counts,
+    phrase_ends,
+    rank_auc,
+    ratio_of,
 )
-from sfms_robot.listeners.events.evidence import AT, NUMBERS
-from sfms_robot.listeners.events.model import STEP_FRAMES, Hazard
+from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in, done_at, heard_in, unspoken
+from sfms_robot.listeners.events.evidence import AT, HEARD, NUMBERS
+from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S, Hazard
 from sfms_robot.signals.phase import piecewise_linear_basis
 
 Knots = tuple[float, ...]
@@ -91,50 +95,56 @@ GROUPS: Final[Mapping[str, Groups]] = {
 }
 
 
+LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
+REACTION_S: Final = 0.3  # of a smile to a laugh, of brows to a question
+SMILES: Final = {"laugh": 0.6, "mm_hm": 0.3, "nod": 0.12}  # shares followed by a smile: others' laughs, own the rest
+BROWS: Final = {"question": 0.5, "nod": 0.15}
+SMILE_S, BROW_S = 1.6, 0.8
+
+
 @dataclass(frozen=True, kw_only=True)
 class EventStudent:
     """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
+        scene: Of all frames.
         evidence: (M, len(EVIDENCE)) as each step begins.
-        listening, others: (N,) frames in which the person listens, and in which another one speaks.
+        listening: (N,) frames in which the person listens.
         lessons: by kind.
     """
 
     person: MeetingPerson
+    scene: Scene
     evidence: Doubles
     listening: Bools
-    others: Bools
     lessons: Mapping[str, Lesson]
 
 
 def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
-    meeting = meeting_evidence(person)
-    scene = scene_of(meeting)
-    spans = spans_of(person, meeting, rng)
-    nods = _begun_in(spans["nod"], meeting.listening)
-    looks = looks_of(person, meeting, counts_in(scene)) if person.gaze is not None else None
-    own = {**spans, "nod": nods} | ({} if looks is None else {"gaze_shift": looks.shifts_s})
-    done = done_in(
-        own, len(meeting.listening), log_rate(nods, meeting.listening), None if looks is None else looks.aside
-    )
-    evidence = np.concatenate([heard_in(scene), done], axis=1)
-    lessons = {kind: lesson(spans[kind], meeting.listening) for kind in spans}
-    if looks is not None:
-        lessons["gaze_shift"] = _looking(looks)
-    return EventStudent(
-        person=person,
-        evidence=_as_steps_begin(evidence),
-        listening=meeting.listening,
-        others=np.asarray(meeting.speaks[:, 1:].any(axis=1)),
-        lessons=lessons,
-    )
+    scene, listening = meeting_scene(person)
+    spans = spans_of(person, rng)
+    nods = begun_in(spans["nod"], listening)
+    lessons = {kind: lesson(each, listening) for kind, each in spans.items()}
+    own, aside = {**spans, "nod": nods}, None
+    if person.gaze is not None:
+        own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
+    ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
+    rows = np.concatenate([heard_in(scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
+    return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
 
 
-def scene_of(meeting: MeetingEvidence) -> Scene:
-    """Return the scene as annotated; smiles were not."""
-    return Scene(meeting.speaks, meeting.looks, meeting.laughs, meeting.nods, np.zeros_like(meeting.laughs))
+def muted(one: EventStudent) -> EventStudent:
+    """Return the rows without the person's own voice among the evidence."""
+    evidence = one.evidence.copy()
+    evidence[:, : len(HEARD)] = _by_step(heard_in(unspoken(one.scene)))
+    return replace(one, evidence=evidence)
+
+
+def _by_step(rows: Doubles) -> Doubles:
+    """Return what is known of rows (N, E) of frames as each step begins (M, E): before the first, nothing."""
+    before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
+    return before[: len(rows) // STEP_FRAMES]
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
@@ -146,32 +156,147 @@ def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
     return np.asarray(np.log((begun + PRIOR_NODS) / (listened + PRIOR_NODS / PRIOR_PER_MINUTE)))
 
 
-def _begun_in(spans: Doubles, mask: Bools) -> Doubles:
+def begun_in(spans: Doubles, mask: Bools) -> Doubles:
+    """Return those of the spans (K, 2) that begin in frames of a mask (N,)."""
     at = np.floor(spans[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
     return spans[(at < len(mask)) & mask[np.minimum(at, len(mask) - 1)]]
 
 
-def _as_steps_begin(rows: Doubles) -> Doubles:
-    """(N, E) known after each frame -> (M, E) known as each step begins; before the first nothing is (NaN)."""
-    steps = len(rows) // STEP_FRAMES
-    before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
-    return before[:steps]
+# --- labels: events of one person of a meeting, and the steps in which they could have happened ---------------------
 
 
-def _looking(looks: Looks) -> Lesson:
-    at = steps_of(looks.at_speaker)
-    begins = np.floor(looks.away_s * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
-    onsets = np.unique(begins[(begins > 0) & (begins < len(at))])
-    may = at.copy()
+@dataclass(frozen=True)
+class Lesson:
+    """One kind of event of one person, M steps of 80 ms.
+
+    Attributes:
+        onsets: (K,) steps in which one begins that could.
+        may: (M,) steps in which it could begin: the person listens and is not inside one.
+    """
+
+    onsets: Ints
+    may: Bools
+
+
+def steps_of(mask: Bools) -> Bools:
+    """Map frames (N,) to steps (N // 2,), by the last frame before each; nothing holds before the first."""
+    before: Bools = np.r_[False, mask[STEP_FRAMES - 1 :: STEP_FRAMES]]
+    return before[: len(mask) // STEP_FRAMES]
+
+
+def spans_of(person: MeetingPerson, rng: np.random.Generator) -> dict[str, Doubles]:
+    """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
+    others, nods = person.others_laughs[:, 0], person.nods[:, 0]
+    smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
+    brows = _some(person.asked, BROWS["question"], rng)
+    return {
+        "nod": person.nods,
+        "shake": person.shakes,
+        "tilt": person.tilts,
+        "laugh": person.laughs,
+        "mm_hm": person.mm_hms,
+        "smile": _spans(np.r_[smiles[0] + REACTION_S, smiles[1], _some(nods, SMILES["nod"], rng)], SMILE_S),
+        "brow_raise": _spans(np.r_[brows + REACTION_S, _some(nods, BROWS["nod"], rng)], BROW_S),
+    }
+
+
+def _some(at_s: Doubles, share: float, rng: np.random.Generator) -> Doubles:
+    return at_s[rng.random(len(at_s)) < share]
+
+
+def _spans(starts_s: Doubles, length_s: float) -> Doubles:
+    starts = np.sort(starts_s)
+    return np.stack([starts, starts + length_s], axis=1)
+
+
+def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
+    """Return the lesson of events (K, 2); none begins inside another."""
+    taken = near(spans_s + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
+    begins = np.floor(spans_s[:, 0] / STEP_S + 1e-6).astype(np.int64)
+    heard = steps_of(listening)
+    onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
+    onsets = onsets[heard[onsets]]
+    may = heard & ~taken[: len(heard) * STEP_FRAMES : STEP_FRAMES]  # that one is over is known as it ends
     may[onsets] = True
     return Lesson(onsets, may)
+
+
+def looks_of(person: MeetingPerson, scene: Scene) -> tuple[Doubles, Bools, Lesson]:
+    """Return the gaze of a person with annotations: the spans (K, 2) from each shift to the next, aside (K,), a lesson.
+
+    A look goes aside if its target neither speaks nor has the floor. In the lesson the gaze leaves such a person.
+    """
+    counts, gaze, agents = counts_in(scene), person.gaze or (), agents_of(person)
+    frames = len(counts)
+    target = np.zeros(frames, np.int64)  # column of the person looked at; 0, oneself, for anything else
+    columns = [agents.index(where) if where in agents else 0 for _, _, where in gaze]
+    first = [min(max(round(start * FRAME_HZ), 0), frames - 1) for start, _, _ in gaze]
+    for column, begin, (_, end, _) in zip(columns, first, gaze, strict=True):
+        target[begin : max(begin, round(end * FRAME_HZ))] = column
+    at_speaker = (target > 0) & counts[np.arange(frames), target]
+    aside = np.array(
+        [not (column and counts[begin, column]) for column, begin in zip(columns, first, strict=True)], bool
+    )
+    away = [start for (start, _, _), begin, goes in zip(gaze, first, aside, strict=True)
+            if goes and begin and at_speaker[begin - 1]]  # fmt: skip
+    may = steps_of(at_speaker)
+    begins = np.floor(np.array(away) * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
+    onsets = np.unique(begins[(begins > 0) & (begins < len(may))])
+    may[onsets] = True
+    return np.array([look[:2] for look in gaze], np.float64).reshape(-1, 2), aside, Lesson(onsets, may)
+
+
+def minutes(mask: Bools) -> float:
+    """Return the minutes of steps in which a mask is True."""
+    return float(mask.sum()) * STEP_S / 60
+
+
+# --- A meeting from the place of one of its people, frame by frame: who speaks, who looks at them, who laughs and nods
+#
+# `listeners.events.evidence` makes its numbers of that; annotations take the place of a microphone and a camera.
+
+
+def agents_of(person: MeetingPerson) -> tuple[str, ...]:
+    """Return the letters of the people of a meeting: the participant, then the others by letter."""
+    return (person.agent, *sorted(set(person.words) - {person.agent}))
+
+
+def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
+    """Return the scene of the whole time in which a person's head was annotated, by `agents_of`, and listening (N,).
+
+    Looks are NaN where not annotated; smiles were not annotated.
+    """
+    whole = Stretch(person=person, start_s=0.0, end_s=int(person.until_s * FRAME_HZ) / FRAME_HZ)
+    agents = agents_of(person)
+    speaks = [active(person.words.get(agent, np.zeros((0, 2))), whole) for agent in agents]
+    looks = np.full((whole.frames, len(agents)), np.nan)
+    for column, agent in enumerate(agents[1:], start=1):
+        if agent in person.gaze_known:
+            looks[:, column] = active(spans_by(person.looked_at, agent), whole)
+    nods = np.zeros(whole.frames, bool)
+    at = np.floor(spans_by(person.others_nods)[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
+    nods[at[(at >= 0) & (at < whole.frames)]] = True
+    laughs = active(person.others_laughs, whole)
+    scene = Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros_like(laughs))
+    return scene, listening_in(person, whole)
+
+
+def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
+    """Return (N,): others spoke in the last 2 s, the participant is silent and in view."""
+    others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
+    return listening_mask(others, FRAME_HZ, own) & ~unseen
+
+
+def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """Return the spans (K, 2) of events (start, end, agent) of one agent, or of all."""
+    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
 # --- fitting ----------------------------------------------------------------------------------------------------
 
 
 def inputs(evidence: Doubles, groups: Groups) -> Floats:
-    """(M, len(EVIDENCE)) -> (M, K): hats of curves and plain numbers, in the order of the groups."""
+    """Map evidence (M, len(EVIDENCE)) to inputs (M, K): hats of curves and plain numbers, in the groups' order."""
     parts = []
     for name, knots in groups.items():
         value = evidence[:, AT[name]]
@@ -182,41 +307,29 @@ def inputs(evidence: Doubles, groups: Groups) -> Floats:
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 
-def sampled(students: Iterable[EventStudent], kind: str, seed: int) -> tuple[Doubles, Doubles, Doubles]:
-    """Evidence (R, E) of all onsets and of a sixth of the other steps, whether it happens (R,), how often it counts."""
+def teach(students: Iterable[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
+    """Fit the hazard of one kind on all onsets and a sixth of the other steps."""
     rows, happens, counts = [], [], []
     for number, one in enumerate(students):
-        if kind not in one.lessons:
-            continue
-        given = one.lessons[kind]
-        onset = np.zeros(len(given.may), bool)
-        onset[given.onsets] = True
-        lot = np.random.default_rng([seed, number]).integers(KEPT, size=len(onset)) == 0
-        kept = given.may & (onset | lot)
-        rows.append(one.evidence[kept])
-        happens.append(onset[kept])
-        counts.append(np.where(onset[kept], 1.0, KEPT))
-    return np.concatenate(rows), np.concatenate(happens).astype(np.float64), np.concatenate(counts)
-
-
-def teach(students: Sequence[EventStudent], kind: str, groups: Groups, seed: int = 0, ridge: float = RIDGE) -> Logistic:
-    """The hazard of one kind."""
-    rows, happens, counts = sampled(students, kind, seed)
-    return fit(inputs(rows, groups), happens, counts, ridge=ridge)
+        if (given := one.lessons.get(kind)) is not None:
+            onset = np.isin(np.arange(len(given.may)), given.onsets)
+            lot = np.random.default_rng([seed, number]).integers(KEPT, size=len(onset)) == 0
+            kept = given.may & (onset | lot)
+            rows.append(one.evidence[kept])
+            happens.append(onset[kept])
+            counts.append(np.where(onset[kept], 1.0, KEPT))
+    happened = np.concatenate(happens).astype(np.float64)
+    return fit(inputs(np.concatenate(rows), groups), happened, np.concatenate(counts), ridge)
 
 
 def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: float) -> Hazard:
-    """As it is written down: curves by knot."""
+    """Return the fitted hazard as the file has it: curves by knot."""
     weights: dict[str, float | dict[float, float]] = {}
     at = 0
     for name, knots in groups.items():
-        if name in NUMBERS:
-            weights[name] = round(float(learned.weights[at]), 3)
-            at += 1
-            continue
-        count = len(knots) - (name in FORGOTTEN)
+        count = 1 if name in NUMBERS else len(knots) - (name in FORGOTTEN)
         values = [round(float(value), 3) for value in learned.weights[at : at + count]]
-        weights[name] = dict(zip(knots, [*values, 0.0][: len(knots)], strict=True))
+        weights[name] = values[0] if name in NUMBERS else dict(zip(knots, [*values, 0.0], strict=False))
         at += count
     return Hazard(
         learned_from=learned_from,
@@ -229,29 +342,10 @@ def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: flo
 # --- ranking ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Ranked:
-    """AUC of each person (P,), by name."""
+def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles], Doubles]) -> Doubles:
+    """Return the AUC of each person (P,): how well `score`, (M, E) -> (M,), ranks onsets above other steps.
 
-    people: tuple[str, ...]
-    auc: Doubles
-
-    @property
-    def mean(self) -> float:
-        return float(self.auc.mean()) if len(self.auc) else float("nan")
-
-    def interval(self, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
-        """95 % of the mean, had other people been met."""
-        if len(self.auc) < 2:
-            return float("nan"), float("nan")
-        drawn = np.random.default_rng(seed).integers(len(self.auc), size=(draws, len(self.auc)))
-        low, high = np.quantile(self.auc[drawn].mean(axis=1), [0.025, 0.975])
-        return float(low), float(high)
-
-
-def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles], Doubles]) -> Ranked:
-    """Return how well `score`, (M, E) -> (M,), ranks onsets above other steps; meetings of a person weighted by
-    onsets.
+    Meetings of a person are weighted by onsets.
     """
     found: dict[str, list[tuple[float, int]]] = {}
     for one in students:
@@ -263,14 +357,15 @@ def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles
         auc = rank_auc(score(one.evidence), given.onsets, others)
         if np.isfinite(auc):
             found.setdefault(one.person.participant, []).append((auc, len(given.onsets)))
-    means = [float(np.average([auc for auc, _ in each], weights=[n for _, n in each])) for each in found.values()]
-    return Ranked(tuple(found), np.array(means))
+    return np.array(
+        [np.average(aucs, weights=onsets) for aucs, onsets in (zip(*each, strict=True) for each in found.values())]
+    )
 
 
 def rate_per_minute(students: Iterable[EventStudent], kind: str) -> float:
-    """Of the time in which they might."""
-    pairs = [(len(one.lessons[kind].onsets), minutes(one.lessons[kind].may)) for one in students if kind in one.lessons]
-    onsets, time = np.sum(pairs, axis=0) if pairs else (0.0, 0.0)
+    """Return the onsets per minute of the time in which they may happen; 0 without any."""
+    lessons = [one.lessons[kind] for one in students if kind in one.lessons]
+    onsets, time = sum(len(one.onsets) for one in lessons), sum(minutes(one.may) for one in lessons)
     return float(onsets / time) if time else 0.0
 
 
@@ -288,45 +383,67 @@ class Logistic:
     weights: Doubles
 
     def log_odds(self, inputs: Floats) -> Doubles:
-        """(N, K) -> (N,)."""
+        """Return the log-odds (N,) of inputs (N, K)."""
         return np.asarray(self.intercept + inputs @ self.weights, np.float64)
 
 
-def fit(
-    inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles | None = None, ridge: float = 10.0
-) -> Logistic:
-    """Maximum likelihood of `happens` (N,) 0 or 1, each row counting `counts` (N,) times, less ridge / 2 * |weights|^2.
+def fit(inputs: Floats, happens: Doubles, counts: Doubles, ridge: float = 10.0) -> Logistic:
+    """Maximise the likelihood of `happens` (N,) 0 or 1, less ridge / 2 * |weights|^2; the intercept is free.
 
-    `offset` (N,) is added to the log-odds and not fitted. The intercept is free.
+    Each row of the inputs (N, K) counts `counts` (N,) times.
     """
-    rows, columns = inputs.shape
+    columns = inputs.shape[1]
     share = float((happens * counts).sum() / counts.sum())
     at = np.r_[np.log(share / (1 - share)), np.zeros(columns)]
-    given = np.zeros(rows) if offset is None else offset
     penalty = np.r_[0.0, np.full(columns, ridge)]
     before, fit_before = at, -np.inf
     for _ in range(NEWTON_STEPS):
-        goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
-        while not goodness >= fit_before:  # too far: whoever starts at the mean may overshoot
+        goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
+        while not goodness >= fit_before:  # too far: a start at the mean may overshoot
             at = (at + before) / 2
-            goodness, slope, bend = _at(at, inputs, happens, counts, given, penalty)
+            goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
         before, fit_before = at, goodness - 1e-9 * abs(goodness)
         at = at + np.linalg.solve(bend, slope)
     return Logistic(float(at[0]), at[1:])
 
 
 def _at(
-    at: Doubles, inputs: Floats, happens: Doubles, counts: Doubles, offset: Doubles, penalty: Doubles
+    at: Doubles, inputs: Floats, happens: Doubles, counts: Doubles, penalty: Doubles
 ) -> tuple[float, Doubles, Doubles]:
-    """Penalised log-likelihood, its gradient and its negative curvature."""
+    """Return the penalised log-likelihood, its gradient and its negative curvature."""
     goodness = -0.5 * float(penalty @ at**2)
     slope, bend = -penalty * at, np.diag(penalty + 1e-9)
     for start in range(0, len(inputs), _ROWS):
         part = slice(start, start + _ROWS)
         x = np.concatenate([np.ones((len(inputs[part]), 1)), inputs[part]], axis=1)
-        odds = np.clip(x @ at + offset[part], -40, 40)
+        odds = np.clip(x @ at, -40, 40)
         chance = 1.0 / (1.0 + np.exp(-odds))
         goodness += float(counts[part] @ (happens[part] * odds - np.log1p(np.exp(odds))))
         slope += x.T @ (counts[part] * (happens[part] - chance))
         bend += x.T @ (x * (counts[part] * chance * (1 - chance))[:, None])
     return goodness, slope, bend
+
+
+# --- nods of people and of hazards, counted alike --------------------------------------------------------------------
+
+
+def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
+    """Return the counts of one person's nods: pairs (nods, minutes); and the intervals [s] in listening time."""
+    listening = steps_of(one.listening)[: len(one.evidence)]
+    steps = np.minimum(np.floor(onsets_s / STEP_S + 1e-6).astype(np.int64), len(listening) - 1)
+    one_speaks, own_voice_s, known, looked_at = one.evidence[
+        :, [AT[name] for name in ("one_speaks", "own_voice_s", "gaze_known", "looked_at")]
+    ].T
+    spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
+    masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
+    counts = phrase_end_counts(
+        onsets_s, phrase_ends(one.scene.speaks[:, 1:].any(axis=1), FRAME_HZ), one.listening, FRAME_HZ
+    )
+    rates = {f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()}
+    return {**rates, "phrase_end": np.array(counts)}, np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S))
+
+
+def figures(found: Sums) -> dict[str, float]:
+    """Return the rates and the phrase-end ratio of counts; NaN where they are not defined."""
+    rates = {name: pair[0] / pair[1] if pair[1] else np.nan for name, pair in found.items() if "minute" in name}
+    return {**rates, "phrase_end_ratio": ratio_of(found["phrase_end"].tolist())}

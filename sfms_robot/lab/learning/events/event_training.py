@@ -5,26 +5,31 @@ Taught on the people of training; ranked and rolled out on those of validation. 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
+from scipy.optimize import brentq
+from scipy.special import expit, ndtri
+from scipy.stats import ks_2samp
 
+from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
-from sfms_robot.lab.evaluation.meetings import tables
-from sfms_robot.lab.learning.events import event_rollout, event_trainer
+from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
+from sfms_robot.lab.evaluation.meetings import decisions, tables
+from sfms_robot.lab.evaluation.rollout import tracked
+from sfms_robot.lab.evaluation.whole_recordings import event_spans, heard_in
+from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,
+    LEARNED,
     NOD,
     RIDGE,
     STUDY_RIDGE,
@@ -33,7 +38,6 @@ from sfms_robot.lab.learning.events.event_trainer import (
     hazard,
     inputs,
 )
-from sfms_robot.lab.learning.events.labels import LEARNED
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE
 from sfms_robot.listeners.events.model import STEP_S, EventModel, EventTables, Hazard, HazardBank, Shape
 from sfms_robot.signals import event_sizes as sizes
@@ -74,27 +78,30 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
     people = read_people(tables(data))
     split = split_series(people)
     parts = {"train": people if all_series else split["train"], "validation": [] if all_series else split["validation"]}
-    with _progress(len(parts["train"]) + len(parts["validation"]) + len(LEARNED)) as step:
-        taught, judged = ([_one(person, seed, step) for person in parts[name]] for name in ("train", "validation"))
-        for kind in LEARNED:
-            if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
-                raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
-        recipe = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
-        hazards = {kind: _taught(taught, kind, *recipe, seed, step) for kind in LEARNED}
-        motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
-        hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
-        hazards["blink"] = blink_hazard(motions.gaps)
-        found = EventTables(
-            hazards={kind: hazards[kind] for kind in EVENT_KINDS},
-            shapes=shapes(taught, motions),
-        )
+
+    def student(person: MeetingPerson) -> EventStudent:
+        return event_trainer.student(person, np.random.default_rng([seed, *person.meeting.encode(), ord(person.agent)]))
+
+    taught, judged = ([student(person) for person in tracked(some, name)] for name, some in parts.items())
+    for kind in LEARNED:
+        if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
+            raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
+    groups, ridge = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
+    hazards = {}
+    for kind in tracked(LEARNED, "kinds of events"):
+        learned = event_trainer.teach(taught, kind, groups[kind], seed, ridge)
+        hazards[kind] = hazard(learned, groups[kind], FROM[kind], event_trainer.rate_per_minute(taught, kind))
+    motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
+    hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
+    hazards["blink"] = blink_hazard(motions.gaps)
+    found = EventTables(hazards={kind: hazards[kind] for kind in EVENT_KINDS}, shapes=shapes(taught, motions))
     if out is not None:
         save(out, found)
     figures: dict[str, Any] = {
         "out": None if out is None else str(out),
         "people": {name: len({person.participant for person in parts[name]}) for name in ("train", "validation")},
         "listening_minutes": round(sum(float(one.listening.sum()) for one in taught) / 25 / 60, 1),
-        "kinds": {kind: _figures(found.hazards[kind], kind, taught, judged) for kind in LEARNED},
+        "kinds": {kind: _judged(found.hazards[kind], kind, taught, judged) for kind in LEARNED},
         "nod": found.hazards["nod"].model_dump(mode="json"),
     }
     if judged:
@@ -117,109 +124,82 @@ def save(file: Path, found: EventTables) -> None:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def _one(person: MeetingPerson, seed: int, step: Any) -> EventStudent:
-    made = event_trainer.student(person, np.random.default_rng([seed, *person.meeting.encode(), ord(person.agent)]))
-    step()
-    return made
-
-
-def _taught(
-    students: Sequence[EventStudent], kind: str, groups: Mapping[str, Groups], ridge: float, seed: int, step: Any
-) -> Hazard:
-    learned = event_trainer.teach(students, kind, groups[kind], seed, ridge)
-    step()
-    rate = event_trainer.rate_per_minute(students, kind)
-    return event_trainer.hazard(learned, groups[kind], FROM[kind], rate)
-
-
-def _figures(
-    given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Sequence[EventStudent]
-) -> dict[str, Any]:
+def _judged(given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Sequence[EventStudent]) -> dict[str, Any]:
+    """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval."""
+    lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
     found: dict[str, Any] = {
-        "onsets": sum(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons),
-        "steps": sum(int(one.lessons[kind].may.sum()) for one in taught if kind in one.lessons),
+        "onsets": sum(len(one.onsets) for one in lessons),
+        "steps": sum(int(one.may.sum()) for one in lessons),
         "per_minute": given.per_minute,
     }
     if not judged:
         return found
-    ranked = event_trainer.ranked(judged, kind, _score(given, kind))
-    found |= {"auc": _figure(ranked.mean), "interval": [_figure(end) for end in ranked.interval()],
-              "people": len(ranked.auc), "study_auc": STUDY_AUC.get(kind)}  # fmt: skip
+
+    def ranked(*left_out: str) -> Doubles:
+        def score(evidence: Doubles) -> Doubles:
+            rows = evidence.copy()
+            rows[:, [AT[name] for name in left_out]] = np.nan
+            return _log_odds(given, rows)
+
+        return event_trainer.ranked(judged, kind, score)
+
+    auc = ranked()
+    interval = np.full(2, np.nan)
+    if len(auc) > 1:
+        interval = ends(auc[np.random.default_rng(0).integers(len(auc), size=(DRAWS, len(auc)))].mean(axis=1))
+    found |= {
+        "auc": _mean(auc), "interval": [rounded(end) for end in interval.tolist()], "people": len(auc),
+        "study_auc": STUDY_AUC.get(kind),
+    }  # fmt: skip
     if kind == "nod":
-        for name, left_out in (
-            ("own_voice", ("own_voice_s", "floor_mine")),
-            ("own_nods", ("nod_end_s", "root_nods_30s", "log_rate")),
-        ):
-            less = event_trainer.ranked(judged, kind, _score(given, kind, left_out))
-            found[f"auc_without_{name}"] = _figure(less.mean)
+        found |= {
+            "auc_without_own_voice": _mean(ranked("own_voice_s", "floor_mine")),
+            "auc_without_own_nods": _mean(ranked("nod_end_s", "root_nods_30s", "log_rate")),
+        }
     return found
 
 
-def _score(given: Hazard, kind: str, left_out: Sequence[str] = ()) -> Any:
-    """Evidence (M, E) -> log-odds (M,), some evidence unknown."""
-    bank = HazardBank({kind: given})
-    columns = [EVIDENCE.index(name) for name in left_out]
+def _mean(auc: Doubles) -> float | None:
+    return rounded(float(auc.mean())) if len(auc) else None
 
-    def score(evidence: np.ndarray) -> np.ndarray:
-        rows = evidence.copy()
-        rows[:, columns] = np.nan
-        parts = np.array_split(rows, max(1, len(rows) // 4096))
-        return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
-    return score
+def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
+    """Return the log-odds (M,) of a hazard for evidence (M, E), in parts that stay in a cache."""
+    bank, parts = HazardBank({"": given}), np.array_split(rows, max(1, len(rows) // 4096))
+    return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
 
 def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
-    """By knob, and of the people themselves."""
-    theirs = event_rollout.total([event_rollout.count(one, event_rollout.people_did(one)) for one in judged])
-    found: dict[str, Any] = {"people": _rounded(event_rollout.figures(theirs))}
+    """Return figures of the people's nods, and of nods alone decided in their places at each rate of `KNOBS`."""
+
+    def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
+        counts = [event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)]
+        total = added(sums for sums, _ in counts)
+        return event_trainer.figures(total), np.concatenate([intervals_s for _, intervals_s in counts])
+
+    figures, theirs_s = counted(event_trainer.begun_in(one.person.nods, one.listening)[:, 0] for one in judged)
+    found = {"people": figures}
+    heard = [heard_in(one.scene) for one in judged]
     for knob in KNOBS:
-        ours = event_rollout.total(
-            [
-                event_rollout.count(
-                    one,
-                    np.array([nod.start_s for nod in event_rollout.roll_out(model, one, knob, number + 1000 * seed)]),
-                )
-                for number, one in enumerate(judged)
-            ]
-        )
-        figures = {**event_rollout.figures(ours), "interval_ks": event_rollout.interval_distance(ours, theirs)}
-        found[f"{knob:g}"] = _rounded(figures)
-    return found
-
-
-def _rounded(figures: Mapping[str, float]) -> dict[str, float | None]:
-    return {key: _figure(value) for key, value in figures.items()}
-
-
-def _figure(value: float) -> float | None:
-    return round(float(value), 4) if np.isfinite(value) else None
+        asked = Calmness.model_validate(dict.fromkeys(EVENT_KINDS, 0.0) | {"nod": knob})
+        decided = (decisions(model, rows, [at + 1000 * seed], asked)[0] for at, rows in enumerate(heard))
+        figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in decided)
+        found[f"{knob:g}"] = {**figures, "interval_ks": float(ks_2samp(ours_s, theirs_s).statistic)}
+    return {key: {name: rounded(value) for name, value in figures.items()} for key, figures in found.items()}
 
 
 def _rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
-    rows = []
-    for kind, found in figures["kinds"].items():
-        auc = found.get("auc")
-        low, high = found.get("interval") or (None, None)
-        rows.append(
-            {
-                "kind": kind.replace("_", " "),
-                "onsets": found["onsets"],
-                "a minute": found["per_minute"],
-                "AUC on validation": None if auc is None else f"{auc:.3f} [{low:.3f}, {high:.3f}]",
-                "study": found.get("study_auc"),
-            }
-        )
-    return rows
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Any]:
-    """A bar on stderr; calling what it gives is one step."""
-    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("people and kinds", total=total)
-        yield lambda: bar.advance(task)
+    return [
+        {
+            "kind": kind.replace("_", " "),
+            "onsets": found["onsets"],
+            "a minute": found["per_minute"],
+            "AUC on validation": found.get("auc")
+            and "{:.3f} [{:.3f}, {:.3f}]".format(found["auc"], *found["interval"]),
+            "study": found.get("study_auc"),
+        }
+        for kind, found in figures["kinds"].items()
+    ]
 
 
 # --- How long and how large: durations as people had them, the rest as composed dyads have it
@@ -234,65 +214,50 @@ _INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # a tail has no end
 
 
 def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shape]:
-    """Of every kind, durations from these people."""
+    """Return the shape of every kind, with durations from these people."""
+
+    def lasts(spans: str, least_s: float = 0.0, longer_s: float = 0.0) -> tuple[float, ...]:
+        return _quantiles(_lengths(getattr(one.person, spans) for one in students).clip(least_s, LONGEST_S) + longer_s)
+
     least, usual, most = sizes.NOD_DEG
-    nod_deg = np.clip(usual * np.exp(sizes.NOD_SPREAD * _normal(_INNER)), least, most)
+    nod_deg = np.clip(usual * np.exp(sizes.NOD_SPREAD * ndtri(_INNER)), least, most)
     nod_deg[[0, -1]] = least, most
-    habit = tuple(_event_rounded(np.clip(1 + sizes.HABIT_SPREAD * _normal(_INNER), 0.4, 1.6)))
+    habit = _thousandths(np.clip(1 + sizes.HABIT_SPREAD * ndtri(_INNER), 0.4, 1.6))
+    laughs_s = _lengths(one.person.laughs for one in students).clip(0, LONGEST_S)
     rng = np.random.default_rng(0)
+    laughs_s += rng.uniform(*sizes.LAUGH_LONGER_S, len(laughs_s))
+    laugh, smile = (
+        Shape(duration_s=_quantiles(_smiles_s(seen_s, motions, rng)), size=size)
+        for seen_s, size in ((laughs_s, sizes.LAUGH), ((smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
+    )
     slight, whole = sizes.BLINK
+    swings: dict[str, Any] = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
     return {
-        "nod": Shape(
-            duration_s=_quantiles(_lengths(one.person.nods for one in students).clip(0.2, LONGEST_S)),
-            size=tuple(_event_rounded(nod_deg)),
-            habit=habit,
-            swings_hz=sizes.SWINGS_HZ,
-        ),
-        "shake": Shape(
-            duration_s=_quantiles(_lengths(one.person.shakes for one in students).clip(0.2, LONGEST_S)),
-            size=tuple(_event_rounded(sizes.SHAKE * nod_deg)),
-            habit=habit,
-            swings_hz=sizes.SWINGS_HZ,
-        ),
-        "tilt": Shape(
-            duration_s=_quantiles(_lengths(one.person.tilts for one in students).clip(0, LONGEST_S) + 12 * FRAME_S),
-            size=sizes.TILT_DEG,
-        ),
-        "laugh": Shape(
-            duration_s=_quantiles(_laughs_s(_lengths(one.person.laughs for one in students), motions, rng)),
-            size=sizes.LAUGH,
-        ),
-        "smile": Shape(
-            duration_s=_quantiles(_smiles_s([smile_s(rng) for _ in range(DRAWN)], motions, rng)), size=sizes.SMILE
-        ),
-        "mm_hm": Shape(duration_s=_quantiles(_lengths(one.person.mm_hms for one in students)), size=sizes.MM_HM),
+        "nod": Shape(duration_s=lasts("nods", 0.2), size=_thousandths(nod_deg), **swings),
+        "shake": Shape(duration_s=lasts("shakes", 0.2), size=_thousandths(sizes.SHAKE * nod_deg), **swings),
+        "tilt": Shape(duration_s=lasts("tilts", longer_s=12 * FRAME_S), size=sizes.TILT_DEG),
+        "laugh": laugh,
+        "smile": smile,
+        "mm_hm": Shape(duration_s=lasts("mm_hms"), size=sizes.MM_HM),
         "brow_raise": Shape(
             duration_s=_quantiles(np.outer(_recorded(motions.brows), (*sizes.BROW_STRETCH, 1.0)).ravel()),
             size=sizes.BROW_RAISE,
         ),
         "blink": Shape(
             duration_s=_quantiles(_recorded(motions.blinks)),
-            size=tuple(_event_rounded(np.interp(_SHARES, (0, *[sizes.SLIGHT_BLINKS] * 2, 1), (*slight, *whole)))),
+            size=_thousandths(np.interp(_SHARES, (0, *[sizes.SLIGHT_BLINKS] * 2, 1), (*slight, *whole))),
         ),
         "gaze_shift": Shape(
-            duration_s=tuple(_event_rounded(np.array([sizes.aside_s(share) for share in _INNER]))),
-            size=tuple(_event_rounded(np.interp(_SHARES, *sizes.ASIDE_DEG))),
+            duration_s=_thousandths(np.array([sizes.aside_s(share) for share in _INNER])),
+            size=_thousandths(np.interp(_SHARES, *sizes.ASIDE_DEG)),
         ),
     }
 
 
-def _laughs_s(heard_s: Doubles, motions: Motions, rng: np.random.Generator) -> Doubles:
-    """From onset to offset, of laughs that were heard so long."""
-    longer = rng.uniform(*sizes.LAUGH_LONGER_S, len(heard_s))
-    return _smiles_s((heard_s.clip(0, LONGEST_S) + longer).tolist(), motions, rng)
-
-
-def _smiles_s(seen_s: Sequence[float], motions: Motions, rng: np.random.Generator) -> Doubles:
-    """Likewise, of smiles that are seen so long."""
-    curves = [motions.smiles[int(rng.integers(len(motions.smiles)))] for _ in seen_s]
-    return np.array(
-        [len(held(curve, int(seen * FRAME_HZ))) * FRAME_S for curve, seen in zip(curves, seen_s, strict=True)]
-    )
+def _smiles_s(seen_s: Iterable[float], motions: Motions, rng: np.random.Generator) -> Doubles:
+    """Return how long smiles last from onset to offset that are seen so long."""
+    curves = [(motions.smiles[int(rng.integers(len(motions.smiles)))], seen) for seen in seen_s]
+    return np.array([len(held(curve, int(seen * FRAME_HZ))) * FRAME_S for curve, seen in curves])
 
 
 def _lengths(spans: Iterable[Doubles]) -> Doubles:
@@ -305,17 +270,11 @@ def _recorded(curves: Sequence[np.typing.NDArray[np.float32]]) -> Doubles:
 
 
 def _quantiles(values: Doubles) -> tuple[float, ...]:
-    return tuple(_event_rounded(np.quantile(values, _SHARES)))
+    return _thousandths(np.quantile(values, _SHARES))
 
 
-def _event_rounded(values: Doubles) -> list[float]:
-    return [round(float(value), 3) for value in values]
-
-
-def _normal(shares: Doubles) -> Doubles:
-    from scipy import special
-
-    return np.asarray(special.ndtri(shares), np.float64)
+def _thousandths(values: Doubles) -> tuple[float, ...]:
+    return tuple(round(float(value), 3) for value in values)
 
 
 # --- Hazards that the meetings alone cannot teach: blinks, of which nobody noted one, and looks away across no table
@@ -331,7 +290,7 @@ BLINK_CUES: Final = {"silence_s": {0.0: 0.0, 0.12: 1.0, 0.4: 0.6, 0.8: 0.0}, "sh
 
 
 def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
-    """From recorded seconds between blinks."""
+    """Fit the hazard of blinks on recorded seconds between them."""
     every = np.concatenate([np.asarray(gap, np.float64) for gap in gaps])
     since = [np.arange(1, max(2, round(gap / STEP_S) + 1)) * STEP_S for gap in every.tolist()]
     rows = np.full((sum(map(len, since)), len(EVIDENCE)), np.nan)
@@ -344,7 +303,7 @@ def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
 
 
 def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
-    """`found` in the meetings, brought to how often people look away from one another."""
+    """Return `found` in the meetings, brought to how often people look away from one another."""
     weights = {name: weight for name, weight in found.weights.items() if name not in ("at_person_s", "own_voice_s")}
     more = round(float(np.log(AT_PERSON_S / AT_PERSON_SPEAKING_S)), 3)
     weights["own_voice_s"] = {0.0: more, 0.5: round(more / 2, 3), 1.0: 0.0}
@@ -354,21 +313,12 @@ def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
 
 
 def at_rate(given: Hazard, kind: str, students: Iterable[EventStudent], per_minute: float) -> Hazard:
-    """The same with the intercept that gives so many a minute, in the steps of others in which it may happen."""
+    """Return the hazard with the intercept that gives `per_minute` in the steps in which it may happen."""
     rows = np.concatenate(
         [one.evidence[one.lessons[kind].may & (one.evidence[:, AT["own_voice_s"]] > 1.0)] for one in students
          if kind in one.lessons]
     )  # fmt: skip
-    bank = HazardBank({kind: given})
-    odds = np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in _parts(rows)])
-    low, high = -20.0, 20.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        mean = float((1 / (1 + np.exp(-(odds + middle)))).mean()) * 60 / STEP_S
-        low, high = (middle, high) if mean < per_minute else (low, middle)
-    update = {"intercept": round(given.intercept + low, 3), "per_minute": round(per_minute, 3)}
+    odds = _log_odds(given, rows)
+    more = brentq(lambda by: expit(odds + by).mean() * 60 / STEP_S - per_minute, -20.0, 20.0)
+    update = {"intercept": round(given.intercept + more, 3), "per_minute": round(per_minute, 3)}
     return given.model_copy(update=update)
-
-
-def _parts(rows: Doubles) -> list[Doubles]:
-    return np.array_split(rows, max(1, len(rows) // 4096))

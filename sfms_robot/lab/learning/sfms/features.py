@@ -12,21 +12,17 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.lab.corpora.clips import Dyad, at_rate
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
     Corpus,
-    in_space,
+    fit_sway,
     motion_scales,
-    some_sound,
-    sound_scales,
+    shared_frames,
     windows,
-    without_gaze,
 )
-from sfms_robot.lab.learning.slow_motion import fit_sway, without_sway
-from sfms_robot.lab.learning.staged_frames import Scratch
+from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import lateral_channels
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
@@ -35,7 +31,6 @@ from sfms_robot.listeners.sfms.predictor import last_keyframes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
 from sfms_robot.signals import phase as phases
-from sfms_robot.signals.control import control_track
 from sfms_robot.signals.voice_activity import mel_levels_db
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
@@ -76,7 +71,7 @@ def gather(
     settings: config.Sfms | None = None,
     scratch: Scratch | None = None,
 ) -> SfmsCorpus:
-    """`corpus.gather` in one motion space.
+    """Run `corpus.gather` in one motion space.
 
     `frontend` extracts features of the sound; None leaves the sound out, which is enough for a tokenizer.
     `settings`: of a listener that may get events; None: one that does not.
@@ -88,41 +83,19 @@ def gather(
 def frames_of(
     dyad: Dyad, space: MotionSpace, frontend: AudioFrontend | None = None, settings: config.Sfms | None = None
 ) -> SfmsFrames:
-    """Return the frames of one dyad. Raises ConfigError for a motion space that cannot be converted, and for a listener
-    with events where the dyad has none.
-    """
-    control = np.zeros((len(dyad.listener), 0), np.float32)
-    if settings is not None and settings.events:
-        control = _control(dyad)
-        dyad = without_gaze(dyad)
-    face = in_space(dyad, dyad.speaker, space)
-    known = face.isfinite().all(-1)
+    """Return the frames of one dyad. Raises ConfigError (`corpus.shared_frames`)."""
+    face, known, motion, sway, control = shared_frames(dyad, space, settings)
     sound, phase = _audio_features(dyad, frontend)
-    motion = in_space(dyad, dyad.listener, space)
-    sway = torch.zeros(len(motion), 0)
-    if settings is not None and settings.sway:
-        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
     return SfmsFrames(
         motion=motion,
-        face=torch.where(known[:, None], face, 0.0),
+        face=face,
         face_known=known,
         sound=sound,
         heard=torch.full((len(sound),), bool(sound.any())),
         phase=phase,
-        control=torch.from_numpy(control),
+        control=control,
         sway=sway,
     )
-
-
-def _control(dyad: Dyad) -> Floats:
-    """(N, K). Raises ConfigError where the dyad does not say its events, or not at our rate."""
-    if dyad.events is None:
-        raise ConfigError(
-            f"dyad {dyad.name} does not say when its listener nods and smiles; a listener with events needs it"
-        )
-    if dyad.fps != FRAME_HZ:
-        raise ConfigError(f"dyad {dyad.name} has {dyad.fps:g} frames a second; a listener with events takes {FRAME_HZ}")
-    return control_track(dyad.events, 0, len(dyad.listener))
 
 
 def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor, Tensor]:
@@ -150,7 +123,7 @@ def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor,
 
 
 def _whole(audio: Floats) -> Floats:
-    """Samples up to a whole number of our frames, the last one ending in silence."""
+    """Return the samples, padded with silence to a whole number of our frames."""
     return np.pad(audio, (0, -len(audio) % FRAME_SAMPLES))
 
 
@@ -162,19 +135,7 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
     if model.head:
-        slow = torch.split(corpus.frames.sway, list(corpus.lengths))
-        mixture, sizes = fit_sway(slow, lateral_channels(channels))
-        model.sway_mixture.copy_(mixture)
-        model.sway_spread.copy_(sizes)
-
-
-def fit_sound_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
-    """Set the means and deviations of the sound; without any they stay."""
-    rows = some_sound((corpus.frames.sound, corpus.frames.heard))
-    if len(rows):
-        mean, spread = sound_scales(rows)
-        model.sound_mean.copy_(mean)
-        model.sound_std.copy_(spread)
+        fit_sway(model, corpus.by_dyad(corpus.frames.sway), lateral_channels(channels))
 
 
 def context(
@@ -222,8 +183,10 @@ STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many win
 
 @torch.no_grad()
 def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Keyframe masks (N, G) of all dyads: each dyad as a whole where a keyframe has its cost, else stretch by stretch,
-    so that busy seconds may borrow from quiet ones of the same stretch.
+    """Place the keyframes (N, G) of all dyads.
+
+    Each dyad is placed as a whole where a keyframe has its cost; else stretch by stretch, so that busy seconds may
+    borrow from quiet ones of the same stretch.
     """
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
     masks = []
@@ -237,7 +200,7 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
 
 
 def _stretches(frames: int, size: int, least: int) -> list[int]:
-    """Lengths that add up to `frames`, none under `least` unless there is only one."""
+    """Return lengths that add up to `frames`, none under `least` unless there is only one."""
     whole, rest = divmod(frames, size)
     sizes = [size] * whole
     if rest and (rest >= least or not sizes):
@@ -249,7 +212,7 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
 
 @torch.no_grad()
 def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
-    """Tokens (N, G) of every listener in the corpus."""
+    """Return the tokens (N, G) of every listener in the corpus."""
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
@@ -263,7 +226,7 @@ def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Of tokens (N, G) of dyads of those lengths: the last keyframe at or before each frame of its dyad, 0 for none."""
+    """Return the last keyframe (N, G) at or before each frame of its dyad, 0 for none, of tokens (N, G) of dyads."""
     return torch.cat([last_keyframes(one[None]).tokens[0, ..., 0] for one in torch.split(tokens, list(lengths))])
 
 
@@ -287,7 +250,7 @@ def without_last_keyframes(
     share: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Tokens (B, T, G) of which a `share` of groups has missed its last keyframes and is put right in frame `first`.
+    """Return tokens (B, T, G): a `share` of groups has missed its last keyframes and is put right in frame `first`.
 
     Args:
         tokens: what was meant; dense: (B, T, G) what each frame's keyframe would be.

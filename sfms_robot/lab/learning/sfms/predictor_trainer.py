@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import windows
+from sfms_robot.lab.learning.corpus import fit_sound, windows
 from sfms_robot.lab.learning.job import Job, Run
-from sfms_robot.lab.learning.resume import digest_of
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
     context,
-    fit_sound_scales,
     gather,
     held_tokens,
     keyframe_tokens,
     tokenise,
     without_last_keyframes,
 )
-from sfms_robot.lab.learning.sfms.losses import keyframe_dtw, next_tokens
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
-from sfms_robot.lab.learning.training_loop import fit, optimizer
+from sfms_robot.lab.learning.training_loop import digest_of, fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
@@ -69,7 +66,7 @@ def train_listener(
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
-    fit_sound_scales(model, corpus)
+    fit_sound(model, (corpus.frames.sound, corpus.frames.heard))
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
@@ -83,7 +80,7 @@ def train_listener(
 def listener_job(
     settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
 ) -> Job:
-    """Phase 2 as the loop takes it, on a model whose tokenizer is trained; moves the model to `device`."""
+    """Return the job of phase 2, on a model whose tokenizer is trained; move the model to `device`."""
     phase, listener = settings.predictor, settings.listener
     starts = corpus.starts(listener.window_frames)
     eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
@@ -110,22 +107,20 @@ def listener_job(
         seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
-        return _loss(model, seen, target, settings, generator, partial(missing, chosen, generator))
-
-    def missing(chosen: Tensor, generator: torch.Generator, meant: Tensor, first: Tensor) -> Tensor:
-        if not phase.missed_keyframes:
-            return meant
-        tokenizer, window = model.tokenizer, listener.window_frames
-        return without_last_keyframes(
-            meant,
-            windows(dense, chosen, window),
-            windows(motion, chosen, window),
-            first,
-            tokenizer.member,
-            torch.tensor(tokenizer.costs, device=device),
-            phase.missed_keyframes,
-            generator,
-        )
+        meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
+        count = _drawn(listener, target, generator)
+        if phase.missed_keyframes:
+            meant = without_last_keyframes(
+                meant,
+                windows(dense, chosen, listener.window_frames),
+                windows(motion, chosen, listener.window_frames),
+                listener.past_frames + count[:, 0],
+                model.tokenizer.member,
+                torch.tensor(model.tokenizer.costs, device=device),
+                phase.missed_keyframes,
+                generator,
+            )
+        return _loss(model, seen, meant, count, settings)
 
     return Job(
         name="listener",
@@ -147,14 +142,14 @@ def listener_job(
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
-    """Those of the `starts` in whose future something other than a blink is under way."""
+    """Return those of the `starts` in whose future an event other than a blink is under way."""
     active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
     busy = (corpus.frames.control[:, active] > 0).any(-1)
     return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
 
 
 def corrected(settings: config.Training) -> config.Sfms:
-    """The listener with the weight of class 0 in (14) taken out of its probability again: p' ~ w p, if it is to be."""
+    """Return the listener with the weight of class 0 in (14) taken out of its probability (p' ~ w p), if configured."""
     if not settings.predictor.undo_weight:
         return settings.listener
     bias = -math.log(settings.predictor.transition_weight)
@@ -165,30 +160,26 @@ def corrected(settings: config.Training) -> config.Sfms:
     return settings.listener.model_copy(update={"groups": groups})
 
 
-def _loss(
-    model: SfmsModel,
-    seen: Context[Tensor],
-    target: Tensor,
-    settings: config.Training,
-    generator: torch.Generator,
-    missing: Callable[[Tensor, Tensor], Tensor] = lambda meant, first: meant,
-) -> Tensor:
-    """Cross-entropy (14) and soft-DTW on the future behind a random number of frames that are drawn already.
+def _drawn(listener: config.Sfms, target: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw how many frames (B, 1) of each future (B, H, G) are drawn already when the rest is planned.
 
-    None of them drawn is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left
-    of the one before. A stream of hop 4 plans with 4 of them drawn. `missing`: tokens
-    (B, P + H, G) and the first frame to draw (B,) -> those that are seen and learned instead.
+    None of them is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left of the
+    one before. A stream of hop 4 plans with 4 of them drawn.
     """
-    training, (b, h, _) = settings.predictor, target.shape
-    most = h if settings.listener.hop_frames < h else 1
-    count = torch.randint(most, (b, 1), generator=generator).to(target.device)
+    b, h, _ = target.shape
+    return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator).to(target.device)
+
+
+def _loss(model: SfmsModel, seen: Context[Tensor], meant: Tensor, count: Tensor, settings: config.Training) -> Tensor:
+    """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames that are drawn already.
+
+    `meant` (B, P + H, G): tokens of the past, in place of those in `seen`, and of the future.
+    """
+    training, h = settings.predictor, settings.listener.future_frames
+    target = meant[:, -h:]
     drawn = torch.arange(h, device=target.device) < count  # (B, H)
-    past = seen.tokens[:, :-h]
-    meant = missing(torch.cat([past, target], dim=1), past.shape[1] + count[:, 0])
-    seen, target = seen._replace(tokens=torch.cat([meant[:, :-h], seen.tokens[:, -h:]], dim=1)), meant[:, -h:]
     future = torch.where(drawn[..., None], target, UNDECIDED)
-    seen = seen._replace(tokens=torch.cat([seen.tokens[:, :-h], future], dim=1))
-    logits = model.predictor.teacher_forced(seen, target)
+    logits = model.predictor.teacher_forced(seen._replace(tokens=torch.cat([meant[:, :-h], future], dim=1)), target)
     weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
     loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
     if training.dtw_weight:
@@ -204,9 +195,9 @@ def augment(
     levels: Tensor | None,
     neutral: Tensor,
     training: config.PredictorTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> Context[Tensor]:
-    """Missing modalities, a cold start, and a past that is not quite what was meant. `neutral` (P, G)."""
+    """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G)."""
     b, p = seen.heard.shape
     device = seen.tokens.device
 
@@ -229,8 +220,8 @@ def augment(
     return seen._replace(heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
-def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator | None = None) -> Tensor:
-    """A share of the keyframes one level off in one dimension: in a roll-out the past is the model's own.
+def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator) -> Tensor:
+    """Move a share of the keyframes by one level in one dimension: in a roll-out the past is the model's own.
 
     Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
     """
@@ -250,21 +241,21 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 def held_out_loss(
     model: SfmsModel, corpus: SfmsCorpus, settings: config.Training, tokens: Tensor | None = None
 ) -> float:
-    """The loss without augmentation on windows drawn with a fixed seed; `tokens` (N, G) of the corpus, if at hand."""
+    """Return the loss, not augmented, on windows drawn with a fixed seed; `tokens` (N, G) of the corpus if known."""
     model.eval()
     tokens = tokenise(model, corpus) if tokens is None else tokens
     generator = torch.Generator().manual_seed(0)
-    losses = [
-        float(_loss(model, seen, target, settings, generator))
-        for seen, target in some_windows(model, corpus, tokens, settings.listener, generator)
-    ]
+    losses = []
+    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator):
+        meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
+        losses.append(float(_loss(model, seen, meant, _drawn(settings.listener, target, generator), settings)))
     return sum(losses) / len(losses)
 
 
 def some_windows(
     model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
 ) -> Iterator[tuple[Context[Tensor], Tensor]]:
-    """Batches of contexts and the tokens (B, H, G) that came next."""
+    """Yield batches of contexts and the tokens (B, H, G) that came next."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
@@ -275,7 +266,7 @@ def some_windows(
 
 @torch.no_grad()
 def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
-    """Recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
+    """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
     All groups and future frames pooled, on windows drawn with a fixed seed.
     """
@@ -287,3 +278,67 @@ def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms)
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
     return {"keyframe_recall": hit / max(1, true), "keyframe_precision": hit / max(1, said)}
+
+
+def next_tokens(
+    logits: Sequence[Tensor],
+    target: Tensor,
+    counted: Tensor,
+    transition_weight: float,
+    group_weights: Sequence[float],
+) -> Tensor:
+    """Return (14): weighted cross-entropy, class 0 weighing `transition_weight` and a keyframe 1; mean over groups.
+
+    Args:
+        logits: per group (B, H, V_g + 1).
+        target: (B, H, G) classes.
+        counted: (B, H) bool: frames that were to be predicted.
+    """
+    total = torch.zeros(())
+    for group, values in enumerate(logits):
+        truth = target[..., group][counted]
+        weight = torch.where(truth == 0, transition_weight, 1.0)
+        loss = F.cross_entropy(values[counted], truth, reduction="none")
+        total = total + group_weights[group] * (loss * weight).sum() / weight.sum()
+    return total / sum(group_weights)
+
+
+# --- Soft dynamic time warping (Cuturi and Blondel, ICML 2017): a DTW whose minima are soft, so that it has a gradient
+#
+# The predictor's loss takes it on the keyframe indicator (IV-D3, "binary soft dynamic time warping"): a keyframe that
+# is
+# expected one frame late costs less than one that is not expected at all. The paper gives neither smoothing nor weight.
+
+
+def soft_dtw(cost: Tensor, gamma: float) -> Tensor:
+    """Return the least summed cost (B,) of a path through cost (B, T, U), from corner to corner, with soft minima.
+
+    Steps (1, 0), (0, 1), (1, 1), full window. As `gamma` goes to 0 it becomes DTW; above 0 it lies below it. The paths
+    are summed along anti-diagonals, so that the batch and each diagonal go at once.
+    """
+    if gamma <= 0:
+        raise ValueError(f"gamma {gamma:g} must be above 0")
+    b, rows, columns = cost.shape
+    # One frame of infinity around the path sums; diagonal d holds cells (i, d - i) by i, shifted by that frame.
+    far = torch.full((b, rows + 1), torch.inf, dtype=cost.dtype, device=cost.device)
+    before, last = far, far
+    row = torch.arange(rows, device=cost.device)
+    for diagonal in range(rows + columns - 1):
+        column = diagonal - row
+        inside = (column >= 0) & (column < columns)
+        here = cost[:, row, column.clamp(0, columns - 1)]  # (B, T)
+        if diagonal:
+            three = torch.stack([last[:, 1:], last[:, :-1], before[:, :-1]])  # from the left, above, both
+            some = three.isfinite().any(0)
+            soft = -gamma * torch.logsumexp(-torch.where(some, three, 0.0) / gamma, dim=0)
+            here = here + torch.where(some, soft, torch.inf)  # with a finite gradient where all three are infinite
+        now = torch.where(inside, here, torch.inf)
+        before, last = last, torch.cat([far[:, :1], now], dim=1)
+    return last[:, rows]
+
+
+def keyframe_dtw(expected: Tensor, target: Tensor, gamma: float) -> Tensor:
+    """Return the mean soft-DTW per frame of keyframe probabilities and indicators (B, H, G), each group a sequence."""
+    p, y = (one.transpose(1, 2).flatten(0, 1) for one in (expected, target))  # (B G, H)
+    cost = (p[:, :, None] - y[:, None, :]) ** 2
+    return soft_dtw(cost, gamma).mean() / target.shape[1]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
@@ -19,7 +20,6 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import first_frames, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
-from sfms_robot.lab.learning.sfms.losses import masking, reconstruction
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -85,7 +85,7 @@ def train_tokenizer(
 def tokenizer_job(
     settings: config.Training, model: SfmsModel, corpus: SfmsCorpus, held_out: SfmsCorpus, device: torch.device
 ) -> Job:
-    """Phase 1 as the loop takes it; moves the model to `device`."""
+    """Return the job of phase 1; move the model to `device`."""
     phase, tokenizer = settings.tokenizer, model.tokenizer
     fingerprint = corpus.fingerprint()
     model.to(device)
@@ -110,7 +110,7 @@ def tokenizer_job(
 
 
 def optimizers_of(tokenizer: Tokenizer, phase: config.TokenizerTraining) -> list[torch.optim.Optimizer]:
-    """Of codes and inpainter, and of the scores where there are any: they must not run ahead of the codes (IV-D2)."""
+    """Return optimizers of codes and inpainter, and of scores if any, which must not run ahead of the codes (IV-D2)."""
     rest = [*tokenizer.quantizer.parameters(), *tokenizer.inpainter.parameters()]
     made = [optimizer(rest, phase.learning_rate, phase.weight_decay)]
     if tokenizer.score is not None:
@@ -119,7 +119,7 @@ def optimizers_of(tokenizer: Tokenizer, phase: config.TokenizerTraining) -> list
 
 
 def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
-    """Windows (B, T, C) that move more or less than they did, all channels alike: `gain` deviates the logarithm.
+    """Scale the motion of windows (B, T, C), all channels alike; `gain`: deviation of the logarithm of the factor.
 
     A few faces do not hold what the next face does at its widest. The best masks stay the best.
     """
@@ -131,7 +131,7 @@ def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
 def loss_of_steps(
     tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], phase: config.TokenizerTraining, gain: float = 0.0
 ) -> LossOf:
-    """Loss of one step on motion (N, C), standardised, of dyads of those lengths, by how keyframes are placed.
+    """Return the loss of a step on standardised motion (N, C) of dyads of these lengths, by the placement of keyframes.
 
     `gain`: of `amplified` windows.
     """
@@ -161,20 +161,44 @@ def loss_of_steps(
     return beside
 
 
+def reconstruction(
+    motion: Tensor, restored: Tensor, at_keyframes: Tensor, mask: Tensor, member: Tensor, velocity: float
+) -> Tensor:
+    """Return L2 + the first part of L2^Q of (13), and, beyond the paper, `velocity` times the error of the steps.
+
+    The velocity term keeps movement between coarse codes from having corners. ||z^kf - z^kf^|| is taken in motion
+    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are the codebook's
+    (`Grid.commitment`, `Codebook.commitment`), since only it knows whether anything can move.
+
+    Args:
+        motion, restored, at_keyframes: (B, T, C); the last decoded from each frame's own code.
+        mask: (B, T, G); member: (G, C).
+    """
+    weight = mask.detach() @ member  # (B, T, C)
+    keyframes = ((motion - at_keyframes) ** 2 * weight).sum() / weight.sum().clamp(min=1.0)
+    steps = F.mse_loss(restored.diff(dim=1), motion.diff(dim=1))
+    return F.mse_loss(restored, motion) + keyframes + velocity * steps
+
+
+def masking(relaxed: Tensor, best: Tensor) -> Tensor:
+    """Return L1^mask of (13): relaxed k-hot (B, T, G) against the mask of the best reconstruction drawn."""
+    return (relaxed - best.detach()).abs().sum(1).mean()
+
+
 def tokenizer_loss(
     tokenizer: Tokenizer,
     batch: Tensor,
     mask: Tensor,
     phase: config.TokenizerTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Loss (13) without its masking term, and the squared error of each window (B,).
+    """Return loss (13) without its masking term, and the squared error of each window (B,).
 
-    With a `generator` a learned codebook takes its own step: it has no gradient.
+    A learned codebook has no gradient and is moved here.
     """
     quantizer = tokenizer.quantizer
     latent = quantizer.latent(batch)
-    if generator is not None and isinstance(quantizer.codebook, Codebook):
+    if isinstance(quantizer.codebook, Codebook):
         quantizer.codebook.learn(latent, mask, generator)
     codes = quantizer.codebook.nearest(latent)
     restored = tokenizer.inpaint(codes, mask)
@@ -189,11 +213,10 @@ def learned_loss(
     batch: Tensor,
     temperature: float,
     phase: config.TokenizerTraining,
-    generator: torch.Generator | None = None,
+    generator: torch.Generator,
 ) -> Tensor:
-    """Loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
-    if not isinstance(tokenizer.score, ScoreNetwork):
-        raise ValueError("this tokenizer does not learn its placement the paper's way")
+    """Return loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
+    assert isinstance(tokenizer.score, ScoreNetwork)
     scores = tokenizer.score(batch)
     draws = [place_learned(scores, tokenizer.keyframes, temperature, generator) for _ in range(DRAWS)]
     scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
@@ -205,7 +228,7 @@ def learned_loss(
 
 
 def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
-    """Consecutive windows (W, T, C), standardised."""
+    """Return consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
     return windows(
         model.standardise(corpus.frames.motion.to(model.motion_mean.device)),
@@ -215,7 +238,7 @@ def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 
 
 def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
-    """Error to watch: with the masks that training uses, placed once where that takes its time."""
+    """Return the held-out error: with the masks that training uses, placed once where that is slow."""
     tokenizer = model.tokenizer
     if not isinstance(tokenizer.score, ConditionalScore) and tokenizer.strategy != "penalised":
         return lambda: reconstruction_error(model, corpus)
@@ -226,7 +249,7 @@ def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
 
 @torch.no_grad()
 def window_errors(tokenizer: Tokenizer, motion: Tensor, mask: Tensor) -> Tensor:
-    """Mean squared error (W,) of windows (W, T, C) encoded and decoded at a mask (W, T, G), in standardised units."""
+    """Return the mean squared error (W,) of standardised windows (W, T, C) encoded and decoded at a mask (W, T, G)."""
     errors = []
     for some, at in zip(torch.split(motion, CHUNK), torch.split(mask, CHUNK), strict=True):
         restored = tokenizer.inpaint(tokenizer.quantizer.encode(some), at)
@@ -235,13 +258,11 @@ def window_errors(tokenizer: Tokenizer, motion: Tensor, mask: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def reconstruction_error(
-    model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None, keyframes: Sequence[int] | None = None
-) -> float:
-    """Mean squared error on consecutive windows, in standardised units; another placement may be asked for."""
+def reconstruction_error(model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None) -> float:
+    """Return the mean squared error on consecutive windows, in standardised units, perhaps with another placement."""
     tokenizer = model.tokenizer
     motion = held_out_windows(model, corpus)
-    masks = [tokenizer.place(some, keyframes or tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
+    masks = [tokenizer.place(some, tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
     return float(window_errors(tokenizer, motion, torch.cat(masks)).mean())
 
 
@@ -267,7 +288,7 @@ EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
 
 
 def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torch.Generator) -> Tensor:
-    """Cross-entropy of the scores against the teacher, over all states of one choice of 1..`most` keyframes a track."""
+    """Return the cross-entropy of scores and teacher over all states of one choice of 1..`most` keyframes a track."""
     n = len(track.curves)
     k = torch.randint(1, most + 1, (n,), generator=generator).to(track.curves.device)
     rows, chosen, remaining = states(score, track, k, generator)
@@ -280,7 +301,7 @@ def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torc
 
 @torch.no_grad()
 def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: torch.Generator) -> Tracks:
-    """At most `count` tracks of motion (B, T, C), those that move most likelier: a still one has no best keyframes."""
+    """Draw at most `count` tracks of motion (B, T, C), lively ones more often: a still one has no best keyframes."""
     few = -(-CANDIDATES * count // len(member))  # windows that give enough candidates
     some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device)]
     found = tracks(some, member, curves)
@@ -294,7 +315,7 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: t
 def states(
     score: ConditionalScore, track: Tracks, k: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Every state (track row, chosen frames (S, T), keyframes to come) that the network's own choices lead through."""
+    """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach."""
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
     rows, chosen, remaining = [], [], []
@@ -339,33 +360,13 @@ Batch = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]  # batch size ->
 
 
 def teacher(strategy: Strategy) -> Strategy:
-    """The placement that a tokenizer of this strategy is trained on."""
+    """Return the placement that a tokenizer of this strategy is trained on."""
     return "exact" if strategy == "learned" else strategy
 
 
-@dataclass(frozen=True)
-class MaskBank:
-    """Masks (W, T, G) bool of the windows at `starts` (W,)."""
-
-    starts: Tensor
-    masks: Tensor
-
-    def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """First frames (B,) and masks (B, T, G) of some windows."""
-        window = torch.randint(len(self.starts), (size,), generator=generator)
-        return self.starts[window], self.masks[window].float()
-
-
 @torch.no_grad()
-def mask_bank(tokenizer: Tokenizer, motion: Tensor, starts: Tensor, most: int = MOST_WINDOWS) -> MaskBank:
-    """Masks of at most `most` of the windows at `starts`, evenly spread."""
-    kept = starts[:: max(1, -(-len(starts) // min(most, MOST_WINDOWS)))]
-    parts = [_masks(tokenizer, windows(motion, some, tokenizer.window)) > 0.5 for some in torch.split(kept, CHUNK)]
-    return MaskBank(kept, torch.cat(parts))
-
-
 def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
-    """(B, T, G)."""
+    """Return the masks (B, T, G) of windows by the teacher's placement."""
     gap = tokenizer.max_gap if tokenizer.strategy == "exact" else None
     return place(batch, tokenizer.keyframes, teacher(tokenizer.strategy), member=tokenizer.member, max_gap=gap)
 
@@ -375,38 +376,27 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
 
     `lengths` are those of the dyads in `motion`, `drawn` the number of windows over the whole training.
     """
-    starts = first_frames(lengths, tokenizer.window)
-    if teacher(tokenizer.strategy) == "exact" and len(tokenizer.member) > FEW_GROUPS:
-        bank = mask_bank(tokenizer, motion, starts, drawn)
-
-        def look_up(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-            first, mask = bank.draw(size, generator)
-            return windows(motion, first, tokenizer.window), mask
-
-        return look_up
-
-    if tokenizer.strategy == "penalised":  # a window is a piece of its dyad, and begins where the last keyframe is held
+    strategy, window = tokenizer.strategy, tokenizer.window
+    starts, kept, whole = first_frames(lengths, window), None, None
+    if teacher(strategy) == "exact" and len(tokenizer.member) > FEW_GROUPS:
+        starts = starts[:: max(1, -(-len(starts) // min(drawn, MOST_WINDOWS)))]  # spread evenly
+        parts = torch.split(starts, CHUNK)
+        kept = torch.cat([_masks(tokenizer, windows(motion, some, window)) > 0.5 for some in parts])
+    elif strategy in ("penalised", "exact"):
         whole = place_all(tokenizer, motion, lengths)
 
-        def pieces(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-            first = starts[torch.randint(len(starts), (size,), generator=generator)]
-            mask = windows(whole, first, tokenizer.window)
+    def draw(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        chosen = torch.randint(len(starts), (size,), generator=generator)
+        batch = windows(motion, starts[chosen], window)
+        if kept is not None:
+            return batch, kept[chosen].float()
+        if whole is None:
+            return batch, _masks(tokenizer, batch)
+        mask = windows(whole, starts[chosen], window)
+        if strategy == "penalised":  # a window is a piece of its dyad, and begins where the last keyframe is held
             mask[:, 0] = 1.0
-            return windows(motion, first, tokenizer.window), mask
+            return batch, mask
+        # A tokenizer that places exactly at run time sees half its masks from long stretches, as the predictor will.
+        return batch, torch.cat([mask[: size // 2], _masks(tokenizer, batch[size // 2 :])])
 
-        return pieces
-
-    # A tokenizer that places exactly at run time sees half its masks from long stretches, as the predictor will.
-    stretched = tokenizer.strategy == "exact"
-    long_masks = place_all(tokenizer, motion, lengths) if stretched else None
-
-    def fresh(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        first = starts[torch.randint(len(starts), (size,), generator=generator)]
-        batch = windows(motion, first, tokenizer.window)
-        near = size // 2 if stretched else 0
-        mask = _masks(tokenizer, batch[near:])
-        if long_masks is not None:
-            mask = torch.cat([windows(long_masks, first[:near], tokenizer.window), mask])
-        return batch, mask
-
-    return fresh
+    return draw
