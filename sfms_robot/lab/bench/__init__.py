@@ -46,13 +46,11 @@ BENCHES: Final[Mapping[str, Bench]] = {
     ),
     "bus": Bench("bus_bench:bus", "write and read of a head, of each family, beside the vendor's own calls"),
     "retarget": Bench(
-        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size",
-        takes=("head", "frames"),
+        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size"
     ),
     "lead": Bench("lead:lead", "how late joints are, beside the same with no lead", takes=("head",)),
     "listener": Bench(
-        "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch",
-        takes=("budget",),
+        "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch"
     ),
     "memory": Bench(
         "lead:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
@@ -88,10 +86,6 @@ BENCHES: Final[Mapping[str, Bench]] = {
     "campaign": Bench(
         "campaign:measure", "every fault on every family of servos; exit code 1 where one is not survived",
         in_all=False, takes=("say",),
-    ),
-    "fuzz": Bench(
-        "campaign:measure_fuzz", "random bytes at every family; exit code 1 where they do harm", in_all=False,
-        takes=("minutes", "say"),
     ),
 }  # fmt: skip
 

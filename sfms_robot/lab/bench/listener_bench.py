@@ -6,7 +6,7 @@ thread, and they take turns, some frames each, so that other load of the machine
 frames falls due on every `hop`-th frame; the other frames are only heard.
 
 The row NAME is the engine that `--engine auto` takes, with further figures of the listener: `in_run` beside a servo
-loop, `samplers` of ARIG. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
+loop. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
 the same. ARIG's context is filled with random numbers, as full as after an hour.
 """
 
@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -36,13 +36,10 @@ from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.ports import Listener
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
-if TYPE_CHECKING:
-    from sfms_robot.listeners.arig.stream import ArigListener
-
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 PAPER: Final = "sfms-paper"  # ships as a training only
 TRAINED, SEEDED = "trained", "seeded, not trained"
-EAGER, BF16 = "eager", "torch bf16"
+EAGER: Final = "eager"
 TURN_HOPS: Final = 4
 _TURNS: Final = 20
 _LIMIT_S: Final = 20.0  # for all engines of a listener: a busy machine gives fewer turns
@@ -54,17 +51,10 @@ _COLUMNS: Final = {
 }  # fmt: skip
 
 
-def listener(budget: bool = False) -> BenchResult:
-    """Measure all listeners; restores the number of torch's threads.
-
-    `budget`: count the cost of a frame and compute the time on small computers (`operation_count.budget`) instead.
-    """
+def listener() -> BenchResult:
+    """Measure all listeners; restores the number of torch's threads."""
     import torch
 
-    if budget:
-        from sfms_robot.lab.bench import operation_count
-
-        return operation_count.budget()
     before = torch.get_num_threads()
     rows: dict[str, Row] = {}
     torch.set_num_threads(1)
@@ -100,15 +90,12 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
         way: load_listener(where, graphs=way != EAGER, engine=engine, threads=1)
         for way, (where, engine) in ways.items()
     }
-    if isinstance(settings, config.Arig):
-        loaded[BF16] = _in_bf16(ways[EAGER][0], settings)
     streams = {way: Stream(one, aged(one, one.start(0), speaker)) for way, one in loaded.items()}
     take_turns(streams, speaker)
     rows = {f"{name} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
     for way in streams.keys() - {EAGER}:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
-        if way in ways:
-            rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
+        rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
     auto = [*ways][-1]
     rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
@@ -122,22 +109,8 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
             "minute_1_ms": float(np.median(early.frame_ms)),
             f"minute_{_MINUTES}_ms": float(np.median(streams[auto].frame_ms)),
             "in_run": in_run(folder),
-            "samplers": samplers(_how(loaded[EAGER]), speaker) if weights == TRAINED else None,
         }
     return rows
-
-
-def _in_bf16(where: Path, settings: config.Arig) -> Listener:
-    """Return an ARIG on torch with its large layers in bf16. No configuration asks for it: its row shows why."""
-    from sfms_robot.listeners.arig import networks, torch_engine
-
-    found = load_listener(where, graphs=False, engine="torch", threads=1)
-    how = _how(found)
-    how.engine = torch_engine(
-        settings.model_copy(update={"precision": "fp32"}), networks.with_layers(how.model, networks.Bf16Linear)
-    )
-    how.build_graphs()
-    return found
 
 
 def _how(listener: Listener) -> Any:
@@ -340,51 +313,3 @@ def _of_precision(folder: Path, settings: config.ListenerSettings, precision: st
         if (folder / name).exists():
             (other / name).symlink_to((folder / name).resolve())
     return other
-
-
-# --- samplers -------------------------------------------------------------------------------------------------------
-
-WAYS: Final = (
-    ("ddpm", 50), ("ddpm", 15), ("ddpm", 12), ("ddpm", 10), ("ddpm", 8), ("ddim", 15), ("ddim", 8), ("ddim", 4),
-)  # fmt: skip
-_DRAWS: Final = 32
-_EVERY: Final = 4  # frames between two conditions
-
-
-def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[str, float]:
-    """Return the quality lost by shorter or noiseless sampling (`ddim-8`: DDIM, 8 steps), against 50 steps of eq. (4).
-
-    For the same conditions, many draws of each sampler: how far their mean and spread lie from those of the 50 steps,
-    as a share of the motion's standard deviation. The same 50 steps with another seed show the part of chance.
-    """
-    import torch
-
-    from sfms_robot.listeners.arig.sampler import Denoiser
-
-    head = listener.model.head
-    if not isinstance(head, Denoiser):
-        return {}
-    memory, conditions = listener.start(0), []
-    for index, frame in enumerate(speaker):
-        if index % _EVERY == _EVERY - 1:
-            conditions.append(listener.condition(frame, memory)[0])
-        _, memory = listener.step(frame, memory)
-    repeated = torch.from_numpy(np.concatenate(conditions)).repeat_interleave(_DRAWS, dim=0)
-
-    @torch.inference_mode()
-    def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        plain = {"sampler": sampler, "steps": steps, "temperature": (1.0, 1.0), "temperatures": {}}
-        other = Denoiser(listener.settings.channels, head.condition.in_features, head.settings.model_copy(update=plain))
-        other.load_state_dict(head.state_dict())
-        generator = torch.Generator().manual_seed(seed)
-        noise = torch.randn(len(repeated), steps, listener.model.channels, generator=generator)
-        motion = other.sample(repeated, noise).view(len(conditions), _DRAWS, -1)
-        return motion.mean(1), motion.std(1)
-
-    mean, deviation = drawn("ddpm", 50, seed=1)
-    lost = {}
-    for sampler, steps in WAYS:
-        of_mean, of_deviation = drawn(sampler, steps, seed=2)
-        squared = (of_mean - mean).square().mean() + (of_deviation - deviation).square().mean()
-        lost[f"{sampler}-{steps}"] = float(squared.sqrt())  # standardised motion: its deviation is 1
-    return lost

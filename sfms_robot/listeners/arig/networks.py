@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from sfms_robot.errors import ModelError
 from sfms_robot.listeners.arig.model import ArigModel
@@ -201,21 +199,6 @@ class Int8Linear(nn.Module):
     __call__ = forward  # as PlainModule
 
 
-class Bf16Linear(nn.Module):
-    """A stand-in for an nn.Linear that reads half as much. For benches: integers are faster wherever they exist."""
-
-    def __init__(self, linear: nn.Linear) -> None:
-        super().__init__()
-        self.weight = linear.weight.detach().bfloat16()
-        self.bias = linear.bias.detach().bfloat16()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (..., out) of x (..., in)."""
-        return F.linear(x.bfloat16(), self.weight, self.bias).float()
-
-    __call__ = forward  # as PlainModule
-
-
 def supported() -> bool:
     """Return whether this processor multiplies such integers fast."""
     return torch.backends.quantized.engine in ("x86", "fbgemm", "onednn")
@@ -230,15 +213,10 @@ def with_precision(model: ArigModel, precision: str) -> ArigModel:
         return model
     if not supported():
         raise ModelError("precision: int8 needs an x86 processor (valid here: auto, fp32)")
-    return with_layers(model, Int8Linear)
-
-
-def with_layers(model: ArigModel, kind: Callable[[nn.Linear], nn.Module]) -> ArigModel:
-    """Return a copy of the model with large layers of another kind, except those of the sampler."""
     out = copy.deepcopy(model)
     for name, part in out.named_children():
         if name in PARTS:
-            _replace(part, kind)
+            _replace(part)
     return out
 
 
@@ -253,10 +231,10 @@ def large_layers(model: ArigModel) -> list[str]:
     ]
 
 
-def _replace(module: nn.Module, kind: Callable[[nn.Linear], nn.Module]) -> None:
+def _replace(module: nn.Module) -> None:
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):
             if child.weight.numel() >= SMALLEST:
-                setattr(module, name, kind(child))
+                setattr(module, name, Int8Linear(child))
         else:
-            _replace(child, kind)
+            _replace(child)
