@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats, ListenerEvent
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, MOTION_DIM, SPACE_CHANNELS, Floats, ListenerEvent
 from sfms_robot.lab.corpora.action_units import FAU_VALUE
 from sfms_robot.signals import mel as log_mel
+from sfms_robot.signals.tracks import Take
 
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
@@ -199,6 +200,27 @@ def read(file: Path) -> Dyad:
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error
+
+
+TAKE_STEP: Final = 2e-4  # resolution of whole takes on disk: a hundredth of what counts as stillness
+
+
+def read_takes(file: Path) -> dict[str, list[Take]]:
+    """Return whole recorded faces (`sim/listeners/takes.npz`) of the splits `train` and `held_out`.
+
+    A take is kept as differences from frame to frame. Raises ConfigError for a file with other content.
+    """
+    found: dict[str, list[Take]] = {"train": [], "held_out": []}
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            for key, steps in arrays.items():
+                split, name, _ = key.split("/")
+                if steps.ndim != 2 or len(steps) != MOTION_DIM:
+                    raise ValueError(f"{key} has shape {steps.shape}")
+                found[split].append(Take(name, (steps.cumsum(axis=1).T * TAKE_STEP).astype(np.float32)))
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{file}: not a file of recorded takes: {error}") from error
+    return found
 
 
 def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:

@@ -6,6 +6,7 @@ A pickle can run code. Those of data sets hold arrays and plain values, and only
 from __future__ import annotations
 
 import csv
+import gzip
 import importlib
 import io
 import pickle
@@ -112,11 +113,21 @@ def npy(file: Path) -> NDArray[Any]:
 
 
 def table(file: Path) -> list[list[str]]:
-    """Rows of a CSV file, the header among them, empty ones left out. Raises ConfigError."""
+    """Return the rows of a CSV file, gzipped or not, with its header, without empty rows. Raises ConfigError."""
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            return [row for row in csv.reader(stream) if row]
-    except (OSError, ValueError, csv.Error) as error:
+        with gzip.open(file, "rb") if file.suffix == ".gz" else file.open("rb") as stream:
+            lines = io.TextIOWrapper(stream, encoding="utf-8-sig", newline="")
+            return [row for row in csv.reader(lines) if row]
+    except (OSError, EOFError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{file}: not a table: {error}") from error
+
+
+def columns(file: Path) -> dict[str, list[str]]:
+    """Return the columns of a CSV file by their names in the header. Raises ConfigError."""
+    try:
+        header, *rows = table(file)
+        return dict(zip(header, map(list, zip(*rows, strict=True)) if rows else ([] for _ in header), strict=True))
+    except ValueError as error:
         raise ConfigError(f"{file}: not a table: {error}") from error
 
 

@@ -28,15 +28,6 @@ VOICES: Final[Mapping[Split, tuple[str, ...]]] = {
     "validation": ("1114_3_15", "katie", "audio_EN2006", "hvb_a7ccc3", "hvb_eb82ec"),
     "test": ("1114_3_16", "steve", "audio_EN2005", "audio_EN2009", "audio_ES2003", "hvb_01f7ec"),
 }  # fmt: skip
-# Recordings of faces and heads that listeners and speakers are composed of, by name; others are for training.
-TAKES: Final[Mapping[Split, tuple[str, ...]]] = {
-    "train": (
-        "yes1", "yes_sad1", "understanding1", "attentive1", "listening1", "no_excited1", "reprimand2", "thoughtful1",
-        "serenity1", "S07-001", "d0", "d6", "d19", "1114_2_01",
-    ),
-    "validation": ("yes_excited1", "attentive2", "no_sad1", "apfel", "d3", "d12", "1114_3_15"),
-    "test": ("understanding2", "listening2", "displeased2", "inquiring2", "facial", "d18", "1114_3_16"),
-}  # fmt: skip
 _Item = TypeVar("_Item")
 
 
@@ -53,11 +44,6 @@ def split_of(meeting: str) -> Split:
 def split_of_voice(name: str) -> Split:
     """The part that a recorded voice belongs to."""
     return next((split for split in SPLITS if name.startswith(VOICES[split])), "train")
-
-
-def split_of_take(name: str) -> Split:
-    """The part that a recorded face or head belongs to."""
-    return next((split for split in SPLITS if name in TAKES[split]), "train")
 
 
 def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:

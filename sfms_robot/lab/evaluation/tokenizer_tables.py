@@ -29,7 +29,7 @@ from torch import Tensor
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
-from sfms_robot.lab.corpora import takes
+from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
     AS_WRITTEN,
@@ -337,8 +337,8 @@ def evaluate_table(options: TableOptions) -> dict[str, Any]:
     """Score one table, or all; return the JSON object. Raises ConfigError, ModelError."""
     chosen = _chosen(options)
     folder = options.models or data_dir("configs") / "tokenizers"
-    recorded = takes.load(data_dir("sim") / "listeners" / "takes.npz")
-    held_out = recorded[takes.HELD_OUT] if options.data is None else folder_takes(options.data)
+    recorded = read_takes(data_dir("sim") / "listeners" / "takes.npz")
+    held_out = recorded["held_out"] if options.data is None else folder_takes(options.data)
     wanted = list(dict.fromkeys(name for table in chosen for name in needed(table, options.models is None)))
     train_missing(options, wanted, folder, recorded)
     loaded = {name: read(folder / name) for name in wanted}
@@ -398,6 +398,6 @@ def train_missing(options: TableOptions, wanted: Sequence[str], folder: Path, re
     from sfms_robot.lab.evaluation.table_training import train_all
 
     train_all(
-        missing, folder, recorded[takes.TRAIN], Windows.of(recorded[takes.HELD_OUT], _WINDOW_FRAMES).motion,
+        missing, folder, recorded["train"], Windows.of(recorded["held_out"], _WINDOW_FRAMES).motion,
         size=options.size, steps=options.steps, jobs=options.jobs, device=options.device, anew=options.train,
     )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
-from sfms_robot.lab.corpora.compose.motions import table
+from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.corpora.splits import Split, by_split, split_of
 
 GAP_S: Final = 0.2  # shorter silences are part of a phrase
@@ -203,7 +203,7 @@ def _table(folder: Path, name: str) -> _Rows:
             break
     else:
         raise ConfigError(f"{folder / name}.csv.gz: no such file; an AMI folder holds {', '.join(_COLUMNS)}")
-    rows = table(file)
+    rows = columns(file)
     for column in _COLUMNS[name]:
         if column not in rows:
             raise ConfigError.at(file, "column", column, "is missing", rows)

@@ -17,8 +17,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
-from sfms_robot.lab.corpora.compose.motions import SHAPE, facegood_mouth, table
+from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.lab.corpora.compose.motions import SHAPE
+from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.corpora.splits import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
@@ -84,7 +85,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     """
     found: list[tuple[Split, Floats]] = []
     for folder in folders:
-        rows = table(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
+        rows = columns(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
         said = list(
@@ -182,6 +183,53 @@ def _mouth(file: Path) -> Floats | None:
             shapes = resample(read_track(track), FRAME_HZ).motion[:, SHAPES]
             return np.nan_to_num(shapes)
     return None
+
+
+# ARKit channels of FACEGOOD's mouth controls, each with its weight: mouth_oh_c reaches 1 in ordinary speech. Where
+# several controls feed a channel the largest counts.
+FACEGOOD: Final = {
+    "jawOpen": (("mouth_stretch_c", 1.0),),
+    "jawLeft": (("jaw_sideways_l", 1.0),),
+    "mouthFunnel": (("mouth_funnel_", 1.0),),
+    "mouthPucker": (("mouth_oh_c", 0.5), ("mouth_pucker_", 1.0), ("mouth_oo_c", 1.0)),
+    "mouthSmile": (("mouth_lipCornerPull_", 1.0), ("mouth_lipCornerPullOpen_", 1.0)),
+    "mouthStretch": (("mouth_lipStretch_", 1.0),),
+    "mouthDimple": (("mouth_dimple_", 1.0),),
+    "mouthPress": (("mouth_press_", 1.0),),
+    "mouthRollLower": (("mouth_suck_d", 1.0),),
+    "mouthRollUpper": (("mouth_suck_u", 1.0),),
+    "mouthLowerDown": (("mouth_lowerLipDepress_", 1.0),),
+    "mouthUpperUp": (("mouth_upperLipRaise_", 1.0),),
+}
+
+
+def facegood_mouth(file: Path) -> Floats:
+    """Mouth weights of a FACEGOOD take -> (N, 52) at 25 fps. Raises ConfigError."""
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            weights, names, fps = arrays["weights"], arrays["names"], float(arrays["fps"])
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{file}: not a file of mouth weights: {error}") from error
+    shapes = np.zeros((len(weights), len(BLENDSHAPES)), np.float32)
+    for column, name in enumerate(str(name) for name in names):
+        for channel, gain in _channels_of(name):
+            shapes[:, SHAPE[channel]] = np.maximum(shapes[:, SHAPE[channel]], gain * weights[:, column])
+    return at_25_hz(np.arange(len(shapes)) / fps, np.clip(shapes, 0, 1))
+
+
+def _channels_of(control: str) -> list[tuple[str, float]]:
+    side = {"_l": "Left", "_r": "Right"}.get(control[-2:], "")
+    found = []
+    for channel, controls in FACEGOOD.items():
+        name = channel if channel in SHAPE else channel + side
+        found += [(name, gain) for prefix, gain in controls if name in SHAPE and control.startswith(prefix)]
+    return found
+
+
+def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
+    """Linear onto the 25 fps grid from times_s[0] on, (N, C)."""
+    grid = np.arange(times_s[0], times_s[-1], 1 / FRAME_HZ)
+    return np.stack([np.interp(grid, times_s, column) for column in values.T], axis=1).astype(np.float32)
 
 
 def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.float64]:
