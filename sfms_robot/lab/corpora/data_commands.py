@@ -18,7 +18,7 @@ from rich.progress import Progress, TaskID
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS, Doubles
-from sfms_robot.lab.corpora import clips, formats, stored
+from sfms_robot.lab.corpora import clips, formats
 from sfms_robot.lab.corpora.clips import SEAMLESS_CHANNELS, Dyad
 from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.compose.composed import compose_folder
@@ -243,7 +243,7 @@ def convert_data(
             for name, dataset in sets.items()
         ]
     if not any(split["clips"] for split in splits):
-        (out / stored.SOURCE).unlink()
+        (out / formats.SOURCE).unlink()
         first = next((one for split in splits for one in split["left_out"]), None)
         raise ConfigError(f"{place}: no usable clip" + (f": {first['first']}" if first else ""))
     return {
@@ -279,7 +279,7 @@ def _origin(out: Path, place: Path, layout: str, licence: str | None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     told = {"layout": layout, "folder": str(place.resolve()), "licence": licence}
     text = "# Written by `sfms-robot data convert`: whose data these dyads are.\n" + yaml.safe_dump(told, width=1000)
-    (out / stored.SOURCE).write_text(text, encoding="utf-8")
+    (out / formats.SOURCE).write_text(text, encoding="utf-8")
 
 
 def _data_split(

@@ -7,29 +7,105 @@ default the layout's own; files that look like the other one are refused before 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 
+from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Floats
-from sfms_robot.lab.corpora import stored
+from sfms_robot.frames import FRAME_HZ, Doubles, Floats
 from sfms_robot.lab.corpora.audio_features import Feature, cached
-from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
+from sfms_robot.lab.corpora.clips import Dyad, read
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
-from sfms_robot.lab.corpora.reading import pose_last
+from sfms_robot.lab.corpora.reading import npz, npz_shapes, pose_last
+from sfms_robot.lab.corpora.splits import SPLITS
+
+# --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
+
+SOURCE: Final = "source.yaml"  # beside the splits of converted data: their layout and licence
+_FEATURE: Final = "feature."
+
+
+def _stored_splits(place: Path) -> Mapping[str, str]:
+    found = {str(split): str(split) for split in SPLITS if any((place / split).glob("*.npz"))}
+    first = next((file for split in ("", *found) for file in sorted((place / split).glob("*.npz"))[:1]), None)
+    if first is None:
+        return {}
+    try:
+        ours = "listening" in npz_shapes(first)
+    except ClipError:
+        ours = not first.stem.endswith(("_speaker1", "_speaker2"))
+    return (found or {"train": "."}) if ours else {}
+
+
+def _stored_kind(file: Path) -> tuple[str, float]:
+    """Return space and frame rate of one dyad. Raises ClipError for another file."""
+    shapes = npz_shapes(file)
+    if "listening" not in shapes:
+        raise ClipError.of("unreadable", file, "not a dyad: has no listening")
+    space, fps = npz(file, "space", "fps") if "space" in shapes else ("arkit58", FRAME_HZ)
+    return str(space), float(fps)
+
+
+def _stored_facts(place: Path, split: str) -> Mapping[str, Any]:
+    """Return space and rate of the first dyad, and the licence of converted data.
+
+    `place` may be one split of them. Raises ConfigError for an invalid source.yaml.
+    """
+    facts: dict[str, Any] = {}
+    for file in sorted((place / split).glob("*.npz")):
+        try:
+            facts["space"], facts["fps"] = _stored_kind(file)
+            break
+        except ClipError:  # named by the scan
+            continue
+    source = next((base / SOURCE for base in (place, place.parent) if (base / SOURCE).is_file()), None)
+    if source is not None:
+        told = read_yaml(source)
+        facts["licence"] = told.get("licence") if isinstance(told, dict) else told
+        if not isinstance(told, dict) or not isinstance(facts["licence"], str | None):
+            raise ConfigError.at(source, "licence", facts["licence"], "is no text")
+    return facts
+
+
+def _stored_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    kinds: list[tuple[str, float]] = []
+
+    def clip(file: Path) -> Clip:
+        kinds.append(kind := _stored_kind(file))
+        if kind != kinds[0]:
+            raise ClipError.of("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {kinds[0][0]}")
+        shapes = npz_shapes(file)
+        features = {key.removeprefix(_FEATURE): partial(_stored_feature, file, key)
+                    for key in shapes if key.startswith(_FEATURE)}  # fmt: skip
+        return Clip(name=file.stem, frames=shapes["listening"][0], read=partial(read, file), features=features)
+
+    yield from attempt(sorted((place / split).glob("*.npz")), clip)
+
+
+def _stored_feature(file: Path, key: str) -> Floats:
+    return np.asarray(npz(file, key)[0], np.float32)
+
+
+COMPOSED: Final = Layout(
+    name="composed", about="dyads of sfms-robot: {train,validation,test}/NAME.npz", space="arkit58",
+    fps=float(FRAME_HZ), splits=_stored_splits, scan=_stored_scan, facts=_stored_facts, below=("",),
+)  # fmt: skip
+
+
+# --- Every layout ---------------------------------------------------------------------------------------------------
 
 LAYOUTS: Final = {
     layout.name: layout
     for layout in (
-        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.REACT2025_LAYOUT,
-        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
+        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.LAYOUT_2025,
+        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, COMPOSED,
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
@@ -48,7 +124,7 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
         raise ConfigError(f"{folder}: no such folder")
     tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
     # Our own first: converted dyads keep the names of their files, and these may be another layout's.
-    for candidate in sorted(tried, key=lambda one: one is not stored.LAYOUT):
+    for candidate in sorted(tried, key=lambda one: one is not COMPOSED):
         place = candidate.root(folder)
         if place is not None:
             return candidate, place
@@ -133,7 +209,7 @@ def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Data
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
     held_out = "validation" not in theirs and layout.held_out
-    whole = replace(layout.scan(place, theirs.get(split, theirs.get("train", "")), order), split=split)
+    whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order)
     if not held_out or split not in ("train", "validation"):
         return whole
     rank = np.random.default_rng(_SEED).permutation(len(whole))
@@ -147,7 +223,7 @@ def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Data
 def _shipped(layout: Layout, features: Iterable[str]) -> tuple[str, ...]:
     wanted = tuple(features)
     for name in wanted:
-        if name not in layout.features and layout.name != stored.LAYOUT.name:
+        if name not in layout.features and layout is not COMPOSED:
             raise ConfigError(f"{layout.name} ships no feature {name!r} ({', '.join(layout.features) or 'none'})")
     return wanted
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import ClipError, Problem
+from sfms_robot.lab.corpora.collection import ClipError
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
 
@@ -131,6 +131,12 @@ def columns(file: Path) -> dict[str, list[str]]:
         raise ConfigError(f"{file}: not a table: {error}") from error
 
 
+def npz(file: Path, *keys: str) -> list[NDArray[Any]]:
+    """Return arrays of a .npz. Raises what `UNREADABLE` names."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return [arrays[key] for key in keys]
+
+
 def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
     """Shapes of the arrays of a .npz, from their headers. Raises ClipError."""
     shapes = {}
@@ -185,48 +191,46 @@ def sound(file: Path, frames: int, fps: float) -> Floats:
     return np.pad(audio[:wanted], (0, max(0, wanted - len(audio))))
 
 
-def dyad(
+def voices_of(*files: Path) -> list[Path]:
+    """Return the files of a clip's voices. Raises ClipError if the speaker's, the first, is missing."""
+    if not files[0].is_file():
+        raise ClipError.of("missing sound", files[0], "no such file")
+    return list(files)
+
+
+def dyad_of(
     name: str,
-    speaker: Floats,
-    listener: Floats,
+    faces: Sequence[tuple[object, NDArray[Any]]],
+    frames: int,
     space: str,
     fps: float,
     *,
-    audio: Floats | None = None,
+    voices: Sequence[Path] = (),
     mel: Floats | None = None,
-    own: Floats | None = None,
+    own: bool = False,
 ) -> Dyad:
     """Return a dyad of a data set without annotations: the two voices, where both are there, say who listens when.
 
-    Without the listener's `own` voice the listener listens all the time, as the role in the data says.
+    Without the listener's voice the listener listens all the time, as the role in the data says.
+
+    Args:
+        faces: Origin and rows (T, D) of the speaker, which may have gaps, and of the listener.
+        voices: Files of the speaker's and the listener's voice; the second may be missing.
+        own: Let the dyad carry the listener's voice.
     """
-    frames = len(listener)
-    listening = np.ones(frames, bool)
-    if audio is not None and own is not None:
-        voices = [speaks(voice, frames, fps) for voice in (audio, own)]
-        listening = np.asarray(listening_mask(voices[0], fps, voices[1]), bool)
-    return Dyad(
-        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel
-    )
-
-
-def filed_dyad(
-    name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, space: str, fps: float, pose_first: bool
-) -> Dyad:
-    """Return a dyad with its motion in one .npy file for the speaker and one for the listener; the same for voices."""
     speaker, listener = (
-        track(str(file), pose_last(npy(file), pose_first), frames, WIDTHS[space], gaps=gaps)
-        for file, gaps in zip(faces, (True, False), strict=True)
+        track(str(origin), rows, frames, WIDTHS[space], gaps=gaps)
+        for (origin, rows), gaps in zip(faces, (True, False), strict=True)
     )
-    return dyad(name, speaker, listener, space, fps, **voices_of(voices, frames, fps))
-
-
-def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floats | None]:
-    """`audio` of the speaker and `own` of the listener from their files, as `dyad` takes them; the second may lack."""
-    if not voices:
-        return {}
-    own = sound(voices[1], frames, fps) if voices[1].is_file() else None
-    return {"audio": sound(voices[0], frames, fps), "own": own}
+    audio = sound(voices[0], frames, fps) if voices else None
+    said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
+    listening = np.ones(frames, bool)
+    if audio is not None and said is not None:
+        listening = np.asarray(listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps)), bool)
+    return Dyad(
+        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
+        agent_audio=said if own else None,
+    )  # fmt: skip
 
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
@@ -247,16 +251,3 @@ def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
 def pose_last(values: NDArray[Any], pose_first: bool) -> NDArray[Any]:
     """Channels with the six pose ones last, from files in which they stand first or already do."""
     return np.concatenate([values[..., 6:], values[..., :6]], axis=-1) if pose_first else values
-
-
-def collect(
-    names: Sequence[tuple[int, str]], build: Callable[[int, str], Any]
-) -> tuple[tuple[Any, ...], tuple[Problem, ...]]:
-    """`build` for every (row, name): what came out, and the problems of those that failed."""
-    built, problems = [], []
-    for row, name in names:
-        try:
-            built.append(build(row, name))
-        except ClipError as error:
-            problems.append(error.problem)
-    return tuple(built), tuple(problems)

@@ -17,7 +17,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, SPACE_CHANNELS, Doubles
-from sfms_robot.lab.corpora.learning2listen import l2l_mean_std
+from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.intervals import Chosen, jackknife
 

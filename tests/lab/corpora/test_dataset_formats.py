@@ -17,8 +17,8 @@ from sfms_robot.lab.corpora import clips, formats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
 from sfms_robot.lab.corpora.collection import ClipError
 from sfms_robot.lab.corpora.external import l2l, react
+from sfms_robot.lab.corpora.external.l2l import l2l_bilateral
 from sfms_robot.lab.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
-from sfms_robot.lab.corpora.learning2listen import l2l_bilateral
 from sfms_robot.lab.learning.sfms.features import gather
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.space import MotionSpace

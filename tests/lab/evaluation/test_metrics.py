@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from sfms_robot.lab.corpora.learning2listen import l2l_bilateral, l2l_mean_std
+from sfms_robot.lab.corpora.external.l2l import l2l_bilateral, l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 
 RNG = np.random.default_rng(3)
