@@ -44,7 +44,7 @@ BENCHES: Final[Mapping[str, Bench]] = {
         "startup_bench:startup", "a command typed to its end, `run` to its first goal, beside a bare Python",
         takes=("against",),
     ),
-    "bus": Bench("bus_bench:bus", "write and read of a head, of each family, beside the vendor's own calls"),
+    "bus": Bench("bus_bench:bus", "write and read of a head, one servo silent, beside the vendor's own calls"),
     "retarget": Bench(
         "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size"
     ),
@@ -68,16 +68,12 @@ BENCHES: Final[Mapping[str, Bench]] = {
         in_all=False, takes=("minutes", "audio", "torture", "say"),
     ),
     "view": Bench(
-        "view_bench:measure", "a page with three who look, beside the same run without; a halt from click to wire",
+        "view_bench:measure", "a page that three clients read, beside the share allowed; a halt from click to wire",
         in_all=False, takes=("say",),
     ),
     "throttle": Bench(
         "throttle_bench:measure", "a run on a quarter of one core, beside the same on all of this machine; exit code 1 "
         "where a command leaves its limits or the states are not those of docs/safety.md", takes=("say",),
-    ),
-    "train": Bench(
-        "train_bench:measure", "a step of each stage of training, beside plain products of as many operations",
-        takes=("say",),
     ),
     "serve": Bench(
         "serve_bench:measure", "heads that one server answers in time, beside one head at a time", in_all=False,

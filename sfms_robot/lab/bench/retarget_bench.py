@@ -9,26 +9,18 @@ import numpy as np
 from sfms_robot.app.head.head_check import named_faces
 from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_firmware_map, load_head
-from sfms_robot.frames import FRAME_S, MOTION_DIM, Doubles, Floats, Plan
+from sfms_robot.frames import FRAME_S, MOTION_DIM, Floats, Plan
 from sfms_robot.lab.bench.measure import HEAD, Row, row, times
 from sfms_robot.motion.calibration import Calibration
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.stewart import Stewart
 from sfms_robot.runtime.loop import difference
 
 _RATE_HZ = 100.0
 _TICKS = 2000
 _HORIZON, _HOP = 8, 4
-_STEWART_HEAD = "reachy_mini"
 
 
 def retarget() -> dict[str, Row]:
-    """Return rows of CPU time."""
-    return {**_tick(), "retarget.stewart": _stewart()}
-
-
-def _tick() -> dict[str, Row]:
-    """Measure `retarget.tick` = mapping + limits + calibration, each of these, and the timeline before them."""
+    """Return rows of CPU time: `retarget.tick` = mapping + limits + calibration, each of these, and the timeline."""
     head = load_head(HEAD)
     motion = build_motion(head, _RATE_HZ)
     turns = [load_firmware_map(joint.model).ticks_per_revolution for joint in head.joints.values()]
@@ -75,15 +67,3 @@ def _recorded_plans() -> list[Plan]:
         Plan(k * FRAME_S, FRAME_S * np.arange(k + 1.0, k + _HORIZON + 1), faces[k : k + _HORIZON])
         for k in range(0, need - _HORIZON, _HOP)
     ]
-
-
-def _stewart() -> Row:
-    """Measure the closed-form inverse of six legs beside one product of six rows of three."""
-    neck = HeadRetargeter(load_head(_STEWART_HEAD)).neck
-    if not isinstance(neck, Stewart):
-        raise TypeError(f"{_STEWART_HEAD}: expected a Stewart platform as neck, got {type(neck).__name__}")
-    pose: Doubles = np.array([0.05, 0.1, 0.02, 0.003, 0.002, 0.001])
-    rows, way = np.random.default_rng(0).normal(size=(6, 3)), np.array([0.1, 0.2, 0.3])
-    calls = (lambda: neck.geometry.inverse(pose), lambda: rows @ way)
-    ours, peers = (times(call, _TICKS, time.thread_time) for call in calls)
-    return row(ours, peers, "ms", "6 x 3 matrix product")

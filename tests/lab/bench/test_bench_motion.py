@@ -45,6 +45,6 @@ def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late
 
 def test_a_tick_is_measured_part_by_part_beside_a_matrix_product():
     rows = retarget()
-    parts = {f"retarget.{part}" for part in ("tick", "timeline", "mapping", "limits", "calibration", "stewart")}
+    parts = {f"retarget.{part}" for part in ("tick", "timeline", "mapping", "limits", "calibration")}
     assert set(rows) == parts
     assert all(row["median"] > 0 and row["ratio"] > 0 and row["unit"] == "ms" for row in rows.values())
