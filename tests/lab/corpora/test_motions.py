@@ -1,11 +1,11 @@
 """Cutting motion primitives: a swing is cut whole, a resting face is zero, and saved pieces are loaded."""
 
 import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
 from sfms_robot.lab.corpora.clips import read_takes
@@ -17,7 +17,7 @@ from sfms_robot.signals.motion_primitives import KINDS, read_motions
 from sfms_robot.signals.tracks import Take
 
 TAKE = {"train": "yes1", "validation": "apfel", "test": "facial"}
-cut = runpy.run_path(str(data_dir("sim") / "listeners" / "cut_recordings.py"))
+cut = runpy.run_path(str(Path(__file__).parents[3] / "scripts" / "cut_recordings.py"))
 
 
 def test_every_swing_of_a_nodding_head_is_cut_and_normalised():

@@ -1,6 +1,6 @@
 """Cut `motions.npz` and `takes.npz` from a folder of the recordings that SOURCE.md lists.
 
-    python sim/listeners/cut_recordings.py RECORDINGS
+    python scripts/cut_recordings.py RECORDINGS
 
 Primitives are neutral-calibrated and brought to 25 fps. Nothing is done to whole takes but resampling: resting faces
 differ from person to person, and a tokenizer has to cope. Whole recordings are kept apart for validation and test.
