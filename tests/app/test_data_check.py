@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.corpora.audio_features import MFCC78
 from sfms_robot.lab.corpora.data_commands import check_data
-from sfms_robot.lab.corpora.formats import open_dataset, with_feature
 
 
 def problems(report, split="train"):
@@ -140,17 +138,6 @@ def test_set_of_which_nothing_can_be_used_ends_with_2(tmp_path, command_line):
 def test_no_data_set_is_one_line_and_2(tmp_path, command_line):
     ended = command_line("data", "check", tmp_path, "--json")
     assert ended.code == 2 and ended.complaint
-
-
-def test_computed_features_come_from_the_voice_and_the_cache(tmp_path):
-    write.dualtalk(tmp_path / "set", split="test")
-    dataset = with_feature(open_dataset(tmp_path / "set", "test"), MFCC78, tmp_path / "cache")
-    rows = dataset[0].features["mfcc"]
-    np.testing.assert_array_equal(rows, MFCC78.compute(dataset[0].audio))
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-    write.l2l(tmp_path / "l2l")
-    with pytest.raises(ConfigError, match="mfcc has 25 frames a second, l2l 30"):
-        with_feature(open_dataset(tmp_path / "l2l", "test"), MFCC78, tmp_path / "cache")
 
 
 @pytest.mark.parametrize("seed", range(4))

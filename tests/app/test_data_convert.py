@@ -193,4 +193,4 @@ def test_a_source_that_is_no_text_is_named(tmp_path, command_line):
     convert_data(write.dualtalk(tmp_path / "in"), tmp_path / "out")
     (tmp_path / "out" / "source.yaml").write_text("licence: [1]\n")
     report = command_line("data", "check", tmp_path / "out", "--json").told
-    assert "source.yaml: licence = [1] is no text" in report["splits"][0]["problems"][0]["first"]
+    assert "source.yaml: licence = [1] is not text" in report["splits"][0]["problems"][0]["first"]

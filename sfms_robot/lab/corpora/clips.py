@@ -22,10 +22,9 @@ from sfms_robot.signals.tracks import Take
 
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
-# Numbers per frame of every space data comes in: those a listener may work in, and three that it may not.
+# Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
 WIDTHS: Final[Mapping[str, int]] = {
     **{name: len(channels) for name, channels in SPACE_CHANNELS.items()},
-    "faceverse58-centred": 58,  # less a mean face: how far from it, not where
     "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
     "seamless27": len(SEAMLESS_CHANNELS),
 }
@@ -39,6 +38,13 @@ _EVENT: Final = np.dtype(
     [(name, "f8") for name in ("start_s", "duration_s", "size")]
     + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
 )
+# Arrays that a dyad may lack: their type on disk, and as they are read.
+_OPTIONAL: Final[Mapping[str, tuple[type, type]]] = {
+    "states": (np.int8, np.int8),
+    "mel": (np.float32, np.float32),
+    "head_of_gaze_rad": (np.float16, np.float32),
+    "attention": (np.float16, np.float32),
+}
 _Number = TypeVar("_Number", bound=np.generic)
 
 
@@ -108,7 +114,7 @@ class Dyad:
                 raise ValueError(f"{self.name}: {key} must be finite")
 
     def mel_rows(self) -> Floats | None:
-        """(4N, 128) natural log of mel power: `mel`, or made from `audio`; None where there is no sound.
+        """Return the natural log of mel power (4N, 128): `mel`, or made from `audio`; None without sound.
 
         At other rates than 25 each row is the newest of the 100 a second that is complete by its time.
         """
@@ -120,7 +126,7 @@ class Dyad:
 
 
 def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: float) -> NDArray[_Number]:
-    """Rows (M, ...) at one rate -> (wanted, ...) at another: of each time the newest that is complete by then.
+    """Resample rows (M, ...) to (wanted, ...): for each time the newest row that is complete by then.
 
     Nothing is complete by the first few times where they come sooner than the first row: that one stands there.
     """
@@ -132,12 +138,12 @@ def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: floa
 
 
 def samples_of(frames: int, fps: float) -> int:
-    """Samples at 16 kHz in that many frames: 640 each at 25 fps."""
+    """Return the samples at 16 kHz in that many frames: 640 each at 25 fps."""
     return round(frames * AUDIO_HZ / fps)
 
 
 def save(folder: Path, dyads: Sequence[Dyad]) -> None:
-    """One NAME.npz per dyad: audio as int16, motion of ours as float16 (3 decimals are more than a servo shows).
+    """Write one NAME.npz per dyad: audio as int16, arkit58 motion as float16 (3 decimals are more than a servo shows).
 
     Motion in other spaces stays float32: angles near pi would lose what a nod is made of.
     """
@@ -152,14 +158,9 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
         for key, voice in (("audio", dyad.audio), ("agent_audio", dyad.agent_audio)):
             if voice is not None:
                 arrays[key] = np.round(voice * 32767).astype(np.int16)
-        if dyad.states is not None:
-            arrays["states"] = dyad.states
-        if dyad.mel is not None:
-            arrays["mel"] = dyad.mel
-        if dyad.head_of_gaze_rad is not None:
-            arrays["head_of_gaze_rad"] = dyad.head_of_gaze_rad.astype(np.float16)
-        if dyad.attention is not None:
-            arrays["attention"] = dyad.attention.astype(np.float16)
+        for key, (filed, _) in _OPTIONAL.items():
+            if (values := getattr(dyad, key)) is not None:
+                arrays[key] = values.astype(filed)
         if dyad.events is not None:
             arrays["events"] = _event_rows(dyad.events)
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
@@ -169,7 +170,7 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
 
 
 def load(folder: Path) -> list[Dyad]:
-    """Every dyad in a folder, by name. Raises ConfigError when there is none or one is broken."""
+    """Return every dyad in a folder, by name. Raises ConfigError when there is none or one is broken."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise ConfigError(f"{folder}: no dyads (*.npz) here; `sfms-robot data compose` makes them")
@@ -177,9 +178,12 @@ def load(folder: Path) -> list[Dyad]:
 
 
 def read(file: Path) -> Dyad:
-    """One dyad as `save` wrote it. Raises ConfigError."""
+    """Return one dyad as `save` wrote it. Raises ConfigError."""
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            optional: dict[str, Any] = {
+                key: arrays[key].astype(read) for key, (_, read) in _OPTIONAL.items() if key in arrays
+            }
             return Dyad(
                 name=file.stem,
                 audio=_voice(arrays, "audio"),
@@ -188,15 +192,10 @@ def read(file: Path) -> Dyad:
                 listening=arrays["listening"].astype(bool),
                 space=str(arrays["space"]) if "space" in arrays else "arkit58",
                 fps=float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
-                mel=arrays["mel"].astype(np.float32) if "mel" in arrays else None,
                 features={key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
                 agent_audio=_voice(arrays, "agent_audio"),
-                states=arrays["states"].astype(np.int8) if "states" in arrays else None,
                 events=_events(arrays["events"]) if "events" in arrays else None,
-                head_of_gaze_rad=arrays["head_of_gaze_rad"].astype(np.float32)
-                if "head_of_gaze_rad" in arrays
-                else None,
-                attention=arrays["attention"].astype(np.float32) if "attention" in arrays else None,
+                **optional,
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error

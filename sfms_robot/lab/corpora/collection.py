@@ -115,7 +115,7 @@ class Dataset(Sequence[Dyad]):
     def __getitem__(self, index: slice) -> Dataset: ...
 
     def __getitem__(self, index: int | slice) -> Dyad | Dataset:
-        """One dyad, read now, or a part of the set. Raises ClipError for a clip that cannot be used."""
+        """Return one dyad, read now, or a part of the set. Raises ClipError for a clip that cannot be used."""
         if isinstance(index, slice):
             return replace(self, clips=self.clips[index])
         clip = self.clips[index]
@@ -135,28 +135,8 @@ class Dataset(Sequence[Dyad]):
 
         return replace(self, space=space or self.space, clips=tuple(changed(clip) for clip in self.clips))
 
-    def checked(self, least_frames: int = 0, each: Callable[[Dyad | None], None] | None = None) -> Dataset:
-        """The clips that can be used, every one of them read once; the others join the problems.
-
-        `each` is given every dyad, or None for a clip that cannot be used.
-        """
-        kept, problems = [], list(self.problems)
-        for index, clip in enumerate(self.clips):
-            dyad = None
-            try:
-                if clip.frames < (least := max(1, least_frames)):
-                    detail = f"{clip.frames} frames, a window needs {least}"
-                    raise ClipError.of("too short", clip.name, detail)
-                dyad = self[index]
-                kept.append(clip)
-            except ClipError as error:
-                problems.append(error.problem)
-            if each is not None:
-                each(dyad)
-        return replace(self, clips=tuple(kept), problems=tuple(problems))
-
     def summary(self) -> str:
-        """One line: what is there, and how much was left out."""
+        """Return one line: clips and minutes, and the number that was left out."""
         left_out = Counter(problem.kind for problem in self.problems)
         said = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
         return f"{self.layout} {self.split}: {len(self)} clips, {self.minutes:.1f} min" + (
@@ -165,7 +145,7 @@ class Dataset(Sequence[Dyad]):
 
 
 def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
-    """Every dyad that can be read; the others are counted and named in one warning when all are through."""
+    """Yield every dyad that can be read; the others are counted and named in one warning at the end."""
     left_out = []
     for index in range(len(dyads)):
         try:
@@ -213,7 +193,6 @@ class Layout:
         below: Folders in which the data may lie, relative to the given one.
         order: Order of the channels in the files as they are shipped; None: there is only one.
         held_out: Share of train that serves as validation where the layout ships none.
-        features: Names of the arrays it ships beside motion and sound.
         facts: (root, their name of a split) -> space, fps or licence where these differ from folder to folder.
     """
 
@@ -226,7 +205,6 @@ class Layout:
     below: tuple[str, ...] = ("", "data")
     order: Order | None = None
     held_out: float = 0.0
-    features: tuple[str, ...] = ()
     licence: str | None = None
     facts: Callable[[Path, str], Mapping[str, Any]] = lambda place, split: {}
 

@@ -49,7 +49,7 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def _module(name: str) -> Any:
-    """numpy 1's modules under the names of the numpy at hand."""
+    """Import one of numpy 1's modules by the name that it has in the installed numpy."""
     return importlib.import_module(name.replace("numpy.core", "numpy._core") if _NUMPY_2 else name)
 
 
@@ -57,7 +57,7 @@ _NUMPY_2: Final = int(np.__version__.split(".")[0]) >= 2
 
 
 def unpickle(file: Path) -> Any:
-    """A pickle of arrays and plain values. Raises UnpicklingError for one that asks for anything else, or is broken."""
+    """Return arrays and plain values of a pickle. Raises UnpicklingError for one that asks for more, or is broken."""
     content = io.BytesIO(file.read_bytes())
     try:
         return _ArraysOnly(content).load()
@@ -97,7 +97,7 @@ def _has(module: str, name: str) -> bool:
 
 
 def npy(file: Path) -> NDArray[Any]:
-    """An array on disk, mapped rather than read. Raises ClipError."""
+    """Map an array on disk into memory. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing half", file, "no such file")
     try:
@@ -138,7 +138,7 @@ def npz(file: Path, *keys: str) -> list[NDArray[Any]]:
 
 
 def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of a .npz, from their headers. Raises ClipError."""
+    """Read the shapes of the arrays of a .npz from their headers. Raises ClipError."""
     shapes = {}
     try:
         with zipfile.ZipFile(file) as archive:
@@ -157,7 +157,7 @@ def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 
 def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) -> int:
-    """Frames that tracks of these shapes share; singleton axes do not count. Raises ClipError if lengths differ."""
+    """Return the frames that tracks of these shapes share; singleton axes do not count. Raises ClipError."""
     lengths = [next((size for size in shape[:-1] if size != 1), 1) for shape in tracks]
     if max(lengths) - min(lengths) > slack:
         raise ClipError.of("lengths differ", name, f"{max(lengths)} frames beside {min(lengths)}")
@@ -165,7 +165,7 @@ def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) ->
 
 
 def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: bool = False) -> Floats:
-    """The first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
+    """Return the first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
 
     Raises ClipError for other shapes, and for values that are not finite unless `gaps` are allowed.
     """
@@ -181,7 +181,7 @@ def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: boo
 
 
 def sound(file: Path, frames: int, fps: float) -> Floats:
-    """A voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
+    """Return a voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing sound", file, "no such file")
     audio, wanted = read_audio(file), samples_of(frames, fps)
@@ -240,7 +240,7 @@ def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
 
 
 def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
-    """An array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
+    """Return an array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
     found = values[key]
     array = np.asarray(found.numpy() if hasattr(found, "numpy") else found)
     if array.dtype.kind not in "fiu":
@@ -249,5 +249,5 @@ def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
 
 
 def pose_last(values: NDArray[Any], pose_first: bool) -> NDArray[Any]:
-    """Channels with the six pose ones last, from files in which they stand first or already do."""
+    """Return channels with the six of the pose last, from files in which they stand first or already do."""
     return np.concatenate([values[..., 6:], values[..., :6]], axis=-1) if pose_first else values

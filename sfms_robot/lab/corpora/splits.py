@@ -32,22 +32,22 @@ _Item = TypeVar("_Item")
 
 
 def series(meeting: str) -> str:
-    """Meetings of one series share their people: "IS1008c" -> "IS1008"."""
+    """Return the series of a meeting, whose meetings share their people: "IS1008c" -> "IS1008"."""
     return meeting.rstrip("abcdefgh")
 
 
 def split_of(meeting: str) -> Split:
-    """The part that a meeting belongs to; meetings of other series are for training."""
+    """Return the split of a meeting; meetings of other series are for training."""
     return next((split for split in SPLITS if series(meeting) in SERIES[split]), "train")
 
 
 def split_of_voice(name: str) -> Split:
-    """The part that a recorded voice belongs to."""
+    """Return the split of a recorded voice."""
     return next((split for split in SPLITS if name.startswith(VOICES[split])), "train")
 
 
 def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
-    """Items in their order, by part; every part is there."""
+    """Return items in their order, by split; every split is there."""
     parts: dict[Split, list[_Item]] = {split: [] for split in SPLITS}
     for split, item in items:
         parts[split].append(item)

@@ -97,14 +97,21 @@ def tables(tmp_path_factory):
     return folder
 
 
+def compose(ami_folder, voices, seed, minutes):
+    parts = {split: [] for split in SPLITS}
+    for split, dyad in composed.dyads(composed.read_material(ami_folder, voices, MOTIONS), seed, minutes):
+        parts[split].append(dyad)
+    return parts
+
+
 @pytest.fixture(scope="module")
 def made(tables):
-    return composed.compose(tables, VOICES, MOTIONS, seed=3, minutes=3)
+    return compose(tables, VOICES, seed=3, minutes=3)
 
 
 def test_one_seed_composes_the_same_dyads_and_another_one_others(tables, made):
-    again = composed.compose(tables, VOICES, MOTIONS, seed=3, minutes=3)
-    other = composed.compose(tables, VOICES, MOTIONS, seed=4, minutes=3)
+    again = compose(tables, VOICES, seed=3, minutes=3)
+    other = compose(tables, VOICES, seed=4, minutes=3)
     assert [d.name for d in again["train"]] == [d.name for d in made["train"]]
     for one, two in zip(again["train"], made["train"], strict=True):
         np.testing.assert_array_equal(one.listener, two.listener)
@@ -477,12 +484,12 @@ def test_a_missing_column_is_named(tmp_path, tables):
 
 def test_minutes_below_zero_are_refused(tables):
     with pytest.raises(ConfigError, match="--minutes -1: must be above 0"):
-        composed.compose(tables, VOICES, MOTIONS, seed=1, minutes=-1)
+        compose(tables, VOICES, seed=1, minutes=-1)
 
 
 def test_a_folder_without_voices_is_refused(tables, tmp_path):
     with pytest.raises(ConfigError, match="no WAV or FLAC file to take voices from"):
-        composed.compose(tables, [tmp_path], MOTIONS, seed=1, minutes=1)
+        compose(tables, [tmp_path], seed=1, minutes=1)
 
 
 def test_a_broken_motion_file_is_named(tmp_path):

@@ -216,15 +216,6 @@ def test_whoever_trains_on_them_is_told_the_licence(tmp_path, caplog):
     assert "CC BY-NC 4.0" in caplog.text
 
 
-def test_speech_that_begins_or_ends_with_the_interaction_is_counted(tmp_path):
-    write.seamless(tmp_path, 2)
-    file = file_of(tmp_path, ONE, ".json")
-    told = json.loads(file.read_text())
-    told["metadata:vad"][0]["start"] = 0.0
-    file.write_text(json.dumps(told))
-    assert "0 of 2 interactions contradict themselves, 1 begin or end inside speech" in scanned(tmp_path).notes[2]
-
-
 # --- bad input --------------------------------------------------------------------------------------------------
 
 

@@ -17,21 +17,21 @@ SMILE: Final = [SHAPE[name] for name in SMILE_CORNERS]
 
 
 def slow(pose: Floats, cut_hz: float = 0.8) -> Floats:
-    """The part of a head's motion below `cut_hz`, mean 0."""
+    """Return the part of a head's motion below `cut_hz`, mean 0."""
     sos = signal.butter(2, cut_hz, fs=FRAME_HZ, output="sos")
     low = signal.sosfiltfilt(sos, pose - pose.mean(0), axis=0)
     return np.asarray(low - low.mean(0), np.float32)
 
 
 def edges(length: int, ramp: int) -> Floats:
-    """1 in the middle, raised-cosine to 0 at both ends."""
+    """Return a window that is 1 in the middle and falls to 0 as a raised cosine at both ends."""
     ramp = min(ramp, length // 2)
     up = 0.5 - 0.5 * np.cos(np.pi * np.arange(ramp) / max(ramp, 1))
     return np.concatenate([up, np.ones(length - 2 * ramp), up[::-1]]).astype(np.float32)
 
 
 def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade: int = FADE) -> Floats:
-    """Random pieces (K, C) one after the other, each crossfaded over `fade` frames, cut to (frames, C)."""
+    """Join random pieces (K, C), each crossfaded over `fade` frames; return (frames, C)."""
     usable = [piece for piece in pieces if len(piece) > 2 * fade] or [max(pieces, key=len)]
     fade = min(fade, min(len(piece) for piece in usable) // 2)
     total = frames + 2 * fade
@@ -47,7 +47,7 @@ def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade:
 
 
 def stretched(curve: Floats, frames: int) -> Floats:
-    """A curve (K,) or (K, C) played over `frames` frames."""
+    """Return a curve (K,) or (K, C) played over `frames` frames."""
     at = np.linspace(0, len(curve) - 1, max(2, frames))
     if curve.ndim == 1:
         return np.interp(at, np.arange(len(curve)), curve).astype(np.float32)
@@ -57,7 +57,7 @@ def stretched(curve: Floats, frames: int) -> Floats:
 
 
 def held(curve: Floats, frames: int) -> Floats:
-    """A rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
+    """Return a rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
 
     Longer ones rest at their height, as long smiles do; shorter ones are played faster, to 0.6 of their length at most.
     """
@@ -71,12 +71,12 @@ def held(curve: Floats, frames: int) -> Floats:
 
 
 def first_frame(start_s: float) -> int:
-    """The frame that something begins with."""
+    """Return the frame that begins at or nearest to a time."""
     return int(round(start_s * FRAME_HZ))
 
 
 def placed(curve: Floats, start_s: float, frames: int) -> Floats:
-    """Zeros (frames,) or (frames, C) with the curve from `start_s` on."""
+    """Return zeros (frames,) or (frames, C) with the curve from `start_s` on."""
     out = np.zeros((frames, *curve.shape[1:]), np.float32)
     first = first_frame(start_s)
     low, high = max(0, first), min(frames, first + len(curve))
@@ -86,7 +86,7 @@ def placed(curve: Floats, start_s: float, frames: int) -> Floats:
 
 
 def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> ListenerEvent:
-    """Of a curve that was laid with `placed`."""
+    """Return the event of a curve that was laid with `placed`."""
     return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
@@ -95,5 +95,5 @@ def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
 
 
 def over(below: Floats, above: Floats) -> Floats:
-    """Two activations of the same muscles: sums while small, saturates at 1, smooth."""
+    """Combine two activations of the same muscles: their sum while small, saturating at 1, smooth."""
     return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)

@@ -63,7 +63,7 @@ class VoiceClip:
 
 
 def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
-    """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
+    """Read every WAV and FLAC file in the folders, or one level below. Raises ConfigError when there is none."""
     files = [file for folder in folders for file in sorted([*folder.glob("*"), *folder.glob("*/*")])]
     voices = [read_voice(file) for file in files if file.suffix in _SOUNDS and not file.stem.startswith(_UNFIT)]
     if not voices:
@@ -72,7 +72,7 @@ def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
 
 
 def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
-    """Whole recordings by part (`splits.VOICES`); a part that has none uses all there are."""
+    """Return whole recordings by split (`splits.VOICES`); a split without any gets all of them."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
 
@@ -167,7 +167,7 @@ def _levelled(speech: Floats) -> Floats:
 
 
 def _lulls(speech: Floats) -> NDArray[np.bool_]:
-    """Grains (n // 320,) inside pauses that only show once loudness is levelled; 40 ms of each end of one stay."""
+    """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
     out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
         out[start : start + 2] = out[max(start, end - 2) : end] = False
@@ -204,7 +204,7 @@ FACEGOOD: Final = {
 
 
 def facegood_mouth(file: Path) -> Floats:
-    """Mouth weights of a FACEGOOD take -> (N, 52) at 25 fps. Raises ConfigError."""
+    """Return mouth weights of a FACEGOOD take as (N, 52) at 25 fps. Raises ConfigError."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             weights, names, fps = arrays["weights"], arrays["names"], float(arrays["fps"])
@@ -227,7 +227,7 @@ def _channels_of(control: str) -> list[tuple[str, float]]:
 
 
 def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
-    """Linear onto the 25 fps grid from times_s[0] on, (N, C)."""
+    """Interpolate values (M, C) to 25 fps from times_s[0] on; return (N, C)."""
     grid = np.arange(times_s[0], times_s[-1], 1 / FRAME_HZ)
     return np.stack([np.interp(grid, times_s, column) for column in values.T], axis=1).astype(np.float32)
 
@@ -267,13 +267,13 @@ def lay(
 
 
 def _soften(mouth: Floats) -> Floats:
-    """Short binomial smoothing: takes the edges off the joints, keeps syllables."""
+    """Smooth shortly (binomial): joints lose their edges, syllables stay."""
     padded = np.pad(mouth, ((1, 1), (0, 0)), mode="edge")
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
 def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
-    """Noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, slowly breathing."""
+    """Return a noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, that drifts."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
     kernel = np.roll(kernel, len(kernel) // 2) * np.hanning(len(kernel)).astype(np.float32)
@@ -285,7 +285,7 @@ def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
 
 
 def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
-    """Speech as a room of 0.12 to 0.4 s reverberation gives it back, 6 to 16 dB below the direct sound."""
+    """Return speech in a room of 0.12 to 0.4 s reverberation, 6 to 16 dB below the direct sound."""
     length_s = rng.uniform(0.12, 0.4)
     times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
     tail = rng.standard_normal(len(times)) * 10 ** (-3 * times / length_s)
@@ -294,7 +294,7 @@ def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
 
 
 def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
-    """A mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
+    """Return a mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """

@@ -16,7 +16,6 @@ parts: the motion of one split is held in memory, its shape, detail and words ar
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -36,8 +35,6 @@ WIDTH: Final = 56
 UNUSED: Final = "devi2"  # there, and never used by the reference
 HOST_IS_P1: Final = ("fallon",)
 STD_EPS: Final = 1e-10
-BILATERAL_RADIUS: Final = 2  # cv2's d = 5
-BILATERAL_SIGMA: Final = 20.0  # both of value and of place
 
 
 def _is_subject(folder: Path) -> bool:
@@ -111,12 +108,6 @@ def _log_mel(sound: Path, index: int, frames: int, decibels: bool) -> Floats:
     return rows * np.float32(LN_PER_DB) if decibels else np.log(np.maximum(rows, 0) + np.float32(FLOOR))
 
 
-def smoothed(clip: Dyad) -> Dyad:
-    """Return a dyad with faces smoothed as L2L does before anything else, its truth included. For `Dataset.map`."""
-    speaker, listener = (np.asarray(l2l_bilateral(faces), np.float32) for faces in (clip.speaker, clip.listener))
-    return replace(clip, speaker=speaker, listener=listener)
-
-
 def l2l_mean_std(x: ArrayLike) -> tuple[Doubles, Doubles]:
     """Return mean and "std" (1, 1, D) of clips (N, T, D) with which L2L standardises.
 
@@ -129,28 +120,6 @@ def l2l_mean_std(x: ArrayLike) -> tuple[Doubles, Doubles]:
     mean: Doubles = clips.mean(axis=1).mean(axis=0)[None, None]
     std: Doubles = clips.std(axis=1).std(axis=0)[None, None] + STD_EPS
     return mean, std
-
-
-def l2l_bilateral(x: ArrayLike) -> Doubles:
-    """Smooth clips (..., T, D) over time as L2L does before anything else: cv2's bilateral filter, d 5, sigmas 20.
-
-    A channel is an image of width 1 with reflected borders (... 2 1 | 0 1 2 ...), so the circular neighbourhood holds
-    the frame itself five times, the next ones three times and the second next once.
-    """
-    clips = np.asarray(x, dtype=np.float64)
-    frames = clips.shape[-2]
-    place = np.pad(np.arange(frames), BILATERAL_RADIUS, mode="reflect" if frames > 1 else "edge")
-    total, weights = np.zeros_like(clips), np.zeros_like(clips)
-    offsets = range(-BILATERAL_RADIUS, BILATERAL_RADIUS + 1)
-    for step in offsets:
-        neighbour = clips[..., place[BILATERAL_RADIUS + step :][:frames], :]
-        near = np.exp(-((neighbour - clips) ** 2) / (2 * BILATERAL_SIGMA**2))
-        for distance2 in (step**2 + across**2 for across in offsets):
-            if distance2 <= BILATERAL_RADIUS**2:
-                weight = near * np.exp(-distance2 / (2 * BILATERAL_SIGMA**2))
-                total += weight * neighbour
-                weights += weight
-    return np.asarray(total / weights)
 
 
 LAYOUT: Final = Layout(
@@ -219,5 +188,5 @@ def _face(name: str, segment: Mapping[str, Any], person: str) -> Floats:
 
 LM_LISTENER_LAYOUT: Final = Layout(
     name="lm_listener", about="lm-listener: {subject}/segments_{train,val,test}.pth", space=SPACE, fps=FPS,
-    splits=lm_splits, scan=lm_scan, below=("", "dataset"), features=("hubert",),
+    splits=lm_splits, scan=lm_scan, below=("", "dataset"),
 )  # fmt: skip

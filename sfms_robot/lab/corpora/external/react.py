@@ -11,14 +11,12 @@ people of a dyad under one name. Roles are given, so pairs are read one way. All
 appropriate.
 
 Deviation: the references subtract a mean face or standardise on loading. Here motion stays as the files hold it, which
-is what the retargeting of `faceverse58` reads; `faceverse58-centred` is the reference's (`centred`), and never drives a
-head.
+is what the retargeting of `faceverse58` reads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -27,7 +25,7 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
-from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
+from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
 from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, pose_last, table, track, voices_of
 
@@ -42,7 +40,6 @@ FACES_2025: Final = "coefficients"
 CLEANED: Final = dict.fromkeys(("Expert_video", "P25", "P41", "P45"), "P1") | dict.fromkeys(
     ("Novice_video", "P26", "P42", "P46"), "P2"
 )
-MEAN_FACE: Final = ("mean_face.npy", "external/FaceVerse/mean_face.npy")
 # feature: folder, role, width
 FEATURES_2025: Final[Mapping[str, tuple[str, str, int]]] = {
     "attributes": ("facial-attributes", "listener", 25),
@@ -140,29 +137,11 @@ def _feature(file: Path, frames: int, width: int) -> Floats:
     return np.pad(track(str(file), values, had, width), ((0, frames - had), (0, 0)), mode="edge")
 
 
-def mean_face(place: Path) -> Floats:
-    """Return (58,), the face that the reference subtracts, where the user has put it. Raises ConfigError."""
-    tried = [base / name for base in (place, place.parent) for name in MEAN_FACE]
-    file = next((file for file in tried if file.is_file()), None)
-    if file is None:
-        raise ConfigError(f"{place}: faceverse58-centred needs {MEAN_FACE[0]} or {MEAN_FACE[1]} there or above")
-    mean = np.asarray(npy(file), np.float32).reshape(-1)
-    if mean.shape != (WIDTHS[SPACE],) or not np.isfinite(mean).all():
-        raise ConfigError(f"{file}: a mean face is ({WIDTHS[SPACE]},) and finite, this is {mean.shape}")
-    return mean
-
-
-def centred(mean: Floats, clip: Dyad) -> Dyad:
-    """Return a dyad less the mean face."""
-    return replace(clip, speaker=clip.speaker - mean, listener=clip.listener - mean, space="faceverse58-centred")
-
-
 LAYOUT: Final = Layout(
     name="react", about="REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", space=SPACE, fps=FPS,
-    order="exp-first", splits=partial(splits, FACES), scan=scan, features=("attributes", "speaker_attributes"),
+    order="exp-first", splits=partial(splits, FACES), scan=scan,
 )  # fmt: skip
 LAYOUT_2025: Final = Layout(
     name="react2025", about="REACT 2025/26: {train,val,test}/coefficients/{speaker,listener}/session{n}/NAME.npy",
     space=SPACE, fps=FPS_2025, order="exp-first", splits=partial(splits, FACES_2025), scan=scan_2025,
-    features=tuple(FEATURES_2025),
 )  # fmt: skip

@@ -55,7 +55,6 @@ SLACK_S: Final = 0.5  # by which the ends of sound, face, annotation and partner
 LARGEST_LAG_S: Final = 0.25  # between a voice and what is annotated of it
 _LAGS_S: Final = 2.0  # looked for
 _LAG_GAIN: Final = 0.15  # by which another lag has to agree better
-_CUT_FRAMES: Final = 3  # speech so near to an end of the interaction goes on beyond it
 _ID: Final = re.compile(r"(V\w+_S\w+_I\w+)_P\w+")
 
 
@@ -95,18 +94,12 @@ def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
         try:
             yield from _clips(interaction, [(name, files[name]) for name in names], mirrored, seen)
         except ClipError as error:
-            seen["late"] += error.problem.kind in ("time stamps", "lengths differ")
             yield error.problem
     endings = Counter(ending for one in files.values() for ending in one)
     counted = ", ".join(f"{ending} {endings[ending]}" for ending in (*FILES, ".mp4"))
     share, units = seen["invalid"] / max(1, seen["frames"]), ", ".join(f"AU{unit}" for unit in WITHOUT_SHAPE)
     yield f"{split}: {len(files)} people in {len(interactions)} interactions; files: {counted}"
     yield f"{split}: {share:.1%} of {seen['frames'] / FPS / 60:.1f} minutes of faces are invalid and cut"
-    yield (
-        f"{split}: time stamps (about 10 % are wrong, its authors say): {seen['late']} of {len(interactions)} "
-        f"interactions contradict themselves, {seen['cut']} begin or end inside speech; voices are compared with {VAD} "
-        "when read"
-    )
     yield f"no blendshape shows {units}; no action unit moves {', '.join(WITHOUT_UNIT)}; both sides move alike"
     yield signs
 
@@ -141,11 +134,7 @@ def _clips(
         raise ClipError.of("missing half", interaction, f"{problem}: {', '.join(name for name, _ in people)}")
     one, two = pair = [_person(*each) for each in people]
     frames = frames_of(interaction, *(each.valid[:, None].shape for each in pair), slack=int(SLACK_S * FPS))
-    ends = [each.speaks[part].any() for each in pair for part in (slice(_CUT_FRAMES), slice(-_CUT_FRAMES, None))]
-    seen.update(
-        frames=sum(len(each.valid) for each in pair), invalid=sum(int((~each.valid).sum()) for each in pair),
-        cut=int(any(ends)),
-    )  # fmt: skip
+    seen.update(frames=sum(len(each.valid) for each in pair), invalid=sum(int((~each.valid).sum()) for each in pair))
     for listener, speaker in ((one, two), (two, one)):
         for first, end in stretches(listener.valid[:frames]):
             name = f"{listener.name}_f{first:05d}"

@@ -110,7 +110,7 @@ def _hubert(file: Path, frames: int) -> Floats:
 
 DIM: Final = Layout(
     name="dim", about=f"DIM's ViCo: vico_processed_30fps/<id>.pkl and {LIST}", space="deca56", fps=FPS,
-    order="pose-first", splits=partial(_splits, _listed), scan=dim_scan, held_out=0.1, features=("hubert",),
+    order="pose-first", splits=partial(_splits, _listed), scan=dim_scan, held_out=0.1,
     below=("", "vico_processed_30fps", "data/vico_processed_30fps"),
 )  # fmt: skip
 
@@ -158,5 +158,5 @@ def _mfcc45(file: Path, frames: int) -> Floats:
 
 VICO: Final = Layout(
     name="vico", about="ViCo challenge baseline: features/{audio_feats,video_feats}", space="deep3d73", fps=FPS,
-    splits=partial(_splits, _uuids), scan=vico_scan, held_out=0.1, features=("mfcc45",),
+    splits=partial(_splits, _uuids), scan=vico_scan, held_out=0.1,
 )  # fmt: skip
