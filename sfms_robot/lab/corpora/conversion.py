@@ -186,10 +186,13 @@ def at_frame_rate(dyad: Dyad) -> Dyad:
     def newest(rows: NDArray[Any] | None, a_frame: int = 1) -> Any:
         return None if rows is None else at_rate(rows, a_frame * dyad.fps, a_frame * frames, a_frame * FRAME_HZ)
 
-    voices = {key: getattr(dyad, key) for key in ("audio", "agent_audio")}
+    def cut(voice: Floats | None) -> Floats | None:
+        return None if voice is None else voice[: samples_of(frames, FRAME_HZ)]
+
     return replace(
         dyad,
-        **{key: None if said is None else said[: samples_of(frames, FRAME_HZ)] for key, said in voices.items()},
+        audio=cut(dyad.audio),
+        agent_audio=cut(dyad.agent_audio),
         speaker=_motion(dyad.speaker, dyad.fps, frames),
         listener=_motion(dyad.listener, dyad.fps, frames),
         listening=newest(dyad.listening),

@@ -150,7 +150,7 @@ def compose_folder(
     dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
     ConfigError.
     """
-    sets = {
+    sets: dict[str, tuple[Path, float, Callable[..., Iterator[tuple[Split, Dyad]]]]] = {
         "listening": (out, minutes, dyads),
         "interaction": (out / "interaction", SHARES["interaction"] * minutes, partial(dyads, scene="interaction")),
         "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),

@@ -47,10 +47,8 @@ def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade:
 
 
 def stretched(curve: Floats, frames: int) -> Floats:
-    """Return a curve (K,) or (K, C) played over `frames` frames."""
+    """Return a curve (K, C) played over `frames` frames."""
     at = np.linspace(0, len(curve) - 1, max(2, frames))
-    if curve.ndim == 1:
-        return np.interp(at, np.arange(len(curve)), curve).astype(np.float32)
     low = np.minimum(at.astype(int), len(curve) - 2)
     part = (at - low)[:, None]
     return np.asarray(curve[low] * (1 - part) + curve[low + 1] * part, np.float32)
