@@ -18,12 +18,11 @@ import numpy as np
 from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
-from sfms_robot.lab.corpora.clips import Dyad, read
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, read
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
 from sfms_robot.lab.corpora.reading import npz, npz_shapes, pose_last
-from sfms_robot.lab.corpora.splits import SPLITS
 
 # --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
 

@@ -19,9 +19,9 @@ from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
+from sfms_robot.lab.corpora.clips import Split
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
-from sfms_robot.lab.corpora.splits import Split
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, added_up, asked_and_seen
 from sfms_robot.lab.evaluation.hazard_scores import ReferenceHazard, annotated, decisions, delayed, sensed

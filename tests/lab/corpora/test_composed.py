@@ -9,13 +9,12 @@ import pytest
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, EVENT_KINDS, FRAME_HZ, FRAME_S, POSE, SHAPES
-from sfms_robot.lab.corpora import splits
-from sfms_robot.lab.corpora.clips import load
+from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.corpora.clips import SPLITS, load
 from sfms_robot.lab.corpora.compose import ami, composed
 from sfms_robot.lab.corpora.compose.render_events import Score, act, mirrored, nod_habit, nod_manner
 from sfms_robot.lab.corpora.compose.speaking import Dwell, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import find_voices, lay, read_voice, split_voices
-from sfms_robot.lab.corpora.splits import SPLITS
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions
@@ -264,7 +263,7 @@ def test_a_dwell_is_learned_from_those_who_were_annotated_and_fills_time():
 
 
 def test_no_voice_take_or_series_is_in_two_parts(motions):
-    for named in (splits.SERIES, splits.VOICES):
+    for named in (clips.SERIES, clips.VOICES):
         every = [name for split in SPLITS for name in named[split]]
         assert len(every) == len(set(every)) and all(named[split] for split in SPLITS)
     with np.load(MOTIONS) as arrays:

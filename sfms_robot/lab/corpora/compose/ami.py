@@ -16,8 +16,8 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
+from sfms_robot.lab.corpora.clips import Split, by_split, split_of
 from sfms_robot.lab.corpora.reading import columns
-from sfms_robot.lab.corpora.splits import Split, by_split, split_of
 
 GAP_S: Final = 0.2  # shorter silences are part of a phrase
 NODS: Final = ("concord_signal nod", "concord_signal ")  # form nod, and form left blank
@@ -155,7 +155,7 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPerson]]:
-    """Return people by the split of their meeting (`splits`); people of the training split are left out of the
+    """Return people by the split of their meeting (`clips.SERIES`); people of the training split are left out of the
     others.
     """
     parts = by_split((split_of(person.meeting), person) for person in people)

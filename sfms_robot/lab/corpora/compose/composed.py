@@ -4,7 +4,7 @@ Recorded are: when a listener nods, laughs or says "mm-hm" while others talk, wh
 and when they look at the listener (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
 how speech sounds (`voices`). Their combination is ours: the voice says other words than the meeting did, only its
 phrases begin and end at the same times. Meetings, people, takes and voices kept for validation and test are whole ones
-(`splits`).
+(`clips.SERIES`).
 
 All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
 when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
@@ -34,7 +34,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.clips import Dyad, save
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
@@ -50,7 +50,6 @@ from sfms_robot.lab.corpora.compose.voices import (
     room,
     split_voices,
 )
-from sfms_robot.lab.corpora.splits import SPLITS, Split
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 

@@ -18,9 +18,9 @@ from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.lab.corpora.compose.motions import SHAPE
 from sfms_robot.lab.corpora.reading import columns
-from sfms_robot.lab.corpora.splits import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs
@@ -72,7 +72,7 @@ def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
 
 
 def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
-    """Return whole recordings by split (`splits.VOICES`); a split without any gets all of them."""
+    """Return whole recordings by split (`VOICES`); a split without any gets all of them."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
 
