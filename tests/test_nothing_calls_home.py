@@ -274,7 +274,7 @@ def test_commands_that_learn_and_measure_stay_here(best):
     best.run("train", "tokenizer", *flags, "--tensorboard")
     best.run("train", "listener", *flags, "--no-tensorboard")
     best.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
-    best.run("bench", "retarget", "--frames", "50")
+    best.run("bench", "retarget")
     assert best.strangers() == []
 
 

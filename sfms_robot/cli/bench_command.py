@@ -32,11 +32,8 @@ def bench_names() -> list[str]:
 
 def bench(
     name: str = Argument(ALL, autocompletion=bench_names, help="The bench; all: see below."),
-    head: str | None = Option(None, help="For 'lead', 'memory' and 'retarget --frames': this head."),
-    frames: int | None = Option(None, min=1, help="For 'retarget': count violations over so many wild frames."),
-    minutes: float | None = Option(
-        None, min=0.0, help="For 'fuzz' and 'live': so long; else a million bytes each, 10 min, 30 of torture."
-    ),
+    head: str | None = Option(None, help="For 'lead' and 'memory': this head."),
+    minutes: float | None = Option(None, min=0.0, help="For 'live': so long; else 10 min, 30 with --torture."),
     audio: LiveAudio | None = Option(None, help="For 'live': an emulated microphone (the default), or calls."),
     torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
     against: Path | None = Option(
@@ -44,9 +41,6 @@ def bench(
     ),
     hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
     data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
-    budget: bool = Option(
-        False, "--budget", help="For 'listener': operations and bytes a frame, counted, and what small computers need."
-    ),
     write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
     json: bool = JSON,
 ) -> None:
@@ -58,14 +52,12 @@ def bench(
         checked_file(write, "--write")
     options = {
         "head": head,
-        "frames": frames,
         "minutes": minutes,
         "audio": audio and audio.value,
         "torture": torture or None,
         "against": against,
         "hours": hours,
         "data": data,
-        "budget": budget or None,
     }
     began_s = time.monotonic()
     found = run_bench(

@@ -33,7 +33,7 @@ class TableName(StrEnum):
 
 
 class Part(StrEnum):
-    """Of meetings and voices (`corpora.splits`)."""
+    """Of meetings and voices (`corpora.clips`)."""
 
     train = "train"
     validation = "validation"

@@ -1,7 +1,7 @@
 """Motion primitives: small pieces of recorded motion, as `sim/listeners/motions.npz` holds them.
 
 A *primitive* is one nod cycle, one blink, one smile with everything that moves along, one brow raise, or a stretch of
-idle face or head motion. They are cut from recordings by `lab.corpora.compose.motions`.
+idle face or head motion. They are cut from recordings by `scripts/cut_recordings.py`.
 """
 
 from __future__ import annotations

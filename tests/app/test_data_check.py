@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.corpora.audio_features import MFCC78
 from sfms_robot.lab.corpora.data_commands import check_data
-from sfms_robot.lab.corpora.formats import open_dataset, with_feature
 
 
 def problems(report, split="train"):
@@ -118,17 +116,6 @@ def test_table_names_what_is_left_out_and_the_command_ends_well(tmp_path, comman
     (tmp_path / "empty").mkdir()
     ended = command_line("data", "check", tmp_path / "empty", "--json")
     assert ended.code == 2 and ended.complaint
-
-
-def test_computed_features_come_from_the_voice_and_the_cache(tmp_path):
-    write.dualtalk(tmp_path / "set", split="test")
-    dataset = with_feature(open_dataset(tmp_path / "set", "test"), MFCC78, tmp_path / "cache")
-    rows = dataset[0].features["mfcc"]
-    np.testing.assert_array_equal(rows, MFCC78.compute(dataset[0].audio))
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-    write.l2l(tmp_path / "l2l")
-    with pytest.raises(ConfigError, match="mfcc has 25 frames a second, l2l 30"):
-        with_feature(open_dataset(tmp_path / "l2l", "test"), MFCC78, tmp_path / "cache")
 
 
 @pytest.mark.parametrize("seed", range(4))

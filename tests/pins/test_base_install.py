@@ -95,7 +95,6 @@ NEEDS = {
     "export sfms-small": "torch",
     "train tokenizer --config configs/training/sfms-small.yaml --data {tmp} --out {tmp}/out": "torch",
     "train listener --config configs/training/sfms-small.yaml --data {tmp} --out {tmp}/out": "torch",
-    "bench train": "torch",
     "bench listener": "torch",
     "replay {tmp}/run --plot {tmp}/run.png": "matplotlib",
     "replay {tmp}/run --sheet {tmp}/head.png": "vtkmodules",

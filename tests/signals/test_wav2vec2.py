@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sfms_robot.errors import MissingExtra, ModelError
-from sfms_robot.lab.corpora.audio_features import cached, wav2vec2_feature
 from sfms_robot.signals import wav2vec2
 
 NOISE = np.random.default_rng(0).normal(0, 0.1, 16_000).astype(np.float32)
@@ -105,10 +104,3 @@ def test_missing_extra_names_the_install(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
     with pytest.raises(MissingExtra, match=r"pip install 'sfms-robot\[wav2vec2\]'"):
         wav2vec2.Wav2Vec2(tmp_path)
-
-
-def test_wav2vec2_version_is_that_of_the_weights(folder, tmp_path):
-    one = wav2vec2_feature(folder)
-    rows = cached(NOISE, one, tmp_path)
-    np.testing.assert_array_equal(cached(NOISE, wav2vec2_feature(folder), tmp_path), rows)
-    assert one.version != wav2vec2.Wav2Vec2(folder).folder.name and one.dim == 16

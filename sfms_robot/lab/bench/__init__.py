@@ -44,15 +44,13 @@ BENCHES: Final[Mapping[str, Bench]] = {
         "startup_bench:startup", "a command typed to its end, `run` to its first goal, beside a bare Python",
         takes=("against",),
     ),
-    "bus": Bench("bus_bench:bus", "write and read of a head, of each family, beside the vendor's own calls"),
+    "bus": Bench("bus_bench:bus", "write and read of a head, one servo silent, beside the vendor's own calls"),
     "retarget": Bench(
-        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size",
-        takes=("head", "frames"),
+        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size"
     ),
     "lead": Bench("lead:lead", "how late joints are, beside the same with no lead", takes=("head",)),
     "listener": Bench(
-        "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch",
-        takes=("budget",),
+        "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch"
     ),
     "memory": Bench(
         "lead:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
@@ -70,16 +68,12 @@ BENCHES: Final[Mapping[str, Bench]] = {
         in_all=False, takes=("minutes", "audio", "torture", "say"),
     ),
     "view": Bench(
-        "view_bench:measure", "a page with three who look, beside the same run without; a halt from click to wire",
+        "view_bench:measure", "a page that three clients read, beside the share allowed; a halt from click to wire",
         in_all=False, takes=("say",),
     ),
     "throttle": Bench(
         "throttle_bench:measure", "a run on a quarter of one core, beside the same on all of this machine; exit code 1 "
         "where a command leaves its limits or the states are not those of docs/safety.md", takes=("say",),
-    ),
-    "train": Bench(
-        "train_bench:measure", "a step of each stage of training, beside plain products of as many operations",
-        takes=("say",),
     ),
     "serve": Bench(
         "serve_bench:measure", "heads that one server answers in time, beside one head at a time", in_all=False,
@@ -88,10 +82,6 @@ BENCHES: Final[Mapping[str, Bench]] = {
     "campaign": Bench(
         "campaign:measure", "every fault on every family of servos; exit code 1 where one is not survived",
         in_all=False, takes=("say",),
-    ),
-    "fuzz": Bench(
-        "campaign:measure_fuzz", "random bytes at every family; exit code 1 where they do harm", in_all=False,
-        takes=("minutes", "say"),
     ),
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""`bench campaign` and `bench fuzz`: faults and random bytes on every family of servos, in virtual time.
+"""`bench campaign`: every fault on every family of servos, in virtual time.
 
 One run: four emulated servos follow a slow wave under the limiter, as in the loop. Either a fault of the emulator
 begins after a while, and when it is over the servos get time to recover; or the servos differ from the head's file from
@@ -16,21 +16,13 @@ the start, or half of them are lost for good. Runs are judged from outside, by t
 
 The effect of a corrupted byte from the host is stated per family (`corrupted_bytes`). On a board without a checksum
 goals outside the limits are part of it, not a failure. Virtual time and seeded dice make every run repeatable.
-
-For `fuzz` the port delivers bytes that no servo sent before the servos' answers: half of them random, half shaped like
-the beginning of a packet. The loop continues meanwhile; afterwards every joint has to recover, without an exception, a
-hang, or growing memory. An 8-bit checksum accepts one forged answer in 256, so positions are not judged, but the goals
-that servos hold are.
 """
 
 from __future__ import annotations
 
 import logging
-import random
-import resource
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any, Final
 
@@ -52,7 +44,7 @@ from sfms_robot.lab.bench.campaign_rig import (
     plugged_in,
 )
 from sfms_robot.lab.bench.measure import BenchResult
-from sfms_robot.servo.port import Port, WrappedPort
+from sfms_robot.servo.port import WrappedPort
 
 _TICKS: Final = 1000
 _QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
@@ -321,140 +313,3 @@ def _mute_at_stop(family: str) -> CaseOutcome:
         rig.bus.stop("release")
         stop_s = rig.clock.now_s() - start_s
         return _at_the_end(rig, CaseOutcome(family=family, case=MUTE_AT_STOP, off_s=float(off_s), stop_s=stop_s))
-
-
-# --- random bytes ---------------------------------------------------------------------------------------------------
-
-BYTES: Final = 1_000_000
-_MEMORY_MIB: Final = 64.0  # more than this is growth
-_MOST: Final = 1024  # bytes in one tick
-_WAITING: Final = 8 * _MOST  # a driver's buffer holds no more
-_CALM_TICKS: Final = 240
-_SHARE: Final = 0.8  # of the ticks that are noisy
-_BEGINNINGS: Final = (b"\xff\xff\xfd\x00", b"\xff\xff", b"\xff\xf5", b"\xff\xff\xfd\x00\xfe", b"\xff\xff\xfe")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fuzzed:
-    """The effect of random bytes on one family."""
-
-    family: str
-    bytes: int
-    ticks: int
-    escaped: str | None
-    outside: int
-    recovered_s: float | None
-    named: Sequence[str]
-    slowest_tick_ms: float
-    grown_mib: float
-
-    @property
-    def passed(self) -> bool:
-        back = self.recovered_s is not None and self.recovered_s <= RECOVERY_S
-        return self.escaped is None and not self.outside and back and self.grown_mib < _MEMORY_MIB
-
-
-@dataclass
-class NoisyPort(WrappedPort):
-    """A port that delivers random bytes before the servos' answers, and counts those read or discarded."""
-
-    dice: random.Random
-    waiting: bytearray = field(default_factory=bytearray)
-    count: int = 0
-
-    def rise(self) -> None:
-        """Add a tick's worth of bytes."""
-        if self.dice.random() < _SHARE and len(self.waiting) < _WAITING:
-            start = self.dice.choice(_BEGINNINGS) if self.dice.random() < 0.5 else b""
-            self.waiting += start + self.dice.randbytes(self.dice.randint(1, _MOST))
-
-    def read(self, n: int, deadline_s: float) -> bytes:
-        if not self.waiting:
-            return super().read(n, deadline_s)
-        piece = bytes(self.waiting[: self.dice.randint(1, n)])
-        del self.waiting[: len(piece)]
-        self.count += len(piece)
-        return piece
-
-    def discard_input(self) -> None:
-        self.count += len(self.waiting)
-        self.waiting.clear()
-        super().discard_input()
-
-
-def measure_fuzz(say: Callable[[str], None], minutes: float = 0.0) -> BenchResult:
-    """Fuzz every family once with a million bytes, then again with other dice until `minutes` are over."""
-    logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of expected faults
-    until_s, seed, fuzzed = time.monotonic() + 60.0 * minutes, 0, list[Fuzzed]()
-    while not fuzzed or time.monotonic() < until_s:
-        for family in FAMILIES:
-            say(f"{family}: {BYTES} bytes, dice {seed}")
-            fuzzed.append(fuzz_one(family, BYTES, seed))
-        seed += 1
-    passed = all(each.passed for each in fuzzed)
-    rows = [
-        {
-            "family": each.family,
-            "bytes": each.bytes,
-            "escaped": each.escaped or 0,
-            "outside": each.outside,
-            "back s": None if each.recovered_s is None else round(each.recovered_s, 2),
-            "out": len(each.named),
-            "ms": round(each.slowest_tick_ms, 1),
-            "MiB": round(each.grown_mib, 1),
-            "passed": "yes" if each.passed else "NO",
-        }
-        for each in fuzzed
-    ]
-    plain = [asdict(each) | {"passed": each.passed} for each in fuzzed]
-    return BenchResult({"passed": passed, "runs": plain}, rows, passed=passed)
-
-
-def fuzz_one(family: str, count: int = BYTES, seed: int = 0) -> Fuzzed:
-    """Deliver `count` bytes to the bus of one family, and then none for a while."""
-    ports: list[NoisyPort] = []
-
-    def noisy(port: Port) -> NoisyPort:
-        if ports:  # the bus has opened its port again
-            ports[0].inner = port
-        else:
-            ports.append(NoisyPort(port, random.Random(seed)))
-        return ports[0]
-
-    with plugged_in(head_of(family), wrap=noisy) as rig:
-        rig.hold()
-        noise, judge = ports[0], Judge(rig)
-        ticks, calm, slowest_s, escaped = 0, 0, 0.0, None
-        end_s, before_mib = rig.clock.now_s(), _memory_mib()
-        while calm < _CALM_TICKS:
-            if noise.count < count:
-                noise.rise()
-                end_s = rig.clock.now_s()
-            else:
-                noise.waiting.clear()
-                calm += 1
-            ticks += 1
-            began_s = time.perf_counter()
-            try:
-                readings = rig.tick()
-            except Exception as error:  # the bench looks for exceptions that escape
-                escaped = f"{type(error).__name__}: {error}"
-                break
-            slowest_s = max(slowest_s, time.perf_counter() - began_s)
-            judge.see(readings)
-        return Fuzzed(
-            family=family,
-            bytes=noise.count,
-            ticks=ticks,
-            escaped=escaped,
-            outside=judge.outside,
-            recovered_s=judge.recovered_s(end_s),
-            named=judge.named,
-            slowest_tick_ms=1e3 * slowest_s,
-            grown_mib=_memory_mib() - before_mib,
-        )
-
-
-def _memory_mib() -> float:
-    """Return the peak memory of this process."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

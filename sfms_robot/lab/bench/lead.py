@@ -49,10 +49,9 @@ _LOOKS: Final = 20  # at memory, per hour
 
 @dataclass(frozen=True)
 class Delays:
-    """Delay of each joint [s], positive when late; NaN for a joint that hardly moves. `leads_s`: the head's leads."""
+    """Delay of each joint [s], positive when late; NaN for a joint that hardly moves."""
 
     joints: Sequence[str]
-    leads_s: Doubles
     led_s: Doubles
     unled_s: Doubles
 
@@ -126,13 +125,12 @@ def lead(head: str = HEAD) -> dict[str, Row]:
 
 def delays(head: str, duration_s: float = _DURATION_S) -> Delays:
     """Measure a head with the leads of its file, and without lead."""
-    found = [_delays(head, share, duration_s) for share in (1.0, 0.0)]
-    (joints, leads_s, led_s), (_, _, unled_s) = found
-    return Delays(joints, leads_s, led_s, unled_s)
+    (joints, led_s), (_, unled_s) = (_delays(head, share, duration_s) for share in (1.0, 0.0))
+    return Delays(joints, led_s, unled_s)
 
 
-def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], Doubles, Doubles]:
-    """Return joints, their leads, and their delays when the motion leads by `share` of those."""
+def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], Doubles]:
+    """Return joints, and their delays when the motion leads by `share` of the head's leads."""
     waves = Waves()
     with open_head(HeadOptions(head=name, fast=True, yes=True)) as opened:
         motion, rate_hz = opened.motion, opened.rate_hz
@@ -150,7 +148,7 @@ def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], 
         meant.append(angles)
     settled = times_s > _SETTLED_S
     moved = delay_ticks(np.array(meant)[settled], np.array(seen.angles_rad)[settled], round(_FARTHEST_S * rate_hz))
-    return motion.retargeter.joints, motion.leads_s, moved / rate_hz
+    return motion.retargeter.joints, moved / rate_hz
 
 
 def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:

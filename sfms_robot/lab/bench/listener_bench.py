@@ -6,7 +6,7 @@ thread, and they take turns, some frames each, so that other load of the machine
 frames falls due on every `hop`-th frame; the other frames are only heard.
 
 The row NAME is the engine that `--engine auto` takes, with further figures of the listener: `in_run` beside a servo
-loop, `samplers` of ARIG. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
+loop. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
 the same. ARIG's context is filled with random numbers, as full as after an hour.
 """
 
@@ -16,10 +16,9 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -37,9 +36,6 @@ from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.ports import Listener
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
-if TYPE_CHECKING:
-    from sfms_robot.listeners.arig.stream import ArigListener
-
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
 PAPER: Final = "sfms-paper"  # ships as a training only
 TRAINED, SEEDED = "trained", "seeded, not trained"
@@ -55,17 +51,10 @@ _COLUMNS: Final = {
 }  # fmt: skip
 
 
-def listener(budget: bool = False) -> BenchResult:
-    """Measure all listeners; restores the number of torch's threads.
-
-    `budget`: count the cost of a frame and compute the time on small computers (`operation_count.budget`) instead.
-    """
+def listener() -> BenchResult:
+    """Measure all listeners; restores the number of torch's threads."""
     import torch
 
-    if budget:
-        from sfms_robot.lab.bench import operation_count
-
-        return operation_count.budget()
     before = torch.get_num_threads()
     rows: dict[str, Row] = {}
     torch.set_num_threads(1)
@@ -111,14 +100,7 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
         "weights": weights,
     }
     if isinstance(settings, config.Arig):
-        early = Stream(loaded[auto], aged(loaded[auto], loaded[auto].start(0), speaker, minutes=1))
-        take_turns({name: early}, speaker)
-        rows[name] |= {
-            "minute_1_ms": float(np.median(early.frame_ms)),
-            f"minute_{_MINUTES}_ms": float(np.median(streams[auto].frame_ms)),
-            "in_run": in_run(folder),
-            "samplers": samplers(_how(loaded[EAGER]), speaker) if weights == TRAINED else None,
-        }
+        rows[name]["in_run"] = in_run(folder)
     return rows
 
 
@@ -317,55 +299,3 @@ def _of_precision(folder: Path, settings: config.ListenerSettings, precision: st
         if (folder / name).exists():
             (other / name).symlink_to((folder / name).resolve())
     return other
-
-
-# --- samplers -------------------------------------------------------------------------------------------------------
-
-WAYS: Final = (
-    ("ddpm", 50), ("ddpm", 15), ("ddpm", 12), ("ddpm", 10), ("ddpm", 8), ("ddim", 15), ("ddim", 8), ("ddim", 4),
-)  # fmt: skip
-_DRAWS: Final = 32
-_EVERY: Final = 4  # frames between two conditions
-
-
-def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[str, float]:
-    """Return the quality lost by shorter or noiseless sampling (`ddim-8`: DDIM, 8 steps), against 50 steps of eq. (4).
-
-    For the same conditions, many draws of each sampler: how far their mean and spread lie from those of the 50 steps,
-    as a share of the motion's standard deviation. The same 50 steps with another seed show the part of chance.
-    """
-    import torch
-
-    from sfms_robot.listeners.arig.networks import networks
-    from sfms_robot.listeners.arig.sampler import Denoiser
-    from sfms_robot.listeners.torch_engine import Recorder
-
-    head = listener.model.head
-    if not isinstance(head, Denoiser):
-        return {}
-    listener = copy(listener)
-    listener.engine = recorder = Recorder(listener.model, networks(listener.model))
-    memory, conditions = listener.start(0), []
-    for index, frame in enumerate(speaker):
-        _, memory = listener.step(frame, memory)
-        if index % _EVERY == _EVERY - 1:
-            conditions.append(recorder.examples["draw"]["z"])
-    repeated = torch.cat(conditions).repeat_interleave(_DRAWS, dim=0)
-
-    @torch.inference_mode()
-    def drawn(sampler: str, steps: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        plain = {"sampler": sampler, "steps": steps, "temperature": (1.0, 1.0), "temperatures": {}}
-        other = Denoiser(listener.settings.channels, head.condition.in_features, head.settings.model_copy(update=plain))
-        other.load_state_dict(head.state_dict())
-        generator = torch.Generator().manual_seed(seed)
-        noise = torch.randn(len(repeated), steps, listener.model.channels, generator=generator)
-        motion = other.sample(repeated, noise).view(len(conditions), _DRAWS, -1)
-        return motion.mean(1), motion.std(1)
-
-    mean, deviation = drawn("ddpm", 50, seed=1)
-    lost = {}
-    for sampler, steps in WAYS:
-        of_mean, of_deviation = drawn(sampler, steps, seed=2)
-        squared = (of_mean - mean).square().mean() + (of_deviation - deviation).square().mean()
-        lost[f"{sampler}-{steps}"] = float(squared.sqrt())  # standardised motion: its deviation is 1
-    return lost

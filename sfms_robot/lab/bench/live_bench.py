@@ -40,7 +40,7 @@ from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ
-from sfms_robot.lab.bench.live_stamps import ProcessorTime, ResidentMemory, StampedSource, Stamps
+from sfms_robot.lab.bench.live_stamps import ResidentMemory, StampedSource, Stamps
 from sfms_robot.lab.bench.measure import HEAD, LISTENER, BenchResult, package_environment, result_of
 from sfms_robot.lab.bench.startup_bench import first_goal_s
 from sfms_robot.ports import Source
@@ -143,7 +143,7 @@ def _lines(result: Mapping[str, Any]) -> Sequence[str]:
     return [
         f"load {live['load']} on {idle['cores']} cores; empty loop: jitter p99 {idle['jitter_ms']['p99']} ms{busy}",
         f"hop {live['hop']} frames; p50/p95 ms of its stages: {stages}",
-        f"CPU seconds a second: {live['cpu_s_per_s']}; resident MB: {live['resident_mb']}",
+        f"resident MB: {live['resident_mb']}",
         f"with a file: {file['in_time_share']} of ticks in time, jitter p99 {file['jitter_ms']['p99']} ms, "
         f"sound to goal p50 {file['sound_to_goal_ms']['p50']} ms, p95 {file['sound_to_goal_ms']['p95']} ms",
     ]
@@ -263,7 +263,7 @@ def measured_run() -> None:
     source = StampedSource(_source(options["audio"], options["face"], options["duration_s"], over))
     rate_hz = max(bus.rate_hz for bus in load_head(HEAD).buses.values())
     stamps = Stamps(source.loop_s, lambda: source.latency_s, rate_hz)
-    memory, cpu = ResidentMemory(options["duration_s"] / _MEMORY_LOOKS), ProcessorTime()
+    memory = ResidentMemory(options["duration_s"] / _MEMORY_LOOKS)
     how = {"listener": LISTENER, "duration_s": options["duration_s"], "record": record}
     try:
         with TemporaryDirectory() as folder, launch(emulated(load_head(HEAD))["main"], timing="wire") as chain:
@@ -271,7 +271,7 @@ def measured_run() -> None:
             report = run(
                 RunOptions(head=head, port=chain.device, yes=True, **how),
                 source=source,
-                observers=[stamps, memory, cpu],
+                observers=[stamps, memory],
             )
     finally:
         over.set()
@@ -287,7 +287,6 @@ def measured_run() -> None:
         "budget_ms": report["budget_ms"],
         "listener_step_ms": report["listener_step_ms"],
         "skipped_frames": report["listener_state"]["skipped_frames"],
-        "cpu_s_per_s": cpu.report(),
         "resident_mb": {"settled": round(settled[0], 2), "growth": round(settled[-1] - settled[0], 2)}
         if settled
         else {},

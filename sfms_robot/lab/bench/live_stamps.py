@@ -1,4 +1,4 @@
-"""Observers of a measured run: where the time goes between a sound and the servos, memory, processor time.
+"""Observers of a measured run: where the time goes between a sound and the servos, and memory.
 
 The stages come from the stamps that travel with samples, frames and plans:
 
@@ -14,7 +14,6 @@ samples of each frame, ten milliseconds apart. A face counts from the arrival of
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +21,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from sfms_robot.errors import BusError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan, SpeakerFrame
-from sfms_robot.lab.bench.measure import children_of, memory_mb, processor_time_s
+from sfms_robot.lab.bench.measure import children_of, memory_mb
 from sfms_robot.ports import Observer, Source, Tick
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -31,7 +31,6 @@ SETTLED_S: Final = 5.0  # until then the listener catches up with speech from be
 STAGES: Final = ("hop", "block", "grid", "plan", "write")
 _SAMPLES: Final = 4  # of a frame
 _REMEMBERED: Final = 100  # frames
-_ROLES: Final = {"listeners.process": "listener", "sources.worker": "audio", "emulator": "emulator"}
 
 
 class StampedSource(Source):
@@ -152,36 +151,10 @@ class ResidentMemory(Observer):
             self.resident_mb.append(memory_mb("VmRSS"))
 
 
-class ProcessorTime(Observer):
-    """An observer of the processor time of this process ("main") and of its children by role, once a second."""
-
-    def __init__(self) -> None:
-        self._next_s = SETTLED_S
-        self._seen: list[tuple[float, dict[str, float]]] = []  # first and newest
-
-    def tick(self, seen: Tick) -> None:
-        if seen.time_s < self._next_s:
-            return
-        self._next_s = seen.time_s + 1.0
-        used = {"main": time.process_time()}
-        for role, pid in children_by_role(os.getpid()):
-            with suppress(OSError):
-                used[role] = used.get(role, 0.0) + processor_time_s(pid)
-        self._seen = [*self._seen[:1], (time.monotonic(), used)]
-
-    def report(self) -> dict[str, float]:
-        """Return processor seconds per second, by role."""
-        if len(self._seen) < 2:
-            return {}
-        (first_s, first), (last_s, last) = self._seen
-        return {role: round((used_s - first.get(role, 0.0)) / (last_s - first_s), 4) for role, used_s in last.items()}
-
-
-def children_by_role(pid: int) -> list[tuple[str, int]]:
-    """Return role (listener, audio, emulator) and id of the processes that a run has started."""
-    found = []
+def listener_of(pid: int) -> int:
+    """Return the id of the listener's process of a run. Raises BusError if there is none."""
     for child in children_of(pid):
         with suppress(OSError):
-            command = Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8")
-            found += [(role, child) for part, role in _ROLES.items() if part in command]
-    return found
+            if "listeners.process" in Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8"):
+                return child
+    raise BusError("bench live: the run has no listener's process")

@@ -1,24 +1,19 @@
 """`bench startup`: start and end of commands, seen from outside, so that any installation can be measured.
 
     help, wrong_port, wrong_head    until the process is over
-    first_goal                      from typing `run` to its first goal position on the wire
+    first_goal                      from typing `run` until its servos have torque, in the tick of the first goal
     exit                            from its last byte on the wire until the process is over
     resident                        peak memory of the servo process, without the listener's process
 
-`run` drives emulated servos through a pseudo terminal that passes bytes on and takes their times.
+`run` drives emulated servos, which are looked at every few milliseconds.
 """
 
 from __future__ import annotations
 
-import os
-import select
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -32,37 +27,7 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 _REPEATS: Final = 5
 _RUN_S: Final = 1.0
-_GOAL: Final = b"\x83\x74\x00"  # Protocol 2.0: SYNC WRITE (0x83) at address 116, goal position
-_LOOK_S: Final = 0.01
-_CHUNK: Final = 4096
-
-
-@dataclass
-class WireTimes:
-    """Times of a run on the monotonic clock [s], and its peak resident memory."""
-
-    began_s: float
-    _: KW_ONLY
-    first_goal_s: float = float("nan")
-    last_byte_s: float = 0.0
-    ended_s: float = 0.0
-    resident_mb: float = 0.0
-    tail: bytes = field(default=b"", repr=False)
-
-    def host(self, data: bytes) -> None:
-        """Note bytes from the host."""
-        self.last_byte_s = time.monotonic()
-        if np.isnan(self.first_goal_s):
-            if _GOAL in self.tail + data:
-                self.first_goal_s = self.last_byte_s
-            self.tail = data[-len(_GOAL) :]
-
-    def figures(self) -> dict[str, float]:
-        return {
-            "first_goal": self.first_goal_s - self.began_s,
-            "exit": self.ended_s - self.last_byte_s,
-            "resident": self.resident_mb,
-        }
+_LOOK_S: Final = 0.004
 
 
 def startup(against: Path | None = None) -> dict[str, Row]:
@@ -81,18 +46,11 @@ def startup(against: Path | None = None) -> dict[str, Row]:
             ours.append(_duration_s([*MAIN, *words], None))
             theirs.append(_duration_s(["-c", "pass"] if other is None else [*MAIN, *words], other))
         rows[f"startup.{name}"] = row(ours, theirs, "s", peer)
-    mine, its = [], []
-    for _ in range(_REPEATS):
-        mine.append(_run(None).figures())
-        if other is not None:
-            its.append(_run(other).figures())
-    for key in mine[0]:
-        unit = "MB" if key == "resident" else "s"
-        if its:
-            theirs = [seen[key] for seen in its]
-        else:
-            theirs = [_duration_s(["-c", "pass"], None) if unit == "s" else _bare_mb()]
-        rows[f"startup.{key}"] = row([seen[key] for seen in mine], theirs, unit, peer)
+    runs = [(_run(None), {} if other is None else _run(other)) for _ in range(_REPEATS)]
+    bare = {"s": _duration_s(["-c", "pass"], None), "MB": _bare_mb()}
+    for key, unit in {"first_goal": "s", "exit": "s", "resident": "MB"}.items():
+        theirs = [its.get(key, bare[unit]) for _, its in runs]
+        rows[f"startup.{key}"] = row([mine[key] for mine, _ in runs], theirs, unit, peer)
     return rows
 
 
@@ -111,59 +69,25 @@ def _bare_mb() -> float:
 
 def first_goal_s(words: Sequence[str], env: Mapping[str, str] | None = None) -> float | None:
     """Return the time from typing `run` with these words to its first goal on the wire; None without one. Blocks."""
-    seen_s = _run(env, words).figures()["first_goal"]
+    seen_s = _run(env, words)["first_goal"]
     return None if np.isnan(seen_s) else seen_s
 
 
-def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)) -> WireTimes:
-    """Listen for one second on emulated servos, in real time."""
+def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)) -> dict[str, float]:
+    """Listen for one second on emulated servos, in real time; return `first_goal`, `exit` and `resident`."""
     head = load_head(HEAD)
-    with launch(emulated(head)["main"]) as chain, _relay(chain.device, head.buses["main"].baud) as (port, hosts):
-        words = ["run", "--head", HEAD, "--port", port, "--duration", str(_RUN_S), "--seed", "1", "--json", *more]
-        seen = WireTimes(time.monotonic())
-        hosts.append(seen)
+    with launch(emulated(head)["main"]) as chain:
+        words = ["run", "--head", HEAD, "--port", chain.device, "--duration", str(_RUN_S), "--seed", "1", "--json"]
+        servo, count, resident_mb, goal_s = chain.servos[-1].id, 0, 0.0, float("nan")
+        began_s = byte_s = time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, *MAIN, *words], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [sys.executable, *MAIN, *words, *more], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         while process.poll() is None:
-            seen.resident_mb = max(seen.resident_mb, memory_mb("VmHWM", process.pid))  # a NaN changes nothing
+            resident_mb = max(resident_mb, memory_mb("VmHWM", process.pid))  # a NaN changes nothing
+            if np.isnan(goal_s) and chain.state(servo)["torque"]:
+                goal_s = time.monotonic()
+            if (received := chain.statistics()["bytes_in"]) != count:
+                count, byte_s = received, time.monotonic()
             time.sleep(_LOOK_S)
-        seen.ended_s = time.monotonic()
-    return seen
-
-
-@contextmanager
-def _relay(device: str, baud: int) -> Iterator[tuple[str, list[WireTimes]]]:
-    """Put a pseudo terminal in front of another one; yield its name, and a list of receivers of the host's bytes."""
-    import termios
-    import tty
-
-    import serial
-
-    near, far = os.openpty()
-    tty.setraw(far, termios.TCSANOW)
-    line = serial.Serial(device, baud)  # an emulated servo receives at its baud rate only
-    servos = line.fileno()
-    receivers: list[WireTimes] = []
-    over = threading.Event()
-
-    def carry() -> None:
-        while not over.is_set():
-            ready, _, _ = select.select([near, servos], [], [], 0.05)
-            for source in ready:
-                data = os.read(source, _CHUNK)
-                if source == near:
-                    for seen in receivers:
-                        seen.host(data)
-                os.write(servos if source == near else near, data)
-
-    thread = threading.Thread(target=carry, daemon=True)
-    thread.start()
-    try:
-        yield os.ttyname(far), receivers
-    finally:
-        over.set()
-        thread.join()
-        line.close()
-        os.close(near)
-        os.close(far)
+        return {"first_goal": goal_s - began_s, "exit": time.monotonic() - byte_s, "resident": resident_mb}

@@ -28,8 +28,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
@@ -43,10 +42,8 @@ from sfms_robot.lab.bench.measure import (
     HEAD,
     LISTENER,
     BenchResult,
-    Row,
     children_of,
     package_environment,
-    processor_time_s,
     result_of,
     row,
 )
@@ -79,7 +76,6 @@ class ObservedRun:
         plans_s: Arrival of each plan, and its last frame, in loop time.
         looks, outside: Looks at servos, and how many of them found a goal outside the joint's range.
         torque: Servos that have torque after the run.
-        core_share: Share of one core that the run used, its start included.
     """
 
     report: Mapping[str, Any]
@@ -87,14 +83,14 @@ class ObservedRun:
     looks: int
     outside: int
     torque: Sequence[int]
-    core_share: float
 
-    @property
-    def in_time(self) -> float:
-        """Return the share of the due ticks that came in time."""
+    def figures(self) -> dict[str, float]:
+        """Return the share of the due ticks that came in time [%], ticks a second, and plans a second."""
         tick = self.report["tick"]
         punctual = 1 - float(tick["late"]) / float(self.report["ticks"])
-        return punctual * min(1.0, float(tick["achieved_hz"]) / float(tick["target_hz"]))
+        rate_hz = float(tick["achieved_hz"])
+        in_time = 100 * punctual * min(1.0, rate_hz / float(tick["target_hz"]))
+        return {"in_time": in_time, "rate": rate_hz, "plans": len(self.plans_s) / self.report["duration_s"]}
 
 
 def measure(say: Callable[[str], None]) -> BenchResult:
@@ -108,53 +104,18 @@ def measure(say: Callable[[str], None]) -> BenchResult:
     say(f"{_RUN_S:g} s on {SHARE:g} of one core")
     held = _observed(SHARE)
     problems = [f"{name}: {each}" for name, seen in (("all", free), ("held", held)) for each in problems_of(seen)]
-
-    def beside(figure: Callable[[ObservedRun], float], unit: str) -> Row:
-        return row([figure(held)], [figure(free)], unit, "the same run on all cores")
-
-    all_cores, quarter = _figures(free), _figures(held)
-    figures = {
-        "throttle.in_time": beside(lambda seen: 100 * seen.in_time, "% of ticks"),
-        "throttle.rate": beside(lambda seen: float(seen.report["tick"]["achieved_hz"]), "ticks a second"),
-        "throttle.plans": beside(lambda seen: len(seen.plans_s) / seen.report["duration_s"], "plans a second"),
-        "share": SHARE,
-        "problems": problems,
-        "free": all_cores,
-        "held": quarter,
+    peers, units = free.figures(), {"in_time": "% of ticks", "rate": "ticks a second", "plans": "plans a second"}
+    rows = {
+        f"throttle.{name}": row([value], [peers[name]], units[name], "the same run on all cores")
+        for name, value in held.figures().items()
     }
-    columns = ("measured", "all cores", f"{SHARE:g} of one")
-    lines = [(key, value, quarter[key]) for key, value in all_cores.items() if key != "states"]
-    lines += [
-        (f"% of the time {name}", all_cores["states"].get(name, 0.0), quarter["states"].get(name, 0.0))
-        for name in dict.fromkeys([*all_cores["states"], *quarter["states"]])
-    ]
-    table = [dict(zip(columns, line, strict=True)) for line in lines]
-    return BenchResult(
-        figures, table, problems or ["commands inside limits, states as docs/safety.md says"], not problems
-    )
-
-
-def _figures(seen: ObservedRun) -> dict[str, Any]:
-    report = seen.report
-    seconds = report["states"]["seconds"]
-    return {
-        "core share used": round(seen.core_share, 2),
-        "ticks in time %": round(100 * seen.in_time, 1),
-        "ticks a second": report["tick"]["achieved_hz"],
-        "tick late ms p99": report["tick"]["jitter_ms"]["p99"],
-        "hop frames": report["hop"],
-        "leads cut ms": (report["budget_ms"] or {}).get("lead_cut"),
-        "a plan takes ms p50": report["listener_step_ms"]["p50"],
-        "frame to wire ms p50": report["latency_ms"]["frame_to_wire"]["p50"],
-        "plans": len(seen.plans_s),
-        "plans late": report["plans"].get("late"),
-        "ticks past a plan": report["plans"].get("held", 0) + report["plans"].get("eased", 0),
-        "frames left out": report["listener_state"]["skipped_frames"],
-        "listener started anew": report["listener_state"]["restarts"],
-        "limit violations": report["limits"]["violations"],
-        "goals outside": seen.outside,
-        "states": {name: round(100 * of_s / sum(seconds.values()), 1) for name, of_s in seconds.items()},
-    }
+    found = BenchResult.of_rows(rows)
+    seconds = held.report["states"]["seconds"]
+    states = {name: round(100 * of_s / sum(seconds.values()), 1) for name, of_s in seconds.items()}
+    lines = [f"states on {SHARE:g} of one core, % of the time: {states}"]
+    lines += problems or ["commands inside limits, states as docs/safety.md says"]
+    figures = {**found.figures, "share": SHARE, "problems": problems, "states": states}
+    return BenchResult(figures, found.table, lines, not problems)
 
 
 # --- problems -------------------------------------------------------------------------------------------------------
@@ -221,26 +182,25 @@ def _silences(changes: Sequence[Change], plans_s: Sequence[tuple[float, float]])
 
 
 def _observed(share: float | None) -> ObservedRun:
-    """Start a run, observe its servos, and return what was seen. Raises BusError if the run fails."""
+    """Start a run, observe its servos, and return the observations. Raises BusError if the run fails."""
     with TemporaryDirectory() as name, launch(emulated(load_head(HEAD))["main"]) as chain:
         folder, goals = Path(name), _Goals(chain)
         words = ["-P", "-c", _CHILD, json.dumps({"head": str(patient_head(folder)), "port": chain.device})]
         with (
             (folder / "out").open("wb") as out,
             (folder / "said").open("wb") as said,
-            Tree(words, share, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=package_environment()) as tree,
+            held(words, share, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=package_environment()) as process,
         ):
-            began_s = time.monotonic()
-            while tree.process.poll() is None:
-                if time.monotonic() - began_s > _LIMIT_S:
+            ends_s = time.monotonic() + _LIMIT_S
+            while process.poll() is None:
+                if time.monotonic() > ends_s:
                     raise BusError(f"bench throttle: the run has not ended after {_LIMIT_S:g} s")
                 goals.look()
                 time.sleep(_LOOK_S)
-            core_share = tree.used_s / (time.monotonic() - began_s)
         printed, errors = ((folder / file).read_text(encoding="utf-8") for file in ("out", "said"))
-        found = result_of(tree.process.returncode, errors, printed, "throttle")
+        found = result_of(process.returncode, errors, printed, "throttle")
         torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
-    return ObservedRun(**found, looks=goals.looks, outside=goals.outside, torque=torque, core_share=core_share)
+    return ObservedRun(**found, looks=goals.looks, outside=goals.outside, torque=torque)
 
 
 class _Goals:
@@ -319,73 +279,49 @@ def processes_of(pid: int) -> list[int]:
     return found
 
 
-class Tree:
-    """`sys.executable ARGUMENTS` and all its descendants, held from its first instruction on.
+@contextmanager
+def held(arguments: Sequence[str], share: float | None, **popen: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `sys.executable ARGUMENTS`, held with all its descendants to a share of one core; kill it on leaving.
 
     Args:
         arguments: The command.
         share: Share of a core; None: no limit.
         popen: Options of `subprocess.Popen`.
     """
-
-    def __init__(self, arguments: Sequence[str], share: float | None, **popen: Any) -> None:
+    cores = os.sched_getaffinity(0)
+    first = {min(cores)}
+    with _on_cores(cores if share is None else first):
+        process = subprocess.Popen([sys.executable, *arguments], **popen)
+    over = threading.Event()
+    thread = threading.Thread(target=_hold, args=(process, share or 1.0, cores - first, over), daemon=True)
+    if share is not None:
+        thread.start()
+    try:
+        yield process
+    finally:
+        over.set()
         if share is not None:
-            check()
-        cores = os.sched_getaffinity(0)
-        with _on_cores(cores if share is None else {min(cores)}):
-            self.process = subprocess.Popen([sys.executable, *arguments], **popen)
-        self._share = share
-        self._pids = [self.process.pid]
-        self._used_s: dict[int, float] = {}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._hold, args=(cores - {min(cores)},), daemon=True)
-        self._thread.start()
+            thread.join()
+        process.kill()
+        process.wait()
 
-    @property
-    def used_s(self) -> float:
-        """Return the processor time of all processes, as of the last look."""
-        return sum(self._used_s.values())
 
-    def __enter__(self) -> Self:
-        return self
+def _hold(process: subprocess.Popen[bytes], share: float, cores: set[int], over: threading.Event) -> None:
+    """Stop and continue a process and its descendants in slices until the end; leave them running."""
+    pids, looked_s, begins_s = [process.pid], 0.0, time.monotonic()
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
-        self._over.set()
-        self._thread.join()
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-
-    def _hold(self, cores: set[int]) -> None:
-        """Stop and continue the processes until the end; leave them running."""
-        if self._share is None:
-            while not self._over.wait(_PROCESSES_S):
-                self._look()
-            return
-        awake_s = self._share * _SLICE_S
-        with _on_cores(cores), realtime_priority():
-            begins_s = looked_s = time.monotonic()
-            try:
-                while not self._over.is_set() and self.process.poll() is None:
-                    self._send(signal.SIGCONT)
-                    time.sleep(awake_s)
-                    self._send(signal.SIGSTOP)
-                    now_s = time.monotonic()
-                    if now_s - looked_s >= _PROCESSES_S:
-                        looked_s = now_s
-                        self._look()
-                    begins_s = max(begins_s + _SLICE_S, now_s)
-                    time.sleep(max(0.0, begins_s - time.monotonic()))
-            finally:
-                self._send(signal.SIGCONT)
-
-    def _look(self) -> None:
-        self._pids = processes_of(self.process.pid)
-        for pid in self._pids:
-            with suppress(OSError):
-                self._used_s[pid] = processor_time_s(pid)
-
-    def _send(self, number: signal.Signals) -> None:
-        for pid in self._pids:
+    def send(number: signal.Signals) -> None:
+        for pid in pids:
             with suppress(OSError):
                 os.kill(pid, number)
+
+    with _on_cores(cores), realtime_priority():
+        while not over.is_set() and process.poll() is None:
+            send(signal.SIGCONT)
+            time.sleep(share * _SLICE_S)
+            send(signal.SIGSTOP)
+            if (now_s := time.monotonic()) - looked_s >= _PROCESSES_S:
+                pids, looked_s = processes_of(process.pid), now_s
+            begins_s = max(begins_s + _SLICE_S, now_s)
+            time.sleep(max(0.0, begins_s - time.monotonic()))
+        send(signal.SIGCONT)

@@ -49,7 +49,7 @@ from sfms_robot.lab.bench.live_bench import (
     load,
     patient_head,
 )
-from sfms_robot.lab.bench.live_stamps import children_by_role
+from sfms_robot.lab.bench.live_stamps import listener_of
 from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, package_environment
 
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
@@ -147,8 +147,7 @@ class _Victim:
     def strike(self, kind: str, chance: random.Random) -> tuple[str, str, Callable[[], None] | None]:
         """Cause a fault. Return the thing hit, the run's name for it, and a function that ends the fault, if needed."""
         if kind in ("killed", "stopped"):
-            (pid,) = [pid for role, pid in children_by_role(self.process.pid) if role == "listener"]
-            os.kill(pid, signal.SIGKILL if kind == "killed" else signal.SIGSTOP)
+            os.kill(listener_of(self.process.pid), signal.SIGKILL if kind == "killed" else signal.SIGSTOP)
             return "listener", "listener", None
         if kind == "unplugged":
             joint = chance.choice(list(self.head.joints))

@@ -60,7 +60,9 @@ _PLACES: Final = [
 
 
 def blendshapes_of(intensities: Floats | Doubles) -> Floats:
-    """(N, 24) intensities in the order of `FAU_VALUE` -> (N, 52) within 0..1. Raises ValueError for another width."""
+    """Return blendshapes (N, 52) within 0..1 of intensities (N, 24) in the order of `FAU_VALUE`.
+
+    Raises ValueError for another width."""
     if intensities.ndim != 2 or intensities.shape[1] != len(FAU_VALUE):
         raise ValueError(f"action units are {intensities.shape}, not (N, {len(FAU_VALUE)})")
     out = np.zeros((len(intensities), len(BLENDSHAPES)), np.float32)

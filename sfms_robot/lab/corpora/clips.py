@@ -1,4 +1,4 @@
-"""One conversation seen from one listener, as arrays, and how a set of our own is kept on disk."""
+"""One conversation seen from one listener, as arrays; the files of a set of our own; and its splits."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import pickle
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, SPACE_CHANNELS, Floats, ListenerEvent
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, MOTION_DIM, SPACE_CHANNELS, Floats, ListenerEvent
 from sfms_robot.lab.corpora.action_units import FAU_VALUE
 from sfms_robot.signals import mel as log_mel
+from sfms_robot.signals.tracks import Take
 
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
-# Numbers per frame of every space data comes in: those a listener may work in, and three that it may not.
+# Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
 WIDTHS: Final[Mapping[str, int]] = {
     **{name: len(channels) for name, channels in SPACE_CHANNELS.items()},
-    "faceverse58-centred": 58,  # less a mean face: how far from it, not where
     "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
     "seamless27": len(SEAMLESS_CHANNELS),
 }
@@ -38,6 +38,13 @@ _EVENT: Final = np.dtype(
     [(name, "f8") for name in ("start_s", "duration_s", "size")]
     + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
 )
+# Arrays that a dyad may lack: their type on disk, and as they are read.
+_OPTIONAL: Final[Mapping[str, tuple[type, type]]] = {
+    "states": (np.int8, np.int8),
+    "mel": (np.float32, np.float32),
+    "head_of_gaze_rad": (np.float16, np.float32),
+    "attention": (np.float16, np.float32),
+}
 _Number = TypeVar("_Number", bound=np.generic)
 
 
@@ -107,7 +114,7 @@ class Dyad:
                 raise ValueError(f"{self.name}: {key} must be finite")
 
     def mel_rows(self) -> Floats | None:
-        """(4N, 128) natural log of mel power: `mel`, or made from `audio`; None where there is no sound.
+        """Return the natural log of mel power (4N, 128): `mel`, or made from `audio`; None without sound.
 
         At other rates than 25 each row is the newest of the 100 a second that is complete by its time.
         """
@@ -119,7 +126,7 @@ class Dyad:
 
 
 def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: float) -> NDArray[_Number]:
-    """Rows (M, ...) at one rate -> (wanted, ...) at another: of each time the newest that is complete by then.
+    """Resample rows (M, ...) to (wanted, ...): for each time the newest row that is complete by then.
 
     Nothing is complete by the first few times where they come sooner than the first row: that one stands there.
     """
@@ -131,12 +138,12 @@ def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: floa
 
 
 def samples_of(frames: int, fps: float) -> int:
-    """Samples at 16 kHz in that many frames: 640 each at 25 fps."""
+    """Return the samples at 16 kHz in that many frames: 640 each at 25 fps."""
     return round(frames * AUDIO_HZ / fps)
 
 
 def save(folder: Path, dyads: Sequence[Dyad]) -> None:
-    """One NAME.npz per dyad: audio as int16, motion of ours as float16 (3 decimals are more than a servo shows).
+    """Write one NAME.npz per dyad: audio as int16, arkit58 motion as float16 (3 decimals are more than a servo shows).
 
     Motion in other spaces stays float32: angles near pi would lose what a nod is made of.
     """
@@ -151,14 +158,9 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
         for key, voice in (("audio", dyad.audio), ("agent_audio", dyad.agent_audio)):
             if voice is not None:
                 arrays[key] = np.round(voice * 32767).astype(np.int16)
-        if dyad.states is not None:
-            arrays["states"] = dyad.states
-        if dyad.mel is not None:
-            arrays["mel"] = dyad.mel
-        if dyad.head_of_gaze_rad is not None:
-            arrays["head_of_gaze_rad"] = dyad.head_of_gaze_rad.astype(np.float16)
-        if dyad.attention is not None:
-            arrays["attention"] = dyad.attention.astype(np.float16)
+        for key, (filed, _) in _OPTIONAL.items():
+            if (values := getattr(dyad, key)) is not None:
+                arrays[key] = values.astype(filed)
         if dyad.events is not None:
             arrays["events"] = _event_rows(dyad.events)
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
@@ -168,7 +170,7 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
 
 
 def load(folder: Path) -> list[Dyad]:
-    """Every dyad in a folder, by name. Raises ConfigError when there is none or one is broken."""
+    """Return every dyad in a folder, by name. Raises ConfigError when there is none or one is broken."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise ConfigError(f"{folder}: no dyads (*.npz) here; `sfms-robot data compose` makes them")
@@ -176,9 +178,12 @@ def load(folder: Path) -> list[Dyad]:
 
 
 def read(file: Path) -> Dyad:
-    """One dyad as `save` wrote it. Raises ConfigError."""
+    """Return one dyad as `save` wrote it. Raises ConfigError."""
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            optional: dict[str, Any] = {
+                key: arrays[key].astype(read) for key, (_, read) in _OPTIONAL.items() if key in arrays
+            }
             return Dyad(
                 name=file.stem,
                 audio=_voice(arrays, "audio"),
@@ -187,18 +192,34 @@ def read(file: Path) -> Dyad:
                 listening=arrays["listening"].astype(bool),
                 space=str(arrays["space"]) if "space" in arrays else "arkit58",
                 fps=float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
-                mel=arrays["mel"].astype(np.float32) if "mel" in arrays else None,
                 features={key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
                 agent_audio=_voice(arrays, "agent_audio"),
-                states=arrays["states"].astype(np.int8) if "states" in arrays else None,
                 events=_events(arrays["events"]) if "events" in arrays else None,
-                head_of_gaze_rad=arrays["head_of_gaze_rad"].astype(np.float32)
-                if "head_of_gaze_rad" in arrays
-                else None,
-                attention=arrays["attention"].astype(np.float32) if "attention" in arrays else None,
+                **optional,
             )
     except UNREADABLE as error:
         raise ConfigError(f"{file}: not a dyad: {error}") from error
+
+
+TAKE_STEP: Final = 2e-4  # resolution of whole takes on disk: a hundredth of what counts as stillness
+
+
+def read_takes(file: Path) -> dict[str, list[Take]]:
+    """Return whole recorded faces (`sim/listeners/takes.npz`) of the splits `train` and `held_out`.
+
+    A take is kept as differences from frame to frame. Raises ConfigError for a file with other content.
+    """
+    found: dict[str, list[Take]] = {"train": [], "held_out": []}
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            for key, steps in arrays.items():
+                split, name, _ = key.split("/")
+                if steps.ndim != 2 or len(steps) != MOTION_DIM:
+                    raise ValueError(f"{key} has shape {steps.shape}")
+                found[split].append(Take(name, (steps.cumsum(axis=1).T * TAKE_STEP).astype(np.float32)))
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{file}: not a file of recorded takes: {error}") from error
+    return found
 
 
 def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
@@ -224,3 +245,53 @@ def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
 
 def _voice(arrays: Mapping[str, NDArray[Any]], key: str) -> Floats | None:
     return np.asarray(arrays[key].astype(np.float32) / 32767, np.float32) if key in arrays else None
+
+
+# --- Splits: one table for composing, fitting and scoring -----------------------------------------------------------
+#
+# Meetings of a series share their people, so whole series are kept apart; so are whole recordings of voices and faces.
+# The series are laid out by hand so that every part has people whose gaze was annotated, and meetings in which nods
+# were left without a form. Voices of one person, or of people who talk in several recordings together, are in one
+# part. Nothing is fitted, chosen or calibrated on test.
+
+Split = Literal["train", "validation", "test"]
+SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
+
+SERIES: Final[Mapping[Split, tuple[str, ...]]] = {
+    "train": ("ES2008", "IS1002", "IS1004", "IS1008", "IS1009", "TS3003"),
+    "validation": ("IS1000", "IS1005", "TS3011"),
+    "test": ("ES2003", "IS1001", "IS1006"),
+}
+# Recordings of voices, by how their names begin; others are for training.
+VOICES: Final[Mapping[Split, tuple[str, ...]]] = {
+    "train": (
+        "1114_2_01", "jfk", "audio_EN2001", "audio_EN2003", "audio_EN2004", "hvb_01cefd", "hvb_02e416", "hvb_03a17c",
+        "lca_49",
+    ),
+    "validation": ("1114_3_15", "katie", "audio_EN2006", "hvb_a7ccc3", "hvb_eb82ec"),
+    "test": ("1114_3_16", "steve", "audio_EN2005", "audio_EN2009", "audio_ES2003", "hvb_01f7ec"),
+}  # fmt: skip
+_Item = TypeVar("_Item")
+
+
+def series(meeting: str) -> str:
+    """Return the series of a meeting, whose meetings share their people: "IS1008c" -> "IS1008"."""
+    return meeting.rstrip("abcdefgh")
+
+
+def split_of(meeting: str) -> Split:
+    """Return the split of a meeting; meetings of other series are for training."""
+    return next((split for split in SPLITS if series(meeting) in SERIES[split]), "train")
+
+
+def split_of_voice(name: str) -> Split:
+    """Return the split of a recorded voice."""
+    return next((split for split in SPLITS if name.startswith(VOICES[split])), "train")
+
+
+def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
+    """Return items in their order, by split; every split is there."""
+    parts: dict[Split, list[_Item]] = {split: [] for split in SPLITS}
+    for split, item in items:
+        parts[split].append(item)
+    return parts

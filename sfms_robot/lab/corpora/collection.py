@@ -1,17 +1,17 @@
-"""Data too big for memory: clips known by name and length, read one at a time, and a list of what is wrong with it.
+"""Data sets too big for memory: clips known by name and length, read one at a time, and a list of problems.
 
-Every layout of files on disk is one `Layout`: how to know it, which splits it has, and `scan`, which looks at names
-and headers only and gives a `Dataset`. What cannot be used is left out by name, as a `Problem`: never silently.
+Every layout of files on disk is one `Layout`. Its `scan` looks at names and headers only. Clips that cannot be used are
+left out by name, as a `Problem`, never silently.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal, TypeVar, overload
+from typing import Any, Final, Literal, TypeVar, overload
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
@@ -58,17 +58,17 @@ class Clip:
     """One listener's clip: its name, frames, and how to read it.
 
     Attributes:
-        row: its place in the layout's own list, before anything was left out (REACT's appropriateness matrix counts
-            in it).
-        read: gives the dyad without features; raises ClipError or what `UNREADABLE` names.
-        features: readers of what else the layout ships about the frames, (N, F).
+        read: Returns the dyad without features; raises ClipError or what `UNREADABLE` names.
+        features: Readers of the other arrays that the layout ships about the frames, (N, F).
+        row: Place in the layout's own list, before anything was left out (REACT's appropriateness matrix counts in
+            it). Set by `Layout.dataset`.
     """
 
     name: str
     frames: int
-    row: int
     read: Callable[[], Dyad]
     features: Mapping[str, Callable[[], Floats]] = field(default_factory=dict)
+    row: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +76,10 @@ class Dataset(Sequence[Dyad]):
     """Dyads of one split, read when asked for.
 
     Attributes:
-        features: names of the shipped features each dyad carries.
-        problems: what was left out, and why.
-        notes: what else a person should know.
-        licence: what may be done with the data, as far as they say; None: they do not.
+        features: Names of the shipped features each dyad carries.
+        problems: Clips and files that were left out, and why.
+        notes: Lines for a person.
+        licence: The licence that the data state; None: they state none.
     """
 
     layout: str
@@ -115,7 +115,7 @@ class Dataset(Sequence[Dyad]):
     def __getitem__(self, index: slice) -> Dataset: ...
 
     def __getitem__(self, index: int | slice) -> Dyad | Dataset:
-        """One dyad, read now, or a part of the set. Raises ClipError for a clip that cannot be used."""
+        """Return one dyad, read now, or a part of the set. Raises ClipError for a clip that cannot be used."""
         if isinstance(index, slice):
             return replace(self, clips=self.clips[index])
         clip = self.clips[index]
@@ -135,28 +135,8 @@ class Dataset(Sequence[Dyad]):
 
         return replace(self, space=space or self.space, clips=tuple(changed(clip) for clip in self.clips))
 
-    def checked(self, least_frames: int = 0, each: Callable[[Dyad | None], None] | None = None) -> Dataset:
-        """The clips that can be used, every one of them read once; the others join the problems.
-
-        `each` is given every dyad, or None for a clip that cannot be used.
-        """
-        kept, problems = [], list(self.problems)
-        for index, clip in enumerate(self.clips):
-            dyad = None
-            try:
-                if clip.frames < (least := max(1, least_frames)):
-                    detail = f"{clip.frames} frames, a window needs {least}"
-                    raise ClipError.of("too short", clip.name, detail)
-                dyad = self[index]
-                kept.append(clip)
-            except ClipError as error:
-                problems.append(error.problem)
-            if each is not None:
-                each(dyad)
-        return replace(self, clips=tuple(kept), problems=tuple(problems))
-
     def summary(self) -> str:
-        """One line: what is there, and how much was left out."""
+        """Return one line: clips and minutes, and the number that was left out."""
         left_out = Counter(problem.kind for problem in self.problems)
         said = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
         return f"{self.layout} {self.split}: {len(self)} clips, {self.minutes:.1f} min" + (
@@ -165,7 +145,7 @@ class Dataset(Sequence[Dyad]):
 
 
 def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
-    """Every dyad that can be read; the others are counted and named in one warning when all are through."""
+    """Yield every dyad that can be read; the others are counted and named in one warning at the end."""
     left_out = []
     for index in range(len(dyads)):
         try:
@@ -189,27 +169,59 @@ def guarded(where: str, read: Callable[[], _T]) -> _T:
         raise ClipError.of("unreadable", where, error) from error
 
 
+Found = Clip | Problem | str  # str: a note for a person
+
+
+def attempt(items: Iterable[_T], build: Callable[[_T], Clip]) -> Iterator[Found]:
+    """Build the clip of every item; yield it, or the problem of an item that cannot be used."""
+    for item in items:
+        try:
+            yield build(item)
+        except ClipError as error:
+            yield error.problem
+
+
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """Layout of one family of data sets on disk.
 
     Attributes:
-        space, fps: of the motion.
-        order: of the channels in the files as they are shipped; None: there is only one.
-        root: the folder in or under the given one in which it lies, or None: this is not the layout.
-        splits: their names by ours (train, validation, test, ...).
-        scan: (root, their split's name, order) -> Dataset. Reads headers only where the format allows it.
-        held_out: share of train that serves as validation where the layout ships none.
-        features: names of what it ships beside motion and sound.
+        space, fps: Of the motion.
+        splits: Names of the splits in a folder, by ours (train, validation, test, ...); empty: another layout.
+        scan: (root, their name of a split, order) -> clips, problems and notes. Reads headers only where the format
+            allows it.
+        below: Folders in which the data may lie, relative to the given one.
+        order: Order of the channels in the files as they are shipped; None: there is only one.
+        held_out: Share of train that serves as validation where the layout ships none.
+        facts: (root, their name of a split) -> space, fps or licence where these differ from folder to folder.
     """
 
     name: str
     about: str
     space: str
     fps: float
-    order: Order | None
-    root: Callable[[Path], Path | None]
     splits: Callable[[Path], Mapping[str, str]]
-    scan: Callable[[Path, str, Order | None], Dataset]
+    scan: Callable[[Path, str, Order | None], Iterable[Found]]
+    below: tuple[str, ...] = ("", "data")
+    order: Order | None = None
     held_out: float = 0.0
-    features: tuple[str, ...] = ()
+    licence: str | None = None
+    facts: Callable[[Path, str], Mapping[str, Any]] = lambda place, split: {}
+
+    def root(self, folder: Path) -> Path | None:
+        """Return the folder in or under the given one in which the data lie; None: another layout."""
+        return next((place for name in self.below if self.splits(place := folder / name)), None)
+
+    def dataset(self, place: Path, split: str, theirs: str, order: Order | None) -> Dataset:
+        """Scan the split that the files call `theirs`. A file that several clips need is one problem."""
+        found = list(self.scan(place, theirs, order))
+        listed = enumerate(one for one in found if not isinstance(one, str))
+        facts = {"space": self.space, "fps": self.fps, "licence": self.licence, **self.facts(place, theirs)}
+        return Dataset(
+            layout=self.name,
+            split=split,
+            clips=tuple(replace(one, row=row) for row, one in listed if isinstance(one, Clip)),
+            problems=tuple(dict.fromkeys(one for one in found if isinstance(one, Problem))),
+            notes=tuple(one for one in found if isinstance(one, str)),
+            **facts,
+        )

@@ -1,7 +1,7 @@
 """Which of the seven conversational states (3.3) the agent is in, from who speaks, what is feedback, and nods.
 
 The paper annotated its data by hand and shows the result in a figure alone; this rule is ours. Voice activity decides
-what is possible, `PATTERNS`; dialogue acts decide the rest:
+what is possible; dialogue acts decide the rest:
 
 | agent | user | state |
 |---|---|---|
@@ -32,17 +32,6 @@ STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STAT
 UNKNOWN: Final = -1
 ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, where nobody annotated it
 
-# (agent speaks, user speaks) that a state may have.
-PATTERNS: Final[Mapping[str, frozenset[tuple[bool, bool]]]] = {
-    "speaking": frozenset({(True, False)}),
-    "listening": frozenset({(False, True)}),
-    "receiving_feedback": frozenset({(True, True), (False, True)}),
-    "thinking": frozenset({(False, False)}),
-    "interrupted": frozenset({(True, True)}),
-    "waiting": frozenset({(False, False)}),
-    "giving_feedback": frozenset({(True, False), (True, True), (False, True)}),
-}
-
 
 @dataclass(frozen=True)
 class Voices:
@@ -56,13 +45,13 @@ class Voices:
 
 
 def of_activity(agent: Mask, user: Mask) -> Voices:
-    """Voice activity alone, short answers as feedback, no nods."""
+    """Return voice activity alone, with short answers as feedback and without nods."""
     nods = np.zeros(len(agent), bool)
     return Voices(agent, user, short_answers(agent, user), short_answers(user, agent), nods)
 
 
 def label(heard: Voices) -> NDArray[np.int8]:
-    """(N,) one state per frame; see the table above."""
+    """Return one state per frame (N,); see the table above."""
     agent, user = heard.agent, heard.user
     told, answered = agent & heard.agent_feedback, user & heard.user_feedback
     own_turn = _own_turn(agent & ~told, user & ~answered)
@@ -80,29 +69,23 @@ def label(heard: Voices) -> NDArray[np.int8]:
 
 
 def _own_turn(agent: Mask, user: Mask) -> Mask:
-    """(N,) frames before and after which the agent is the next to have the floor, at any distance."""
+    """Return frames (N,) before and after which the agent is the next to have the floor, at any distance."""
     floor = np.where(agent, 1, np.where(user, -1, 0))
     own: Mask = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)
     return own
 
 
 def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:
-    """(N,) the newest value that is not 0, up to and with each frame; 0 before the first."""
+    """Return the newest value (N,) that is not 0, up to and with each frame; 0 before the first."""
     newest = np.maximum.accumulate(np.where(floor != 0, np.arange(len(floor)), -1))
     return np.where(newest >= 0, floor[newest], 0)
 
 
 def short_answers(active: Mask, other: Mask) -> Mask:
-    """(N,) utterances under a second that begin while the other speaks and after which he speaks again."""
+    """Return utterances (N,) under a second that begin in the other's speech before the other continues."""
     out = np.zeros(len(active), bool)
     for start, end in runs(active):
         before, after = other[max(0, start - FRAME_HZ // 2) : start + 1], other[end : end + FRAME_HZ]
         if end - start < ANSWER_S * FRAME_HZ and before.any() and after.any():
             out[start:end] = True
     return out
-
-
-def shares(states: NDArray[np.int8]) -> dict[str, float]:
-    """Share of each state among the labelled frames."""
-    known = states[states >= 0]
-    return {name: float((known == index).mean()) if len(known) else 0.0 for name, index in STATE.items()}

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Doubles, Floats
@@ -51,7 +52,7 @@ class Residual:
     notes: dict[str, None] = field(default_factory=dict)
 
     def told(self) -> dict[str, Any]:
-        """Figures by name, None for what does not apply; degrees and shares, for people."""
+        """Return figures by name, None for those that do not apply; degrees and shares."""
         return {
             "pose_round_trip_deg": float(np.degrees(self.pose_rad)),
             "resampling_rms_deg": float(np.degrees(np.sqrt(self.resampled_rad2 / self.resampled)))
@@ -71,7 +72,7 @@ class Residual:
 
 
 def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) -> Dyad:
-    """The dyad in `arkit58` at 25 fps; a speaker's unknown frames stay unknown. `residual` takes in what is lost.
+    """Return the dyad in `arkit58` at 25 fps, and add the loss to `residual`; a speaker's unknown frames stay unknown.
 
     Raises ConfigError for a space that cannot become ours, and for a clip of less than one frame.
     """
@@ -89,7 +90,7 @@ def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) ->
 
 
 def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Floats:
-    """(N, D) of a convertible space -> (N, 58) ours; rows that are not known stay so."""
+    """Return motion (N, D) of a convertible space as (N, 58) arkit58; rows that are not known stay so."""
     known = np.isfinite(motion).all(axis=1)
     out = np.full((len(motion), 58), np.nan, np.float32)
     if space == "arkit58":
@@ -109,31 +110,25 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
         return
     filed = dyad.listener.astype(np.float64)
     residual.pose_rad = max(residual.pose_rad, float(_apart_rad(filed, ours, dyad.space).max(initial=0.0)))
-    if dyad.space == "seamless27":
-        units = filed[:, _UNITS]
-        lost = np.maximum(units - FULL, 0.0)
-        lost[:, _UNSHOWN] = units[:, _UNSHOWN]
-        _count(residual, np.square(units).sum(), np.square(lost).sum(), int((units > FULL).sum()), units.size)
-    elif dyad.space == "faceverse58":
-        shapes = filed[:, SPACES["faceverse58"].expression]
-        cut = shapes - np.clip(shapes, 0.0, 1.0)
-        _count(residual, np.square(shapes).sum(), np.square(cut).sum(), int((cut != 0).sum()), shapes.size)
-    else:
+    if dyad.space == "deca56":
+        shown = ours[:, SHAPES].astype(np.float64) @ flame.rows if flame is not None else 0.0
         expression = filed[:, SPACES["deca56"].expression]
-        given = ours[:, SHAPES].astype(np.float64) @ flame.rows if flame is not None else 0.0
-        _count(residual, np.square(expression).sum(), np.square(expression - given).sum(), 0, 0)
+        lost = expression - shown
         residual.notes |= dict.fromkeys(filter(None, [limitation("deca56", flame)]))
-
-
-def _count(residual: Residual, whole: float, left: float, beyond: int, values: int) -> None:
-    residual.expression2 += float(whole)
-    residual.left2 += float(left)
-    residual.beyond += beyond
-    residual.values += values
+    else:
+        seamless = dyad.space == "seamless27"
+        expression = filed[:, _UNITS if seamless else SPACES[dyad.space].expression]
+        lost = expression - np.clip(expression, -np.inf if seamless else 0.0, FULL if seamless else 1.0)
+        residual.beyond += int((lost != 0).sum())
+        residual.values += expression.size
+        if seamless:
+            lost[:, _UNSHOWN] = expression[:, _UNSHOWN]
+    residual.expression2 += float(np.square(expression).sum())
+    residual.left2 += float(np.square(lost).sum())
 
 
 def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
-    """(N,) between heads as filed, and ours written in the source's terms again."""
+    """Return angles (N,) between heads as filed, and ours expressed in the source's terms again."""
     from scipy.spatial.transform import Rotation
 
     name = "deca56" if space == "seamless27" else space
@@ -148,7 +143,7 @@ def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
 
 
 def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
-    """Our angles, read back at the instants of the source's frames (a frame stands for its end)."""
+    """Compare our angles at the instants of the source's frames (a frame stands for its end)."""
     theirs_s = (np.arange(len(filed.listener)) + 1) / filed.fps
     ours_s = (np.arange(len(ours.listener)) + 1) / FRAME_HZ
     inside = (theirs_s >= ours_s[0]) & (theirs_s <= ours_s[-1])
@@ -176,7 +171,7 @@ SPACE: Final = "arkit58"  # in other spaces a frame between two is not always wh
 
 
 def at_frame_rate(dyad: Dyad) -> Dyad:
-    """The dyad at 25 fps, cut to whole frames: motion linear in time, what is counted in frames the newest known.
+    """Return the dyad at 25 fps, cut to whole frames: motion linear in time, other rows the newest known.
 
     Raises ConfigError for other rates in spaces other than arkit58, and for less than one frame.
     """
@@ -188,33 +183,28 @@ def at_frame_rate(dyad: Dyad) -> Dyad:
     if not frames:
         raise ConfigError(f"{dyad.name}: lasts {len(dyad.listener) / dyad.fps:.3f} s, not one frame of {FRAME_S:g} s")
 
-    def voice(samples: Floats | None) -> Floats | None:
-        return None if samples is None else samples[: samples_of(frames, FRAME_HZ)]
+    def newest(rows: NDArray[Any] | None, a_frame: int = 1) -> Any:
+        return None if rows is None else at_rate(rows, a_frame * dyad.fps, a_frame * frames, a_frame * FRAME_HZ)
 
-    def newest(rows: Floats) -> Floats:
-        return at_rate(rows, dyad.fps, frames, FRAME_HZ)
+    def cut(voice: Floats | None) -> Floats | None:
+        return None if voice is None else voice[: samples_of(frames, FRAME_HZ)]
 
     return replace(
         dyad,
-        audio=voice(dyad.audio),
-        agent_audio=voice(dyad.agent_audio),
+        audio=cut(dyad.audio),
+        agent_audio=cut(dyad.agent_audio),
         speaker=_motion(dyad.speaker, dyad.fps, frames),
         listener=_motion(dyad.listener, dyad.fps, frames),
-        listening=at_rate(dyad.listening, dyad.fps, frames, FRAME_HZ),
-        states=None if dyad.states is None else at_rate(dyad.states, dyad.fps, frames, FRAME_HZ),
-        mel=None if dyad.mel is None else _mel(dyad.mel, dyad.fps, frames),
+        listening=newest(dyad.listening),
+        states=newest(dyad.states),
+        mel=newest(dyad.mel, ROWS_PER_FRAME),
         features={name: newest(rows) for name, rows in dyad.features.items()},
         fps=float(FRAME_HZ),
     )
 
 
-def _mel(rows: Floats, fps: float, frames: int) -> Floats:
-    """(4N, 128) at four rows a frame -> (4 * frames, 128): of each time the newest row."""
-    return at_rate(rows, ROWS_PER_FRAME * fps, ROWS_PER_FRAME * frames, ROWS_PER_FRAME * FRAME_HZ)
-
-
 def _motion(motion: Floats, fps: float, frames: int) -> Floats:
-    """(N, 58) -> (frames, 58). A frame stands for its end, (i + 1) / rate; the first also for what was before it."""
+    """Resample (N, 58) to (frames, 58). A frame stands for its end, (i + 1) / rate; the first also before."""
     ends_s = (np.arange(len(motion)) + 1) / fps
     found = resample(Track(ends_s, motion, frozenset(CHANNELS)), FRAME_HZ, FRAME_S).motion[:frames]
     found[(np.arange(frames) + 1) * FRAME_S < ends_s[0] - 1e-6] = motion[0]

@@ -6,31 +6,61 @@ Of a checked set every clip is read once, and nothing is skipped in silence.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 from rich.console import Console
-from rich.progress import Progress, TaskID
+from rich.progress import track
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS, Doubles
-from sfms_robot.lab.corpora import clips, formats, stored
+from sfms_robot.lab.corpora import clips, formats
 from sfms_robot.lab.corpora.clips import SEAMLESS_CHANNELS, Dyad
-from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order, Problem, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.compose.composed import compose_folder
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, Residual, names, to_ours
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
+_T = TypeVar("_T")
+
+
+def _shown(items: Sequence[_T], what: str) -> Iterable[_T]:
+    """Iterate under a progress bar on stderr, if that is a terminal."""
+    console = Console(stderr=True)
+    return track(items, what, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _scanned(layout: Layout, place: Path, split: str, order: Order | None) -> Dataset:
+    """Read names and headers of a split, with a message: of many files even these take some time."""
+    with Console(stderr=True).status(f"{split}: headers"):
+        return formats.scan_split(layout, place, split, order)
+
+
+def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False) -> dict[str, Any]:
+    """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
+    with Console(stderr=True).status("reading") as status:
+
+        def told(name: str, wanted: float, done: float) -> None:
+            status.update(f"composing {name}: {done:.0f} of {wanted:.0f} minutes")
+
+        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite))
+
+
+# --- `data check` ---------------------------------------------------------------------------------------------------
+
 
 def check_data(folder: Path, layout: str = "auto", order: Order | None = None, window: int = 0) -> dict[str, Any]:
-    """Look at every split of a folder.
+    """Read every split of a folder.
 
     Args:
-        window: frames that a clip must have.
+        window: Frames that a clip must have.
 
     Returns:
         layout, order, licence, and per split: clips, minutes, fps, space, frames, sound, features, channels, problems
@@ -39,9 +69,7 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
     Raises ConfigError where there is no data set at all.
     """
     found, place = formats.detect(folder, layout)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        splits = [_split(found, place, name, order, window, progress) for name in formats.split_names(found, place)]
+    splits = [_checked(found, place, name, order, window) for name in formats.split_names(found, place)]
     swapped = any(problem["kind"] == "swapped order" for split in splits for problem in split["problems"])
     return {
         "folder": str(place),
@@ -55,153 +83,108 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
     }
 
 
-def _split(
-    layout: Layout, place: Path, split: str, order: Order | None, window: int, progress: Progress
-) -> dict[str, Any]:
+def _checked(layout: Layout, place: Path, split: str, order: Order | None, window: int) -> dict[str, Any]:
+    """Read every clip of a split; return its report."""
     try:
-        dataset = scanned(layout, place, split, order, progress)
+        dataset = _scanned(layout, place, split, order)
     except ConfigError as error:
-        broken = Problem("unreadable", str(place), str(error))
-        return _report(
-            Dataset(layout=layout.name, split=split, space=layout.space, fps=layout.fps, clips=(), problems=(broken,)),
-            _Tally(),
-            {},
-        )
-    task = progress.add_task(split, total=len(dataset))
-    tally = _Tally()
-
-    def each(dyad: Dyad | None) -> None:
-        if dyad is not None:
-            tally.add(dyad)
-        progress.advance(task)
-
-    checked = dataset.checked(window, each)
+        dataset = Dataset(
+            layout=layout.name, split=split, space=layout.space, fps=layout.fps, clips=(),
+            problems=(Problem("unreadable", str(place), str(error)),),
+        )  # fmt: skip
+    tally, kept, problems = _Tally(), list[Clip](), list(dataset.problems)
+    for index, clip in enumerate(_shown(dataset.clips, split)):
+        try:
+            if clip.frames < (least := max(1, window)):
+                raise ClipError.of("too short", clip.name, f"{clip.frames} frames, a window needs {least}")
+            tally.add(dataset[index], clip)
+            kept.append(clip)
+        except ClipError as error:
+            problems.append(error.problem)
+    checked = replace(dataset, clips=tuple(kept))
+    notes = list(dataset.notes)
     if said := formats.wrong_order(checked, order or layout.order):
         if order is None:
-            checked = replace(checked, problems=(*checked.problems, Problem("swapped order", split, said)))
+            problems.append(Problem("swapped order", split, said))
         else:
-            checked = replace(checked, notes=(*checked.notes, said))
-    counts, missing = _features(checked, progress.add_task(f"{split}: features", total=len(checked)), progress.advance)
-    return _report(replace(checked, problems=(*checked.problems, *missing)), tally, counts)
-
-
-def scanned(layout: Layout, place: Path, split: str, order: Order | None, progress: Progress) -> Dataset:
-    """Names and headers of a split, under a bar that says so: of many files even these take their time."""
-    task = progress.add_task(f"{split}: headers", total=None)
-    try:
-        return formats.scan_split(layout, place, split, order)
-    finally:
-        progress.remove_task(task)
-
-
-def _features(dataset: Dataset, task: Any, advance: Callable[[Any], None]) -> tuple[dict[str, int], Sequence[Problem]]:
-    """Return how many clips have each shipped feature, and the problems of the others.
-
-    A feature that no clip has is not shipped: a count of 0, not a problem of every clip.
-    """
-    counts: Counter[str] = Counter()
-    problems: dict[str, list[Problem]] = {}
-    for clip in dataset.clips:
-        for name, read in clip.features.items():
-            counts[name] += 0
-            try:
-                guarded(clip.name, read)
-                counts[name] += 1
-            except ClipError as error:
-                problems.setdefault(name, []).append(error.problem)
-        advance(task)
-    partly = [
-        problem
-        for name, found in problems.items()
-        for problem in found
-        if counts[name] or problem.kind != "missing feature"
-    ]
-    return dict(counts), partly
-
-
-@dataclass(kw_only=True)
-class _Tally:
-    """Figures of the clips read so far; channels are summed up in float64."""
-
-    low: Doubles | None = None
-    high: Doubles | None = None
-    total: Doubles | None = None
-    square: Doubles | None = None
-    frames: int = 0
-    listening: int = 0
-    faceless: int = 0
-    sound: Counter[str] = field(default_factory=Counter)
-
-    def add(self, dyad: Dyad) -> None:
-        motion = dyad.listener.astype(np.float64)
-        ends = motion.min(axis=0), motion.max(axis=0)
-        sums = motion.sum(axis=0), np.square(motion).sum(axis=0)
-        if self.low is None or self.high is None or self.total is None or self.square is None:
-            (self.low, self.high), (self.total, self.square) = ends, sums
-        else:
-            self.low, self.high = np.minimum(self.low, ends[0]), np.maximum(self.high, ends[1])
-            self.total, self.square = self.total + sums[0], self.square + sums[1]
-        self.frames += len(motion)
-        self.listening += int(dyad.listening.sum())
-        self.faceless += int((~np.isfinite(dyad.speaker).all(axis=1)).sum())
-        self.sound["waveform" if dyad.audio is not None else "mel" if dyad.mel is not None else "none"] += 1
-
-    def channels(self, names: Sequence[str]) -> list[dict[str, Any]]:
-        if self.low is None or self.high is None or self.total is None or self.square is None:
-            return []
-        mean = self.total / self.frames
-        spread = np.sqrt(np.maximum(0.0, self.square / self.frames - mean**2))
-        return [
-            {"name": name, "min": low, "max": high, "mean": middle, "std": std}
-            for name, low, high, middle, std in zip(
-                names, *(np.round(row, 5).tolist() for row in (self.low, self.high, mean, spread)), strict=True
-            )
-        ]
-
-
-def _report(dataset: Dataset, tally: _Tally, features: dict[str, int]) -> dict[str, Any]:
-    width = len(tally.low) if tally.low is not None else 0
-    known = {**SPACE_CHANNELS, "seamless27": SEAMLESS_CHANNELS}
-    names = known.get(dataset.space) or [f"channel_{index}" for index in range(width)]
+            notes.append(said)
     kinds: dict[str, list[Problem]] = {}
-    for problem in dataset.problems:
+    for problem in (*problems, *tally.missing()):
         kinds.setdefault(problem.kind, []).append(problem)
-    lengths = dataset.lengths
+    lengths = checked.lengths
     return {
-        "split": dataset.split,
-        "clips": len(dataset),
-        "minutes": round(dataset.minutes, 3),
+        "split": split,
+        "clips": len(checked),
+        "minutes": round(checked.minutes, 3),
         "fps": dataset.fps,
         "space": dataset.space,
         "frames": {"min": min(lengths), "median": float(np.median(lengths)), "max": max(lengths)} if lengths else None,
         "sound": dict(tally.sound),
-        "features": features,
-        "listening_share": round(tally.listening / tally.frames, 4) if tally.frames else None,
+        "features": dict(tally.features),
+        "listening_share": round(tally.listening / sum(lengths), 4) if lengths else None,
         "speaker_unknown_frames": tally.faceless,
-        "channels": tally.channels(names),
+        "channels": tally.channels(dataset.space, sum(lengths)),
         "problems": [
             {"kind": kind, "count": len(found), "names": [one.where for one in found], "first": found[0].detail}
             for kind, found in kinds.items()
         ],
-        "notes": list(dataset.notes),
+        "notes": notes,
         "licence": dataset.licence,
     }
 
 
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False) -> dict[str, Any]:
-    """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        tasks: dict[str, TaskID] = {}
+class _Tally:
+    """Figures of the clips read so far.
 
-        def told(name: str, wanted: float, done: float) -> None:
-            if name not in tasks:
-                tasks[name] = progress.add_task(f"composing {name}", total=wanted)
-            progress.update(tasks[name], completed=done)
+    Attributes:
+        listening, faceless: Frames in which the listener listens, and in which the speaker's face is not known.
+        sound: Clips by the form of their sound.
+        features: Clips that have each shipped feature.
+    """
 
-        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite))
+    def __init__(self) -> None:
+        self.listening = self.faceless = 0
+        self.sound: Counter[str] = Counter()
+        self.features: Counter[str] = Counter()
+        self._missing: dict[str, list[Problem]] = {}
+        self._motion: list[Doubles] = []  # of each clip, (4, D): lowest, highest, sum, sum of squares
+
+    def add(self, dyad: Dyad, clip: Clip) -> None:
+        """Count a clip, and read each of its shipped features."""
+        motion = dyad.listener.astype(np.float64)
+        self._motion.append(
+            np.stack([motion.min(axis=0), motion.max(axis=0), motion.sum(axis=0), np.square(motion).sum(axis=0)])
+        )
+        self.listening += int(dyad.listening.sum())
+        self.faceless += int((~np.isfinite(dyad.speaker).all(axis=1)).sum())
+        self.sound["waveform" if dyad.audio is not None else "mel" if dyad.mel is not None else "none"] += 1
+        for name, read in clip.features.items():
+            self.features[name] += 0
+            try:
+                guarded(clip.name, read)
+                self.features[name] += 1
+            except ClipError as error:
+                self._missing.setdefault(name, []).append(error.problem)
+
+    def missing(self) -> Iterator[Problem]:
+        """Yield problems of features. One that no clip has is not shipped: a count of 0, and no problem."""
+        for name, found in self._missing.items():
+            yield from (one for one in found if self.features[name] or one.kind != "missing feature")
+
+    def channels(self, space: str, frames: int) -> list[dict[str, Any]]:
+        """Return range, mean and standard deviation of each channel over all frames."""
+        if not self._motion:
+            return []
+        low, high, total, square = np.stack(self._motion, axis=1)
+        mean = total.sum(axis=0) / frames
+        spread = np.sqrt(np.maximum(0.0, square.sum(axis=0) / frames - mean**2))
+        known = {**SPACE_CHANNELS, "seamless27": SEAMLESS_CHANNELS}
+        figures = zip(*(np.round(each, 5).tolist() for each in (low.min(0), high.max(0), mean, spread)), strict=True)
+        titles = known.get(space) or [f"channel_{index}" for index in range(len(mean))]
+        return [
+            dict(zip(("name", "min", "max", "mean", "std"), (name, *row), strict=True))
+            for name, row in zip(titles, figures, strict=True)
+        ]
 
 
 # --- Behind `data convert`: a data set as its authors lay it out in, dyads as `train` and `evaluate` read them out
@@ -231,19 +214,20 @@ def convert_data(
     if found.space not in CONVERTIBLE:
         raise ConfigError(f"{place}: {found.name} is in {found.space}, which cannot become arkit58")
     flame = _matrix(found.space, flame_matrix, flame_order)
-    _empty(out)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: is a file, not a folder to write dyads to")
+    if out.is_dir() and any(out.iterdir()):
+        raise ConfigError(f"{out}: is not empty: dyads of two conversions would be mixed")
     residual = Residual()
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        sets = {name: scanned(found, place, name, order, progress) for name in formats.split_names(found, place)}
-        licence = next((one.licence for one in sets.values() if one.licence), None)
-        _origin(out, place, found.name, licence)
-        splits = [
-            _data_split(dataset, out / name, residual, flame, order or found.order, progress)
-            for name, dataset in sets.items()
-        ]
+    sets = [_scanned(found, place, name, order) for name in formats.split_names(found, place)]
+    licence = next((one.licence for one in sets if one.licence), None)
+    out.mkdir(parents=True, exist_ok=True)
+    origin = {"layout": found.name, "folder": str(place.resolve()), "licence": licence}
+    text = "# Written by `sfms-robot data convert`: whose data these dyads are.\n" + yaml.safe_dump(origin, width=1000)
+    (out / formats.SOURCE).write_text(text, encoding="utf-8")
+    splits = [_converted(dataset, out / dataset.split, residual, flame, order or found.order) for dataset in sets]
     if not any(split["clips"] for split in splits):
-        (out / stored.SOURCE).unlink()
+        (out / formats.SOURCE).unlink()
         first = next((one for split in splits for one in split["left_out"]), None)
         raise ConfigError(f"{place}: no usable clip" + (f": {first['first']}" if first else ""))
     return {
@@ -268,52 +252,29 @@ def _matrix(space: str, file: Path | None, order: str) -> FlameMatrix | None:
     return read_matrix(file, order)
 
 
-def _empty(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: is a file, not a folder to write dyads to")
-    if out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"{out}: is not empty: dyads of two conversions would be mixed")
-
-
-def _origin(out: Path, place: Path, layout: str, licence: str | None) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    told = {"layout": layout, "folder": str(place.resolve()), "licence": licence}
-    text = "# Written by `sfms-robot data convert`: whose data these dyads are.\n" + yaml.safe_dump(told, width=1000)
-    (out / stored.SOURCE).write_text(text, encoding="utf-8")
-
-
-def _data_split(
-    dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None, order: Order | None, progress: Progress
+def _converted(
+    dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None, order: Order | None
 ) -> dict[str, Any]:
+    """Convert every clip of a split, write it, and compare the motion that is read back; return the split's report."""
     if said := formats.wrong_order(dataset, order):
         raise ConfigError(f"{dataset.split}: {said}")
-    task = progress.add_task(dataset.split, total=len(dataset))
     problems, seconds, written = list(dataset.problems), 0.0, 0
-    for index in range(len(dataset)):
+    for index in _shown(range(len(dataset)), dataset.split):
         try:
-            dyad = _one(dataset, index, out, residual, flame)
-            seconds += len(dyad.listener) / dyad.fps
-            written += 1
+            dyad = dataset[index]
+            ours = guarded(dyad.name, partial(to_ours, dyad, residual, flame))
         except ClipError as error:
             problems.append(error.problem)
-        progress.advance(task)
-    kinds = {problem.kind: problem for problem in reversed(problems)}
+            continue
+        clips.save(out, [ours])
+        residual.written(ours, clips.read(out / f"{ours.name}.npz"))
+        seconds += len(ours.listener) / ours.fps
+        written += 1
+    counts, first = Counter(one.kind for one in problems), {one.kind: one for one in reversed(problems)}
     return {
         "split": dataset.split,
         "clips": written,
         "minutes": round(seconds / 60, 3),
-        "left_out": [
-            {"kind": kind, "count": sum(one.kind == kind for one in problems), "first": str(first)}
-            for kind, first in kinds.items()
-        ],
+        "left_out": [{"kind": kind, "count": counts[kind], "first": str(one)} for kind, one in first.items()],
         "notes": list(dataset.notes),
     }
-
-
-def _one(dataset: Dataset, index: int, out: Path, residual: Residual, flame: FlameMatrix | None) -> Dyad:
-    """One clip converted, written, and read back. Raises ClipError for one that cannot be used."""
-    dyad = dataset[index]
-    converted = guarded(dyad.name, lambda: to_ours(dyad, residual, flame))
-    clips.save(out, [converted])
-    residual.written(converted, clips.read(out / f"{converted.name}.npz"))
-    return converted

@@ -7,29 +7,103 @@ default the layout's own; files that look like the other one are refused before 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 
+from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Floats
-from sfms_robot.lab.corpora import stored
-from sfms_robot.lab.corpora.audio_features import Feature, cached
-from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import ClipError, Dataset, Layout, Order
+from sfms_robot.frames import FRAME_HZ, Doubles, Floats
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, read
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
-from sfms_robot.lab.corpora.reading import pose_last
+from sfms_robot.lab.corpora.reading import npz, npz_shapes, pose_last
+
+# --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
+
+SOURCE: Final = "source.yaml"  # beside the splits of converted data: their layout and licence
+_FEATURE: Final = "feature."
+
+
+def _stored_splits(place: Path) -> Mapping[str, str]:
+    found = {str(split): str(split) for split in SPLITS if any((place / split).glob("*.npz"))}
+    first = next((file for split in ("", *found) for file in sorted((place / split).glob("*.npz"))[:1]), None)
+    if first is None:
+        return {}
+    try:
+        ours = "listening" in npz_shapes(first)
+    except ClipError:
+        ours = not first.stem.endswith(("_speaker1", "_speaker2"))
+    return (found or {"train": "."}) if ours else {}
+
+
+def _stored_kind(file: Path) -> tuple[str, float]:
+    """Return space and frame rate of one dyad. Raises ClipError for another file."""
+    shapes = npz_shapes(file)
+    if "listening" not in shapes:
+        raise ClipError.of("unreadable", file, "not a dyad: has no listening")
+    space, fps = npz(file, "space", "fps") if "space" in shapes else ("arkit58", FRAME_HZ)
+    return str(space), float(fps)
+
+
+def _stored_facts(place: Path, split: str) -> Mapping[str, Any]:
+    """Return space and rate of the first dyad, and the licence of converted data.
+
+    `place` may be one split of them. Raises ConfigError for an invalid source.yaml.
+    """
+    facts: dict[str, Any] = {}
+    for file in sorted((place / split).glob("*.npz")):
+        try:
+            facts["space"], facts["fps"] = _stored_kind(file)
+            break
+        except ClipError:  # named by the scan
+            continue
+    source = next((base / SOURCE for base in (place, place.parent) if (base / SOURCE).is_file()), None)
+    if source is not None:
+        told = read_yaml(source)
+        facts["licence"] = told.get("licence") if isinstance(told, dict) else told
+        if not isinstance(told, dict) or not isinstance(facts["licence"], str | None):
+            raise ConfigError.at(source, "licence", facts["licence"], "is not text")
+    return facts
+
+
+def _stored_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    kinds: list[tuple[str, float]] = []
+
+    def clip(file: Path) -> Clip:
+        kinds.append(kind := _stored_kind(file))
+        if kind != kinds[0]:
+            raise ClipError.of("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {kinds[0][0]}")
+        shapes = npz_shapes(file)
+        features = {key.removeprefix(_FEATURE): partial(_stored_feature, file, key)
+                    for key in shapes if key.startswith(_FEATURE)}  # fmt: skip
+        return Clip(name=file.stem, frames=shapes["listening"][0], read=partial(read, file), features=features)
+
+    yield from attempt(sorted((place / split).glob("*.npz")), clip)
+
+
+def _stored_feature(file: Path, key: str) -> Floats:
+    return np.asarray(npz(file, key)[0], np.float32)
+
+
+COMPOSED: Final = Layout(
+    name="composed", about="dyads of sfms-robot: {train,validation,test}/NAME.npz", space="arkit58",
+    fps=float(FRAME_HZ), splits=_stored_splits, scan=_stored_scan, facts=_stored_facts, below=("",),
+)  # fmt: skip
+
+
+# --- Every layout ---------------------------------------------------------------------------------------------------
 
 LAYOUTS: Final = {
     layout.name: layout
     for layout in (
-        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.REACT2025_LAYOUT,
-        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, stored.LAYOUT,
+        l2l.LAYOUT, l2l.LM_LISTENER_LAYOUT, react.LAYOUT, react.LAYOUT_2025,
+        dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, COMPOSED,
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
@@ -41,14 +115,14 @@ log = logging.getLogger(__name__)
 
 
 def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
-    """The layout of a folder and where in it the data lie. Raises ConfigError if there is none, naming those known."""
+    """Return the layout of a folder and the place of the data in it. Raises ConfigError if there is none."""
     if layout != "auto" and layout not in LAYOUTS:
         raise ConfigError(f"--layout {layout}: is not known (auto, {', '.join(LAYOUTS)})")
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder")
     tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
     # Our own first: converted dyads keep the names of their files, and these may be another layout's.
-    for candidate in sorted(tried, key=lambda one: one is not stored.LAYOUT):
+    for candidate in sorted(tried, key=lambda one: one is not COMPOSED):
         place = candidate.root(folder)
         if place is not None:
             return candidate, place
@@ -57,7 +131,7 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
 
 
 def split_names(layout: Layout, place: Path) -> tuple[str, ...]:
-    """Splits that `open_dataset` can give, by our names."""
+    """Return the splits that `open_dataset` can give, by our names."""
     found = set(layout.splits(place))
     if "train" in found and layout.held_out:
         found.add("validation")
@@ -69,10 +143,9 @@ def open_dataset(
     split: str,
     layout: str = "auto",
     order: Order | None = None,
-    space: str | None = None,
     features: Iterable[str] = (),
 ) -> Dataset:
-    """Dyads of one split of a data set on disk, read one at a time when asked for.
+    """Open one split of a data set on disk; its dyads are read one at a time when asked for.
 
     Args:
         split: train, validation (val, valid, dev), test or what else the layout has. Where it ships no validation, a
@@ -80,7 +153,6 @@ def open_dataset(
         layout: a key of `LAYOUTS`, or "auto".
         order: of the channels in the files, by default the layout's; refused unless it is said and they look
             like the other.
-        space: the layout's own, or "arkit58" for faceverse58 data, or react's "faceverse58-centred".
         features: names of shipped features each dyad is to carry.
 
     What cannot be used is in `problems` and counted in a warning. Raises ConfigError when nothing is left.
@@ -92,16 +164,16 @@ def open_dataset(
         raise ConfigError(f"{place}: no usable clip in {split} ({len(dataset.problems)} problems){why}")
     if order is None and (said := wrong_order(dataset, found.order)):
         raise ConfigError(f"{place}: {said}")
-    dataset = replace(dataset, features=_shipped(found, features))
+    dataset = replace(dataset, features=tuple(features))
     if dataset.problems:
         log.warning("%s", dataset.summary())
     if dataset.licence is not None and dataset.split == "train":  # what weights come from
         log.warning("%s: %s", place, dataset.licence)
-    return _in_space(dataset, place, space or dataset.space)
+    return dataset
 
 
 def open_for(space: str, folder: Path, split: str, order: Order | None = None, features: Iterable[str] = ()) -> Dataset:
-    """`open_dataset` for a listener that works in `space`: the data in that space, or in ours, which becomes any.
+    """Open a data set for a listener that works in `space`: in that space, or in arkit58, which becomes any.
 
     Every dyad carries those of `features` that its data ship; what they do not is made from the sound.
     """
@@ -122,7 +194,7 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
 
 def _checked(order: Order | None, layout: Layout) -> Order | None:
     if order is not None and order not in get_args(Order):
-        raise ConfigError(f"--order {order}: is no order of channels ({', '.join(get_args(Order))})")
+        raise ConfigError(f"--order {order}: expected {' or '.join(get_args(Order))}")
     if order is not None and layout.order is None:
         raise ConfigError(f"--order {order}: {layout.name} files name their channels, there is no order to choose")
     return order or layout.order
@@ -133,7 +205,7 @@ def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Data
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
     held_out = "validation" not in theirs and layout.held_out
-    whole = replace(layout.scan(place, theirs.get(split, theirs.get("train", "")), order), split=split)
+    whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order)
     if not held_out or split not in ("train", "validation"):
         return whole
     rank = np.random.default_rng(_SEED).permutation(len(whole))
@@ -144,50 +216,8 @@ def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Data
     return replace(whole, clips=clips, notes=(*whole.notes, note))
 
 
-def _shipped(layout: Layout, features: Iterable[str]) -> tuple[str, ...]:
-    wanted = tuple(features)
-    for name in wanted:
-        if name not in layout.features and layout.name != stored.LAYOUT.name:
-            raise ConfigError(f"{layout.name} ships no feature {name!r} ({', '.join(layout.features) or 'none'})")
-    return wanted
-
-
-def with_feature(dataset: Dataset, feature: Feature, cache: Path) -> Dataset:
-    """The same set, every dyad carrying a feature of its speaker's voice, computed once and kept in `cache`.
-
-    Raises ConfigError for data without a waveform, and for a feature of another frame rate.
-    """
-    if feature.fps != dataset.fps:
-        raise ConfigError(f"{feature.name} has {feature.fps:g} frames a second, {dataset.layout} {dataset.fps:g}")
-
-    def heard(clip: Dyad) -> Dyad:
-        if clip.audio is None:
-            raise ConfigError(f"{clip.name} has no waveform to compute {feature.name} from")
-        rows = cached(clip.audio, feature, cache)[: len(clip.listener)]
-        short = len(clip.listener) - len(rows)  # where a frame is no whole number of samples
-        return replace(clip, features={**clip.features, feature.name: np.pad(rows, ((0, short), (0, 0)), mode="edge")})
-
-    return dataset.map(heard)
-
-
-# --- spaces -----------------------------------------------------------------------------------------------------
-
-
-def _in_space(dataset: Dataset, place: Path, space: str) -> Dataset:
-    if space == dataset.space:
-        return dataset
-    if dataset.space == "faceverse58" and space == "arkit58":
-        return dataset.map(_as_arkit, space)
-    if dataset.layout == react.LAYOUT.name and space == "faceverse58-centred":
-        return dataset.map(partial(react.centred, react.mean_face(place)), space)
-    choices = [dataset.space]
-    if dataset.space == "faceverse58":
-        choices += ["arkit58"] + ["faceverse58-centred"] * (dataset.layout == react.LAYOUT.name)
-    raise ConfigError(f"--space {space}: {dataset.layout} comes in {', '.join(choices)}")
-
-
 def _as_arkit(clip: Dyad) -> Dyad:
-    """faceverse58 in our units; a speaker's unknown frames stay unknown."""
+    """Return a faceverse58 dyad in arkit58; a speaker's unknown frames stay unknown."""
     speaker, listener = (in_ours(motion, "faceverse58") for motion in (clip.speaker, clip.listener))
     return replace(clip, speaker=speaker, listener=listener, space="arkit58")
 
@@ -196,7 +226,7 @@ def _as_arkit(clip: Dyad) -> Dyad:
 
 
 def wrong_order(dataset: Dataset, declared: Order | None) -> str | None:
-    """One line if a sample of the set looks like the other order than `declared`, naming the option that says so."""
+    """Return one line if a sample of the set looks like the other order than `declared`, naming the option to give."""
     if declared is None or not dataset.clips:
         return None
     sample = []
@@ -212,7 +242,7 @@ def wrong_order(dataset: Dataset, declared: Order | None) -> str | None:
 
 
 def looks_like(motions: Sequence[Floats], space: str, declared: Order) -> Order | None:
-    """The order that files look to have; `motions` (T, D) were read as if it was the declared one. None: no telling.
+    """Return the order that files look to have; `motions` (T, D) were read in the `declared` one. None: unknown.
 
     deca56: a jaw hardly turns about y and z, and expressions do vary: two still columns end the six of the pose.
     faceverse58: the rotation about x stays near pi, which no expression does.

@@ -6,6 +6,7 @@ A pickle can run code. Those of data sets hold arrays and plain values, and only
 from __future__ import annotations
 
 import csv
+import gzip
 import importlib
 import io
 import pickle
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import ClipError, Problem
+from sfms_robot.lab.corpora.collection import ClipError
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
 
@@ -48,7 +49,7 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def _module(name: str) -> Any:
-    """numpy 1's modules under the names of the numpy at hand."""
+    """Import one of numpy 1's modules by the name that it has in the installed numpy."""
     return importlib.import_module(name.replace("numpy.core", "numpy._core") if _NUMPY_2 else name)
 
 
@@ -56,7 +57,7 @@ _NUMPY_2: Final = int(np.__version__.split(".")[0]) >= 2
 
 
 def unpickle(file: Path) -> Any:
-    """A pickle of arrays and plain values. Raises UnpicklingError for one that asks for anything else, or is broken."""
+    """Return arrays and plain values of a pickle. Raises UnpicklingError for one that asks for more, or is broken."""
     content = io.BytesIO(file.read_bytes())
     try:
         return _ArraysOnly(content).load()
@@ -96,7 +97,7 @@ def _has(module: str, name: str) -> bool:
 
 
 def npy(file: Path) -> NDArray[Any]:
-    """An array on disk, mapped rather than read. Raises ClipError."""
+    """Map an array on disk into memory. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing half", file, "no such file")
     try:
@@ -112,16 +113,32 @@ def npy(file: Path) -> NDArray[Any]:
 
 
 def table(file: Path) -> list[list[str]]:
-    """Rows of a CSV file, the header among them, empty ones left out. Raises ConfigError."""
+    """Return the rows of a CSV file, gzipped or not, with its header, without empty rows. Raises ConfigError."""
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            return [row for row in csv.reader(stream) if row]
-    except (OSError, ValueError, csv.Error) as error:
+        with gzip.open(file, "rb") if file.suffix == ".gz" else file.open("rb") as stream:
+            lines = io.TextIOWrapper(stream, encoding="utf-8-sig", newline="")
+            return [row for row in csv.reader(lines) if row]
+    except (OSError, EOFError, ValueError, csv.Error) as error:
         raise ConfigError(f"{file}: not a table: {error}") from error
 
 
+def columns(file: Path) -> dict[str, list[str]]:
+    """Return the columns of a CSV file by their names in the header. Raises ConfigError."""
+    try:
+        header, *rows = table(file)
+        return dict(zip(header, map(list, zip(*rows, strict=True)) if rows else ([] for _ in header), strict=True))
+    except ValueError as error:
+        raise ConfigError(f"{file}: not a table: {error}") from error
+
+
+def npz(file: Path, *keys: str) -> list[NDArray[Any]]:
+    """Return arrays of a .npz. Raises what `UNREADABLE` names."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return [arrays[key] for key in keys]
+
+
 def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of a .npz, from their headers. Raises ClipError."""
+    """Read the shapes of the arrays of a .npz from their headers. Raises ClipError."""
     shapes = {}
     try:
         with zipfile.ZipFile(file) as archive:
@@ -140,7 +157,7 @@ def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 
 def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) -> int:
-    """Frames that tracks of these shapes share; singleton axes do not count. Raises ClipError if lengths differ."""
+    """Return the frames that tracks of these shapes share; singleton axes do not count. Raises ClipError."""
     lengths = [next((size for size in shape[:-1] if size != 1), 1) for shape in tracks]
     if max(lengths) - min(lengths) > slack:
         raise ClipError.of("lengths differ", name, f"{max(lengths)} frames beside {min(lengths)}")
@@ -148,7 +165,7 @@ def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) ->
 
 
 def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: bool = False) -> Floats:
-    """The first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
+    """Return the first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
 
     Raises ClipError for other shapes, and for values that are not finite unless `gaps` are allowed.
     """
@@ -164,7 +181,7 @@ def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: boo
 
 
 def sound(file: Path, frames: int, fps: float) -> Floats:
-    """A voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
+    """Return a voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing sound", file, "no such file")
     audio, wanted = read_audio(file), samples_of(frames, fps)
@@ -174,48 +191,46 @@ def sound(file: Path, frames: int, fps: float) -> Floats:
     return np.pad(audio[:wanted], (0, max(0, wanted - len(audio))))
 
 
-def dyad(
+def voices_of(*files: Path) -> list[Path]:
+    """Return the files of a clip's voices. Raises ClipError if the speaker's, the first, is missing."""
+    if not files[0].is_file():
+        raise ClipError.of("missing sound", files[0], "no such file")
+    return list(files)
+
+
+def dyad_of(
     name: str,
-    speaker: Floats,
-    listener: Floats,
+    faces: Sequence[tuple[object, NDArray[Any]]],
+    frames: int,
     space: str,
     fps: float,
     *,
-    audio: Floats | None = None,
+    voices: Sequence[Path] = (),
     mel: Floats | None = None,
-    own: Floats | None = None,
+    own: bool = False,
 ) -> Dyad:
     """Return a dyad of a data set without annotations: the two voices, where both are there, say who listens when.
 
-    Without the listener's `own` voice the listener listens all the time, as the role in the data says.
+    Without the listener's voice the listener listens all the time, as the role in the data says.
+
+    Args:
+        faces: Origin and rows (T, D) of the speaker, which may have gaps, and of the listener.
+        voices: Files of the speaker's and the listener's voice; the second may be missing.
+        own: Let the dyad carry the listener's voice.
     """
-    frames = len(listener)
-    listening = np.ones(frames, bool)
-    if audio is not None and own is not None:
-        voices = [speaks(voice, frames, fps) for voice in (audio, own)]
-        listening = np.asarray(listening_mask(voices[0], fps, voices[1]), bool)
-    return Dyad(
-        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel
-    )
-
-
-def filed_dyad(
-    name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, space: str, fps: float, pose_first: bool
-) -> Dyad:
-    """Return a dyad with its motion in one .npy file for the speaker and one for the listener; the same for voices."""
     speaker, listener = (
-        track(str(file), pose_last(npy(file), pose_first), frames, WIDTHS[space], gaps=gaps)
-        for file, gaps in zip(faces, (True, False), strict=True)
+        track(str(origin), rows, frames, WIDTHS[space], gaps=gaps)
+        for (origin, rows), gaps in zip(faces, (True, False), strict=True)
     )
-    return dyad(name, speaker, listener, space, fps, **voices_of(voices, frames, fps))
-
-
-def voices_of(voices: Sequence[Path], frames: int, fps: float) -> dict[str, Floats | None]:
-    """`audio` of the speaker and `own` of the listener from their files, as `dyad` takes them; the second may lack."""
-    if not voices:
-        return {}
-    own = sound(voices[1], frames, fps) if voices[1].is_file() else None
-    return {"audio": sound(voices[0], frames, fps), "own": own}
+    audio = sound(voices[0], frames, fps) if voices else None
+    said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
+    listening = np.ones(frames, bool)
+    if audio is not None and said is not None:
+        listening = np.asarray(listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps)), bool)
+    return Dyad(
+        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
+        agent_audio=said if own else None,
+    )  # fmt: skip
 
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
@@ -225,7 +240,7 @@ def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
 
 
 def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
-    """An array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
+    """Return an array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
     found = values[key]
     array = np.asarray(found.numpy() if hasattr(found, "numpy") else found)
     if array.dtype.kind not in "fiu":
@@ -234,18 +249,5 @@ def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
 
 
 def pose_last(values: NDArray[Any], pose_first: bool) -> NDArray[Any]:
-    """Channels with the six pose ones last, from files in which they stand first or already do."""
+    """Return channels with the six of the pose last, from files in which they stand first or already do."""
     return np.concatenate([values[..., 6:], values[..., :6]], axis=-1) if pose_first else values
-
-
-def collect(
-    names: Sequence[tuple[int, str]], build: Callable[[int, str], Any]
-) -> tuple[tuple[Any, ...], tuple[Problem, ...]]:
-    """`build` for every (row, name): what came out, and the problems of those that failed."""
-    built, problems = [], []
-    for row, name in names:
-        try:
-            built.append(build(row, name))
-        except ClipError as error:
-            problems.append(error.problem)
-    return tuple(built), tuple(problems)

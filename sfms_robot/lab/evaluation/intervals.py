@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from sfms_robot.frames import Doubles
-from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.splits import series
+from sfms_robot.lab.corpora.clips import Dyad, series
 
 LEVEL: Final = 0.95
 DRAWS: Final = 2000

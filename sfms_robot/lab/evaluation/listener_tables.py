@@ -24,8 +24,8 @@ from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SPACE_CHANNELS, Doubles
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.corpora.learning2listen import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.detection import behaviour
 from sfms_robot.lab.evaluation.intervals import Chosen, finite, jackknife, people_of
@@ -43,6 +43,8 @@ from sfms_robot.lab.learning.corpus import in_space
 from sfms_robot.lab.learning.sfms.features import frames_of, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_scores
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import reconstruction_error
+from sfms_robot.listeners.checkpoint import CONFIG
+from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace

@@ -20,9 +20,9 @@ from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
+from sfms_robot.lab.corpora.clips import Split
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
-from sfms_robot.lab.corpora.splits import Split
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, added_up, asked_and_seen
 from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates
@@ -60,6 +60,7 @@ from sfms_robot.listeners.events.model import (
     STEP_S,
     EventMemory,
     EventModel,
+    last_shift,
 )
 from sfms_robot.listeners.registry import engine_name
 from sfms_robot.listeners.stream_rng import Use, uniforms

@@ -35,9 +35,9 @@ from sfms_robot.frames import (
     Floats,
     SpeakerFrame,
 )
+from sfms_robot.lab.corpora.clips import Split, split_of_voice
 from sfms_robot.lab.corpora.compose.render_events import speaker_motion
 from sfms_robot.lab.corpora.compose.voices import find_voices, mouth_over
-from sfms_robot.lab.corpora.splits import Split, split_of_voice
 from sfms_robot.lab.evaluation.detection import seen
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames

@@ -29,7 +29,7 @@ from torch import Tensor
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
-from sfms_robot.lab.corpora import takes
+from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
     AS_WRITTEN,
@@ -309,12 +309,12 @@ def evaluate_table(
         raise ConfigError("--train needs --models DIR, a folder to keep the tokenizers in")
     chosen = TABLES if table == ALL else (table,)
     folder = models or data_dir("configs") / "tokenizers"
-    recorded = takes.load(data_dir("sim") / "listeners" / "takes.npz")
-    held_out = recorded[takes.HELD_OUT] if data is None else folder_takes(data)
+    recorded = read_takes(data_dir("sim") / "listeners" / "takes.npz")
+    held_out = recorded["held_out"] if data is None else folder_takes(data)
     wanted = list(dict.fromkeys(name for each in chosen for name in needed(each, models is None)))
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
-        examples = Windows.of(recorded[takes.HELD_OUT], _WINDOW_FRAMES).motion
-        train_all(missing, folder, recorded[takes.TRAIN], examples, size=size, steps=steps, jobs=jobs, again=train)
+        examples = Windows.of(recorded["held_out"], _WINDOW_FRAMES).motion
+        train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)
     loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))
     for name, model in loaded.items():  # errors in different units cannot stand in one table

@@ -7,8 +7,6 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.bench.own_voice_bench import (
     CHOSEN_ON,
-    CHOSEN_ON_GEAR_SEED,
-    GEAR_SEED,
     VoiceCondition,
     call_names,
     gear_noise,
@@ -23,10 +21,6 @@ def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):
     assert len(call_names(data_dir("sim") / "conversations")) == 2
     with pytest.raises(ConfigError, match="has no NAME_caller"):
         call_names(tmp_path / "nothing")
-
-
-def test_the_gears_that_are_reported_on_are_not_those_that_parameters_were_chosen_on():
-    assert GEAR_SEED != CHOSEN_ON_GEAR_SEED
 
 
 def test_motors_that_stand_are_silent():

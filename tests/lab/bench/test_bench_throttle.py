@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from sfms_robot.lab.bench.throttle_bench import Tree, processes_of, state_problems
+from sfms_robot.lab.bench.throttle_bench import held, processes_of, state_problems
 
 WELL = [(0.0, "starting", ()), (1.0, "listening", ()), (10.0, "stopping", ()), (11.0, "stopped", ())]
 PLANS = [(0.2 * count, 0.2 * count + 0.3) for count in range(1, 50)]
@@ -60,7 +60,7 @@ def test_a_process_and_all_that_it_starts_are_found():
 
 @linux
 def test_what_is_held_to_a_share_of_a_core_comes_to_its_end_all_the_same():
-    with Tree(["-c", "print(sum(range(10_000)))"], 0.5, stdout=subprocess.PIPE) as tree:
-        assert tree.process.stdout.read() == b"49995000\n"
-        assert tree.process.wait() == 0
-        tree.process.stdout.close()
+    with held(["-c", "print(sum(range(10_000)))"], 0.5, stdout=subprocess.PIPE) as process:
+        assert process.stdout.read() == b"49995000\n"
+        assert process.wait() == 0
+        process.stdout.close()

@@ -15,7 +15,7 @@ from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.lab import bench
 from sfms_robot.lab.bench import BENCHES, Bench, measure_all, run_bench
 from sfms_robot.lab.bench.measure import BenchResult, environment, row, write_page
-from sfms_robot.lab.bench.operation_count import BoardCore, OperationCount
+from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.learning import dry_run
 
 
@@ -34,16 +34,15 @@ def test_every_bench_is_a_function_that_takes_what_its_line_says(name):
 
 
 def test_a_bench_that_is_none_is_told_those_that_are():
-    with pytest.raises(ConfigError, match=r'there is no "bos" \(all, startup, bus, .*fuzz'):
+    with pytest.raises(ConfigError, match=r'there is no "bos" \(all, startup, bus, .*campaign'):
         run_bench("bos", {}, quiet)
 
 
 @pytest.mark.parametrize(
     ("name", "given", "said"),
     [
-        ("bus", {"frames": 5}, "--frames 5: only 'bench retarget' takes it"),
+        ("bus", {"hours": 5}, "--hours 5: only 'bench memory' takes it"),
         ("all", {"torture": True}, "--torture True: only 'bench live' takes it"),
-        ("retarget", {"head": "face28"}, "takes a head with --frames"),
     ],
 )
 def test_an_option_that_means_nothing_there_is_refused(name, given, said):
@@ -58,12 +57,6 @@ def test_a_page_has_every_row_and_says_where_it_was_measured(tmp_path):
     assert "| bus.tick | 1.5 ms | 1.99 | 0.375 | somebody | 2 |" in page and "in 1.5 minutes" in page
     with pytest.raises(ConfigError, match="cannot be written"):
         write_page(tmp_path / "nowhere" / "page.md", rows, 1.0)
-
-
-def test_a_board_is_as_fast_as_the_slower_of_its_core_and_its_memory():
-    board = BoardCore(clock_ghz=1.0, per_cycle=4, memory_gb_s=2.0, call_us=10.0)
-    assert board.ms(1e6, 0, 0) == pytest.approx(1.0) and board.ms(1e6, 4e6, 0) == pytest.approx(2.0)
-    assert board.ms(0, 0, 100) == pytest.approx(1.0)
 
 
 def test_a_row_says_how_often_against_what_and_on_which_machine():

@@ -8,8 +8,18 @@ from hypothesis.extra.numpy import arrays
 
 from sfms_robot.config.listener import STATES
 from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.conversational_states import PATTERNS, STATE, Voices, label, of_activity
+from sfms_robot.lab.corpora.conversational_states import STATE, Voices, label, of_activity
 
+# (agent speaks, user speaks) that a state may have.
+PATTERNS = {
+    "speaking": frozenset({(True, False)}),
+    "listening": frozenset({(False, True)}),
+    "receiving_feedback": frozenset({(True, True), (False, True)}),
+    "thinking": frozenset({(False, False)}),
+    "interrupted": frozenset({(True, True)}),
+    "waiting": frozenset({(False, False)}),
+    "giving_feedback": frozenset({(True, False), (True, True), (False, True)}),
+}
 MASKS = st.integers(0, 60).flatmap(lambda n: arrays(bool, (5, n)))
 
 
@@ -82,10 +92,3 @@ def test_without_dialogue_acts_short_words_in_the_others_turn_are_answers(frames
 def test_activity_alone_is_labelled_too():
     found = label(of_activity(mask("xxxx...."), mask("....xxxx")))
     assert [STATES[state] for state in found] == ["speaking"] * 4 + ["listening"] * 4
-
-
-def test_shares_count_what_is_labelled():
-    found = labels.shares(np.array([0, 0, 1, -1], np.int8))
-    assert found["speaking"] == pytest.approx(2 / 3)
-    assert sum(found.values()) == pytest.approx(1)
-    assert sum(labels.shares(np.array([-1], np.int8)).values()) == 0

@@ -1,34 +1,31 @@
-"""Cutting: a swing is cut whole, a resting face is zero, and what is saved is loaded."""
+"""Cutting motion primitives: a swing is cut whole, a resting face is zero, and saved pieces are loaded."""
+
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
-from sfms_robot.lab.corpora.compose.motions import (
-    cycles,
-    facegood_mouth,
-    neutral,
-    save,
-    slow,
-    table,
-)
-from sfms_robot.lab.corpora.splits import SPLITS
+from sfms_robot.lab.corpora.clips import SPLITS, read_takes
+from sfms_robot.lab.corpora.compose.motions import slow
+from sfms_robot.lab.corpora.compose.voices import facegood_mouth
+from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.signals.motion_primitives import KINDS, read_motions
+from sfms_robot.signals.tracks import Take
 
 TAKE = {"train": "yes1", "validation": "apfel", "test": "facial"}
+cut = runpy.run_path(str(Path(__file__).parents[3] / "scripts" / "cut_recordings.py"))
 
 
 def test_every_swing_of_a_nodding_head_is_cut_and_normalised():
     times = np.arange(10 * FRAME_HZ) / FRAME_HZ
-    found = cycles(np.deg2rad(4) * (0.5 - 0.5 * np.cos(2 * np.pi * 2 * times)), FRAME_HZ)
+    found = cut["cycles"](np.deg2rad(4) * (0.5 - 0.5 * np.cos(2 * np.pi * 2 * times)), FRAME_HZ)
     assert 16 <= len(found) <= 20
     for cycle in found:
         assert cycle[0] == cycle[-1] == 0 and cycle.max() == pytest.approx(1)
-
-
-def test_a_still_head_has_no_swings():
-    assert cycles(np.full(250, 0.1), FRAME_HZ) == []
+    assert cut["cycles"](np.full(250, 0.1), FRAME_HZ) == []
 
 
 def test_slow_motion_is_kept_and_fast_motion_is_not():
@@ -41,22 +38,24 @@ def test_slow_motion_is_kept_and_fast_motion_is_not():
 def test_a_resting_face_is_zero_and_a_lost_one_holds():
     face = np.full((40, len(BLENDSHAPES)), 0.3, np.float32)
     face[10:20] = np.nan
-    assert not neutral(face, 50).any()
+    assert not cut["neutral"](face, 50).any()
 
 
-def test_saved_primitives_are_loaded_in_their_split(tmp_path):
-    rng = np.random.default_rng(0)
+def test_saved_pieces_are_loaded_in_their_split(tmp_path):
+    rng, save, file = np.random.default_rng(0), cut["save_primitives"], tmp_path / "motions.npz"
     named = [(kind, TAKE[split], rng.uniform(0, 1, (5, 52))) for split in SPLITS for kind in KINDS]
-    save(tmp_path / "motions.npz", named)
-    loaded = read_motions(tmp_path / "motions.npz")
+    save(file, named)
+    loaded = read_motions(file)
     for (kind, _, array), split in zip(named, np.repeat(SPLITS, len(KINDS)), strict=True):
         np.testing.assert_allclose(getattr(loaded[split], kind)[0], array, atol=6e-4)
-
-
-def test_a_file_without_a_kind_is_refused(tmp_path):
-    save(tmp_path / "motions.npz", [("nods", "yes1", np.zeros(24, np.float32))])
+    save(file, [("nods", "yes1", np.zeros(24, np.float32))])
     with pytest.raises(ConfigError, match="no shakes for train"):
-        read_motions(tmp_path / "motions.npz")
+        read_motions(file)
+    take = Take("one", rng.uniform(0, 1, (90, 58)).astype(np.float32))
+    cut["save_takes"](tmp_path / "t.npz", [("train", take), ("held_out", take), ("held_out", take)])
+    found = read_takes(tmp_path / "t.npz")
+    assert len(found["train"]) == 1 and len(found["held_out"]) == 2
+    np.testing.assert_allclose(found["train"][0].motion, take.motion, atol=1.1e-4)
 
 
 def test_rig_weights_become_arkit_channels_at_25_fps(tmp_path):
@@ -69,9 +68,10 @@ def test_rig_weights_become_arkit_channels_at_25_fps(tmp_path):
     assert moving == pytest.approx({"jawOpen": 0.5, "mouthPucker": 0.4, "mouthSmileLeft": 0.3})
 
 
-def test_a_table_that_is_none_is_named(tmp_path):
-    (tmp_path / "words.csv").write_text("a,b\n1\n")
-    with pytest.raises(ConfigError, match="words.csv: not a table"):
-        table(tmp_path / "words.csv")
-    with pytest.raises(ConfigError, match="gone.csv: no such file"):
-        table(tmp_path / "gone.csv")
+@pytest.mark.parametrize("text, problem", [("a,b\n1\n", "not a table"), ("", "not a table"), (None, "not a table")])
+def test_a_table_that_cannot_be_read_is_named(tmp_path, text, problem):
+    file = tmp_path / "words.csv"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ConfigError, match=f"words.csv: {problem}"):
+        columns(file)

@@ -87,14 +87,6 @@ def test_converted_motion_keeps_its_place_in_time(tmp_path):
         np.testing.assert_array_equal(ours.audio, heard)
 
 
-def test_mirrored_rotations_turn_the_other_way_and_nod_the_same(tmp_path):
-    vectors = np.random.default_rng(3).normal(0, 0.2, (50, 3)).astype(np.float32)
-    mirrored = vectors * np.array([1, -1, -1], np.float32)
-    units = np.ones((50, 24), np.float32)
-    ours, theirs = (in_ours(np.concatenate([rows, units], axis=1), "seamless27") for rows in (vectors, mirrored))
-    np.testing.assert_allclose(ours[:, :3] * (-1, 1, -1), theirs[:, :3], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("axis", "channel"), [(0, "pitch"), (1, "yaw"), (2, "roll")], ids=["nose down", "to the own left", "right ear down"]
 )
@@ -190,7 +182,6 @@ def test_newer_movement_replaces_the_older(tmp_path):
     rewritten(file_of(tmp_path, ONE, ".npz"), **newer)
     one = open_dataset(tmp_path, "train")[0]
     np.testing.assert_allclose(one.listener[:, 3:], newer["movement_v4:FAUValue"], atol=1e-6)
-    assert "movement_v4 1, movement 2, smplh 2, boxes_and_keypoints 0" in scanned(tmp_path).notes[0]
 
 
 def test_both_labels_are_one_set_and_one_label_is_one_too(tmp_path):
@@ -212,18 +203,9 @@ def test_check_says_what_was_found_and_under_which_licence(tmp_path, command_lin
     assert command_line("data", "check", tmp_path, "--json").told["licence"].startswith("CC BY-NC 4.0")
 
 
-def test_whoever_trains_on_them_is_told_the_licence(tmp_path, caplog):
+def test_training_on_them_names_the_licence(tmp_path, caplog):
     open_dataset(write.seamless(tmp_path), "train")
     assert "CC BY-NC 4.0" in caplog.text
-
-
-def test_speech_that_begins_or_ends_with_the_interaction_is_counted(tmp_path):
-    write.seamless(tmp_path, 2)
-    file = file_of(tmp_path, ONE, ".json")
-    told = json.loads(file.read_text())
-    told["metadata:vad"][0]["start"] = 0.0
-    file.write_text(json.dumps(told))
-    assert "0 of 2 interactions contradict themselves, 1 begin or end inside speech" in scanned(tmp_path).notes[2]
 
 
 # --- bad input --------------------------------------------------------------------------------------------------
@@ -245,7 +227,7 @@ HARMS = {
     "no wav": (lambda root: file_of(root, ONE, ".wav").unlink(), "missing sound", f"{ONE}.wav", "no such file"),
     "no partner": (
         lambda root: [file_of(root, ONE, ending).unlink() for ending in (".npz", ".json", ".wav")],
-        "missing half", write.SEAMLESS_ID, f"his partner's files are not here: {TWO}",
+        "missing half", write.SEAMLESS_ID, f"the partner's files are not here: {TWO}",
     ),
     "no movement": (
         lambda root: rewritten(file_of(root, ONE, ".npz"), **{ROTATION: None, UNITS: None, VALID: None}),

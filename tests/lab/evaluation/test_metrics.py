@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from sfms_robot.lab.corpora.learning2listen import l2l_bilateral, l2l_mean_std
+from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 
 RNG = np.random.default_rng(3)
@@ -83,32 +83,6 @@ def test_l2l_std_is_the_std_of_stds():
     mean, std = l2l_mean_std(x)
     assert mean.shape == std.shape == (1, 1, 2)
     assert std[0, 0, 1] == pytest.approx(np.std([np.std(clip[:, 1]) for clip in x]), rel=1e-9)
-
-
-def test_the_bilateral_filter_is_the_five_tap_kernel_on_small_values():
-    x = 0.1 * RNG.normal(size=(1, 50, 2))
-    padded = np.pad(x, ((0, 0), (2, 2), (0, 0)), mode="reflect")
-    kernel = np.array([1, 3, 5, 3, 1]) / 13
-    expected = sum(w * padded[:, i : i + 50] for i, w in enumerate(kernel))
-    np.testing.assert_allclose(l2l_bilateral(x), expected, atol=2e-3)
-    np.testing.assert_allclose(l2l_bilateral(np.full((3, 7, 1), 4.0)), 4.0)
-
-
-def test_the_bilateral_filter_equals_the_loop_over_a_circle_of_pixels():
-    x = 30 * RNG.normal(size=(2, 9, 3))
-    expected = np.zeros_like(x)
-    for clip, frame, channel in np.ndindex(x.shape):
-        total = weights = 0.0
-        for down in range(-2, 3):
-            for across in range(-2, 3):  # an image one pixel wide: reflection finds the same column
-                if down**2 + across**2 > 4:
-                    continue
-                at = abs(frame + down)
-                value = x[clip, min(at, 2 * 8 - at), channel]
-                far = (down**2 + across**2 + (value - x[clip, frame, channel]) ** 2) / (2 * 20.0**2)
-                total, weights = total + np.exp(-far) * value, weights + np.exp(-far)
-        expected[clip, frame, channel] = total / weights
-    np.testing.assert_allclose(l2l_bilateral(x), expected, rtol=1e-10)
 
 
 RNG = np.random.default_rng(7)

@@ -8,7 +8,7 @@ import pytest
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES, ListenerEvent
-from sfms_robot.lab.corpora.splits import split_of_voice
+from sfms_robot.lab.corpora.clips import split_of_voice
 from sfms_robot.lab.evaluation.robustness import (
     CONDITIONS,
     UnseenSpeaker,

@@ -16,8 +16,8 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
-from sfms_robot.lab.corpora.compose.motions import table
-from sfms_robot.lab.corpora.splits import Split, by_split, split_of
+from sfms_robot.lab.corpora.clips import Split, by_split, split_of
+from sfms_robot.lab.corpora.reading import columns
 
 GAP_S: Final = 0.2  # shorter silences are part of a phrase
 NODS: Final = ("concord_signal nod", "concord_signal ")  # form nod, and form left blank
@@ -83,7 +83,7 @@ class MeetingPerson:
 
 
 def read_people(folder: Path) -> list[MeetingPerson]:
-    """Everybody whose head was annotated. Raises ConfigError naming the table, and the column that is missing."""
+    """Return all persons whose head was annotated. Raises ConfigError naming the table, and a missing column."""
     gestures, gaze = _spans(folder, "head_gestures", "type", "form"), _spans(folder, "gaze_focus", "target")
     words, acts = _spans(folder, "words", "kind", "text"), _spans(folder, "dialogue_acts", "type")
     listed = _table(folder, "participants")
@@ -135,7 +135,7 @@ def read_people(folder: Path) -> list[MeetingPerson]:
 
 
 def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
-    """Spans in any order -> (K, 2), overlapping ones and gaps under 0.2 s joined."""
+    """Return spans (K, 2) by start from spans in any order, overlapping ones and gaps under 0.2 s joined."""
     joined: list[list[float]] = []
     for start, end in sorted(spans):
         if joined and start - joined[-1][1] < GAP_S:
@@ -146,7 +146,7 @@ def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
-    """Words (start, end) of one person -> (K, 2) those under 0.6 s with 0.5 s of his silence on both sides."""
+    """Return the words (K, 2) of one person under 0.6 s with 0.5 s of silence on both sides."""
     spans = np.array(sorted(words), np.float64).reshape(-1, 2)
     before = spans[:, 0] - np.r_[-np.inf, spans[:-1, 1]]
     after = np.r_[spans[1:, 0], np.inf] - spans[:, 1]
@@ -155,7 +155,7 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPerson]]:
-    """Return people by the split of their meeting (`splits`); people of the training split are left out of the
+    """Return people by the split of their meeting (`clips.SERIES`); people of the training split are left out of the
     others.
     """
     parts = by_split((split_of(person.meeting), person) for person in people)
@@ -168,7 +168,7 @@ def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPer
 def _of_others(
     spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]
 ) -> tuple[tuple[float, float, str], ...]:
-    """(start, end, agent) of what the others did, by start."""
+    """Return (start, end, agent) of what the others did, by start."""
     return tuple(
         sorted((start, end, other[1]) for other in others for start, end, what in spans[other] if what in wanted)
     )
@@ -203,7 +203,7 @@ def _table(folder: Path, name: str) -> _Rows:
             break
     else:
         raise ConfigError(f"{folder / name}.csv.gz: no such file; an AMI folder holds {', '.join(_COLUMNS)}")
-    rows = table(file)
+    rows = columns(file)
     for column in _COLUMNS[name]:
         if column not in rows:
             raise ConfigError.at(file, "column", column, "is missing", rows)

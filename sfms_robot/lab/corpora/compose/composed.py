@@ -4,7 +4,7 @@ Recorded are: when a listener nods, laughs or says "mm-hm" while others talk, wh
 and when they look at the listener (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
 how speech sounds (`voices`). Their combination is ours: the voice says other words than the meeting did, only its
 phrases begin and end at the same times. Meetings, people, takes and voices kept for validation and test are whole ones
-(`splits`).
+(`clips.SERIES`).
 
 All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
 when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
@@ -34,7 +34,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.clips import Dyad, save
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
@@ -50,7 +50,6 @@ from sfms_robot.lab.corpora.compose.voices import (
     room,
     split_voices,
 )
-from sfms_robot.lab.corpora.splits import SPLITS, Split
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
@@ -120,7 +119,7 @@ class Material:
 
 
 def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Split, Material]:
-    """By part, from the AMI tables, folders of WAV files and a file of motion primitives. Raises ConfigError."""
+    """Read material by split, from AMI tables, folders of voices and a file of primitives. Raises ConfigError."""
     people = split_series(read_people(ami))
     spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), read_motions(motions)
     dwell = learn_dwell(people["train"])
@@ -132,24 +131,11 @@ def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Spli
     }
 
 
-def compose(ami: Path, voices: Sequence[Path], motions: Path, seed: int, minutes: float) -> dict[Split, list[Dyad]]:
-    """`minutes` of "train" dyads and a sixth of it of "validation" and "test"; the same for the same seed.
-
-    `ami` holds the AMI tables, `voices` are folders of WAV files, `motions` is a file of motion primitives. Raises
-    ConfigError.
-    """
-    made: dict[Split, list[Dyad]] = {split: [] for split in SPLITS}
-    for split, dyad in dyads(read_material(ami, voices, motions), seed, minutes):
-        made[split].append(dyad)
-    return made
-
-
 def compose_folder(
     data: Path,
     out: Path,
     seed: int,
     minutes: float,
-    voices: Sequence[Path] = (),
     told: Callable[[str, float, float], None] | None = None,
     overwrite: bool = False,
 ) -> dict[str, float]:
@@ -158,14 +144,14 @@ def compose_folder(
     Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
-    ami_audio_clips/, the clips beside the tables) and those of further folders. Dyads of an earlier run are refused,
+    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
     or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
     dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
     ConfigError.
     """
-    sets = {
+    sets: dict[str, tuple[Path, float, Callable[..., Iterator[tuple[Split, Dyad]]]]] = {
         "listening": (out, minutes, dyads),
-        "interaction": (out / "interaction", SHARES["interaction"] * minutes, conversations),
+        "interaction": (out / "interaction", SHARES["interaction"] * minutes, partial(dyads, scene="interaction")),
         "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
     }
     if not overwrite and (earlier := sorted(file for folder, _, _ in sets.values() for file in _composed(folder))):
@@ -175,7 +161,7 @@ def compose_folder(
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
-    material = read_material(ami, [*bundled, *brought, *voices], data_dir("sim") / "listeners" / "motions.npz")
+    material = read_material(ami, [*bundled, *brought], data_dir("sim") / "listeners" / "motions.npz")
     written: dict[str, float] = {}
     for name, (folder, wanted, make) in sets.items():
         each = partial(told, name, wanted * (1 + 2 * HELD_OUT_SHARE)) if told else None
@@ -185,7 +171,7 @@ def compose_folder(
 
 
 def _composed(out: Path) -> set[Path]:
-    """Every dyad that a run has written to a folder of splits."""
+    """Return every dyad that a run has written to a folder of splits."""
     return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
 
 
@@ -206,7 +192,7 @@ def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float]
 def dyads(
     material: Mapping[Split, Material], seed: int, minutes: float, scene: Scene = "listening"
 ) -> Iterator[tuple[Split, Dyad]]:
-    """Dyads one by one, as (split, dyad): for sets that need not lie in memory. Raises ConfigError."""
+    """Yield dyads one by one, as (split, dyad): for sets that need not fit in memory. Raises ConfigError."""
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
     for number, split in enumerate(SPLITS):
@@ -214,11 +200,6 @@ def dyads(
         wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
         for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
             yield split, compose_one(stretch, material[split], rng)
-
-
-def conversations(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
-    """Dyads in which both talk."""
-    return dyads(material, seed, minutes, "interaction")
 
 
 def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
@@ -231,14 +212,14 @@ def monologues(material: Mapping[Split, Material], seed: int, minutes: float) ->
 
 
 def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
-    """A voice by lot, often one whose mouth was filmed."""
+    """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
     return fitting[int(rng.integers(len(fitting)))]
 
 
 def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
-    """A filmed voice for the listener, another one than the speaker's if there is one; None: none was filmed."""
+    """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
@@ -293,7 +274,7 @@ def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -
 
 
 def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
-    """(K,) proportional to the weights, none above 1, so that the expected length is what is wanted (or all)."""
+    """Return chances (K,) proportional to the weights, none above 1, for an expected length as wanted (or all)."""
     low, high = 0.0, 1 / weights.min()
     for _ in range(50):
         middle = (low + high) / 2
@@ -305,7 +286,7 @@ def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
 
 
 def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) -> Dyad:
-    """One stretch, cast, acted and voiced."""
+    """Return one stretch as a dyad: cast, acted and voiced."""
     person, frames = stretch.person, stretch.frames
     voice = cast(material.voices, rng)
     others, own = active(person.others, stretch), active(person.talk, stretch)
@@ -352,7 +333,7 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
 def _own_words(
     stretch: Stretch, voice: VoiceClip | None, rng: np.random.Generator
 ) -> tuple[Floats | None, Floats | None]:
-    """The listener's own voice (N * 640,), as a program would send it to a loudspeaker, and its mouth (N, 52)."""
+    """Return the listener's own voice (N * 640,), as sent to a loudspeaker, and its mouth (N, 52)."""
     if voice is None:
         return None, None
     said = np.clip(stretch.person.talk - stretch.start_s, 0, stretch.frames * FRAME_S)
@@ -398,7 +379,7 @@ def attention_of(stretch: Stretch) -> Floats:
 
 
 def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
-    """(K, 2) of what one agent did, or all."""
+    """Return spans (K, 2) of what one agent did, or all."""
     return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
@@ -413,7 +394,7 @@ def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tu
 
 
 def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
-    """(N,) frames whose middle lies in a span."""
+    """Return frames (N,) whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
     for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
         first, last = (int(np.ceil((t - stretch.start_s) * FRAME_HZ - 0.5)) for t in (start, end))
@@ -422,7 +403,7 @@ def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
 
 
 def within(spans: Doubles, stretch: Stretch) -> Doubles:
-    """Spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
+    """Return spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
     inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
     return spans[inside] - stretch.start_s
 
@@ -440,7 +421,7 @@ _LOST_S: Final = (0.3, 3.0)
 
 
 def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
-    """Speech (n,) with room, spectral tilt, gain and noise floor."""
+    """Return speech (n,) with room, spectral tilt, gain and noise floor."""
     direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
     tilt = np.float32(rng.uniform(*_TILT))
     toned = direct - tilt * np.concatenate([[0], direct[:-1]]).astype(np.float32)
@@ -449,7 +430,7 @@ def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
 
 
 def seen(motion: Floats, rng: np.random.Generator) -> Floats:
-    """A face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
+    """Return a face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
     frames = len(motion)
     out = motion.copy()
     stands = np.concatenate([np.deg2rad(rng.normal(0, 5, 3)), rng.normal(0, 0.05, 3)])

@@ -99,7 +99,7 @@ class Acted:
 
 
 def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
-    """One listener, whose manners (size and pace of nods, how often he blinks, where he looks) are drawn."""
+    """Return one listener, whose manners (size and pace of nods, blinks, places of looks) are drawn."""
     motion = np.zeros((score.frames, MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
     targets, looks = _targets(score, rng)
@@ -152,7 +152,7 @@ def speaker_motion(
 
 
 def mirrored(motion: Floats) -> Floats:
-    """The same motion (N, 58) of the mirror image."""
+    """Return the motion (N, 58) of the mirror image."""
     out = motion.copy()
     out[:, SHAPES] = motion[:, SHAPES][:, _MIRROR]
     out[:, _TURNED] *= -1
@@ -174,14 +174,14 @@ def _mirror_image(acted: Acted) -> Acted:
 
 
 def _sway(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
-    """Idle roll, pitch, yaw: recorded slow motion brought to about a degree."""
+    """Return idle roll, pitch, yaw: recorded slow motion brought to about a degree."""
     unit = [piece / (piece.std(axis=0) + 1e-6) for piece in motions.sway]
     size = np.deg2rad(rng.uniform(0.4, 1.1)) * np.array([1.0, 0.8, 1.0], np.float32)
     return np.asarray(tiled(unit, frames, rng, fade=2 * FADE) * size * rng.choice([-1, 1], 3), np.float32)
 
 
 def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
-    """Idle x, y, z: millimetres."""
+    """Return idle x, y, z: millimetres."""
     slowly = [slow(head[:, 3:], 0.5) for head in motions.heads]
     return np.asarray(rng.uniform(0.2, 0.5) * tiled(slowly, frames, rng), np.float32)
 
@@ -215,7 +215,7 @@ class NodManner:
 
 
 def nod_habit(rng: np.random.Generator) -> NodHabit:
-    """A person's: about 5 degrees, 1.8 to 3 swings a second."""
+    """Draw the habit of a person: about 5 degrees, 1.8 to 3 swings a second."""
     usual = sizes.NOD_DEG[1]
     size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
     return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
@@ -232,7 +232,7 @@ def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> No
 
 
 def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> Floats:
-    """Nose down [rad] (frames,) of a nod from `start_s` on; smaller than its size where a neck could not follow."""
+    """Return nose down [rad] (frames,) of a nod from `start_s` on, smaller where a neck could not follow."""
     out = np.zeros(frames)
     each_s = manner.duration_s / manner.swings
     size = min(manner.size_rad, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
@@ -255,7 +255,7 @@ def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generato
 
 
 def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """Nods, shakes and tilts, added to a pose (N, 6)."""
+    """Add nods, shakes and tilts to a pose (N, 6)."""
     events = _nod(pose, score.nods, motions, rng)
     habit = nod_habit(rng)
     for start, end in score.shakes.tolist():
@@ -271,7 +271,7 @@ def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Gener
 
 
 def _bend(shape: Floats, length_s: float) -> float:
-    """Largest second derivative of a unit cycle over unit time, as seen at the frame rate."""
+    """Return the largest second derivative of a unit cycle over unit time, as seen at the frame rate."""
     samples = max(4, int(round(length_s * FRAME_HZ)))
     played = np.interp(np.linspace(0, 1, samples + 1), np.linspace(0, 1, len(shape)), shape)
     twice = np.concatenate([[0, 0], np.tile(played[:-1], 2), [0, 0, 0]])
@@ -282,7 +282,7 @@ def _bend(shape: Floats, length_s: float) -> float:
 
 
 def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
-    """Where he looks, (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead; and his gaze shifts."""
+    """Return gaze targets (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead, and the gaze shifts."""
     seats: dict[str, tuple[float, float]] = {}
     out = np.zeros((score.frames, 2), np.float32)
     for start, end, where in score.gaze:
@@ -295,7 +295,7 @@ def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[Liste
 
 
 def _shifts(targets: Floats) -> list[ListenerEvent]:
-    """One event at each step of the targets (N, 2); before the first frame he looked at the person."""
+    """Return one event at each step of the targets (N, 2); before the first frame the listener looked at the person."""
     before = np.concatenate([np.zeros((1, 2), np.float32), targets])
     at = np.flatnonzero((np.diff(before, axis=0) != 0).any(axis=1)).tolist()
     return [
@@ -333,13 +333,13 @@ def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
-    """The motion of a resting face, lifted so that it hardly ever falls below the neutral."""
+    """Return the motion of a resting face, lifted so that it hardly ever falls below the neutral."""
     moving = tiled(motions.idle, frames, rng, fade=12)
     return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
 
 
 def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """Own laughs always, laughs of others often, backchannels and nods now and then; only a laugh opens the jaw.
+    """Lay smiles: own laughs always, laughs of others often, backchannels and nods seldom; only a laugh opens the jaw.
 
     A smile that would begin during another one is left out.
     """
@@ -380,7 +380,7 @@ def _lay_smile(
     motions: Motions,
     rng: np.random.Generator,
 ) -> Floats:
-    """A recorded smile over the face (N, 52) from `start_s` on; the curve (K, 52) that was laid."""
+    """Lay a recorded smile over the face (N, 52) from `start_s` on; return the curve (K, 52)."""
     curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
     knots = np.arange(0, len(curve) + FRAME_HZ, FRAME_HZ)
     breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # no smile stands still
@@ -391,7 +391,7 @@ def _lay_smile(
 
 
 def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """After half of the questions, with some of the nods."""
+    """Raise the brows after half of the questions and with some of the nods."""
     at = [instant for instant in score.asked if rng.random() < 0.5]
     at += [start for start, _ in score.nods if rng.random() < 0.15]
     events: list[ListenerEvent] = []
@@ -407,7 +407,7 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
 
 
 def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """His own words: the mouth of his voice, or else some recorded mouth over them, small for an "mm-hm".
+    """Lay the listener's own words: the mouth of the voice, or some recorded mouth over them, small for an "mm-hm".
 
     The size of an "mm-hm" is how far it opens the jaw.
     """
@@ -430,7 +430,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
 
 
 def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """Recorded intervals at a personal rate; half the blinks wait for a cue (gaze shift, phrase end) close by."""
+    """Lay blinks at recorded intervals and a personal rate; half wait for a cue (gaze shift, phrase end) nearby."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)
     at, times = rng.uniform(0, 3), []

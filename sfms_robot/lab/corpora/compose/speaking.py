@@ -32,7 +32,7 @@ _GAIN_DB: Final = (-10.0, 6.0)
 def dyads(
     voices: Sequence[VoiceClip], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
 ) -> Iterator[Dyad]:
-    """About `minutes` of pieces of the filmed ones among the voices; none where none was filmed."""
+    """Yield about `minutes` of pieces of the filmed voices; none where none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     weights = np.array([len(voice.recording) for voice in filmed], float)
     rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ def dyads(
 
 
 def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
-    """A piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
+    """Return a piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
     if voice.mouth is None:
         raise ValueError(f"{voice.name} was not filmed")
     whole = min(len(voice.recording) // FRAME_SAMPLES, len(voice.mouth) - 1)
@@ -78,7 +78,7 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.ra
 
 
 def sent(speech: Floats, rng: np.random.Generator) -> Floats:
-    """Speech as a program sends it to a loudspeaker: some level, and silence that is digital or nearly so."""
+    """Return speech as a program sends it to a loudspeaker: some level, and silence that is digital or nearly so."""
     gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
     hiss = rng.standard_normal(len(speech), np.float32) * np.float32(10 ** (rng.uniform(-90, -60) / 20))
     floor = hiss if rng.random() < 0.3 else np.float32(0)
@@ -111,7 +111,7 @@ class Dwell:
     away: tuple[tuple[float, str], ...]
 
     def looks(self, length_s: float, rng: np.random.Generator) -> tuple[Look, ...]:
-        """Looks away in `length_s` seconds; none where nothing was learned."""
+        """Draw looks away in `length_s` seconds; none where nothing was learned."""
         found: list[Look] = []
         if not self.at_s or not self.away:
             return ()
@@ -136,7 +136,7 @@ def learn_dwell(people: Sequence[MeetingPerson]) -> Dwell:
 
 
 def away(person: MeetingPerson, start_s: float, end_s: float, rng: np.random.Generator) -> list[Look]:
-    """His kept looks away between two times of the meeting."""
+    """Return a person's kept looks away between two times of the meeting."""
     found: list[Look] = []
     near = [(a, b, who) for a, b, who in person.floor if a < end_s + _NEAR_S and b > start_s - _NEAR_S]
     floor = {agent: np.array([(a, b) for a, b, who in near if who == agent]) for agent in {who for _, _, who in near}}

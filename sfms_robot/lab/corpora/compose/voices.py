@@ -17,9 +17,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
-from sfms_robot.lab.corpora.compose.motions import SHAPE, facegood_mouth, table
-from sfms_robot.lab.corpora.splits import SPLITS, Split, by_split, split_of_voice
+from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
+from sfms_robot.lab.corpora.compose.motions import SHAPE
+from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs
@@ -62,7 +63,7 @@ class VoiceClip:
 
 
 def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
-    """Every WAV and FLAC file in the folders, or one level below them. Raises ConfigError when there is none."""
+    """Read every WAV and FLAC file in the folders, or one level below. Raises ConfigError when there is none."""
     files = [file for folder in folders for file in sorted([*folder.glob("*"), *folder.glob("*/*")])]
     voices = [read_voice(file) for file in files if file.suffix in _SOUNDS and not file.stem.startswith(_UNFIT)]
     if not voices:
@@ -71,7 +72,7 @@ def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
 
 
 def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
-    """Whole recordings by part (`splits.VOICES`); a part that has none uses all there are."""
+    """Return whole recordings by split (`VOICES`); a split without any gets all of them."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
 
@@ -84,7 +85,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     """
     found: list[tuple[Split, Floats]] = []
     for folder in folders:
-        rows = table(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
+        rows = columns(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
         said = list(
@@ -166,7 +167,7 @@ def _levelled(speech: Floats) -> Floats:
 
 
 def _lulls(speech: Floats) -> NDArray[np.bool_]:
-    """Grains (n // 320,) inside pauses that only show once loudness is levelled; 40 ms of each end of one stay."""
+    """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
     out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
         out[start : start + 2] = out[max(start, end - 2) : end] = False
@@ -182,6 +183,53 @@ def _mouth(file: Path) -> Floats | None:
             shapes = resample(read_track(track), FRAME_HZ).motion[:, SHAPES]
             return np.nan_to_num(shapes)
     return None
+
+
+# ARKit channels of FACEGOOD's mouth controls, each with its weight: mouth_oh_c reaches 1 in ordinary speech. Where
+# several controls feed a channel the largest counts.
+FACEGOOD: Final = {
+    "jawOpen": (("mouth_stretch_c", 1.0),),
+    "jawLeft": (("jaw_sideways_l", 1.0),),
+    "mouthFunnel": (("mouth_funnel_", 1.0),),
+    "mouthPucker": (("mouth_oh_c", 0.5), ("mouth_pucker_", 1.0), ("mouth_oo_c", 1.0)),
+    "mouthSmile": (("mouth_lipCornerPull_", 1.0), ("mouth_lipCornerPullOpen_", 1.0)),
+    "mouthStretch": (("mouth_lipStretch_", 1.0),),
+    "mouthDimple": (("mouth_dimple_", 1.0),),
+    "mouthPress": (("mouth_press_", 1.0),),
+    "mouthRollLower": (("mouth_suck_d", 1.0),),
+    "mouthRollUpper": (("mouth_suck_u", 1.0),),
+    "mouthLowerDown": (("mouth_lowerLipDepress_", 1.0),),
+    "mouthUpperUp": (("mouth_upperLipRaise_", 1.0),),
+}
+
+
+def facegood_mouth(file: Path) -> Floats:
+    """Return mouth weights of a FACEGOOD take as (N, 52) at 25 fps. Raises ConfigError."""
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            weights, names, fps = arrays["weights"], arrays["names"], float(arrays["fps"])
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{file}: not a file of mouth weights: {error}") from error
+    shapes = np.zeros((len(weights), len(BLENDSHAPES)), np.float32)
+    for column, name in enumerate(str(name) for name in names):
+        for channel, gain in _channels_of(name):
+            shapes[:, SHAPE[channel]] = np.maximum(shapes[:, SHAPE[channel]], gain * weights[:, column])
+    return at_25_hz(np.arange(len(shapes)) / fps, np.clip(shapes, 0, 1))
+
+
+def _channels_of(control: str) -> list[tuple[str, float]]:
+    side = {"_l": "Left", "_r": "Right"}.get(control[-2:], "")
+    found = []
+    for channel, controls in FACEGOOD.items():
+        name = channel if channel in SHAPE else channel + side
+        found += [(name, gain) for prefix, gain in controls if name in SHAPE and control.startswith(prefix)]
+    return found
+
+
+def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
+    """Interpolate values (M, C) to 25 fps from times_s[0] on; return (N, C)."""
+    grid = np.arange(times_s[0], times_s[-1], 1 / FRAME_HZ)
+    return np.stack([np.interp(grid, times_s, column) for column in values.T], axis=1).astype(np.float32)
 
 
 def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -219,13 +267,13 @@ def lay(
 
 
 def _soften(mouth: Floats) -> Floats:
-    """Short binomial smoothing: takes the edges off the joints, keeps syllables."""
+    """Smooth shortly (binomial): joints lose their edges, syllables stay."""
     padded = np.pad(mouth, ((1, 1), (0, 0)), mode="edge")
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
 def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
-    """Noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, slowly breathing."""
+    """Return a noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, that drifts."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
     kernel = np.roll(kernel, len(kernel) // 2) * np.hanning(len(kernel)).astype(np.float32)
@@ -237,7 +285,7 @@ def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
 
 
 def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
-    """Speech as a room of 0.12 to 0.4 s reverberation gives it back, 6 to 16 dB below the direct sound."""
+    """Return speech in a room of 0.12 to 0.4 s reverberation, 6 to 16 dB below the direct sound."""
     length_s = rng.uniform(0.12, 0.4)
     times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
     tail = rng.standard_normal(len(times)) * 10 ** (-3 * times / length_s)
@@ -246,7 +294,7 @@ def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
 
 
 def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
-    """A mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
+    """Return a mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """

@@ -1,8 +1,8 @@
 """DualTalk (Peng et al., CVPR 2025): two people who talk, at 25 fps; each listens to the other. Both have a voice.
 
 `{train,test,ood}/<id>_speaker{1,2}.{wav,npz}`, the .npz with FLAME's `exp` (T, 50) and `pose` (T, 6) = head | jaw,
-among others. Its published demo (`demo/`, a split of that name) has two voices and one face a clip: whose face is there
-listens, and the other's is unknown.
+among others. Its published demo (`demo/`, a split of that name) has two voices and one face a clip: the person with the
+face listens, and the face of the other is unknown.
 
 The edition in ARKit's shapes (OpenFacebot/DualTalk_Dataset_ARKit @ 4313f343) adds, for the same names,
 `ARKit_npy/{train,test,ood}/<id>_speaker{1,2}.npy` (T, 61): 51 shapes in Apple's order, TongueOut 0 | HeadYaw, HeadPitch
@@ -11,8 +11,8 @@ and HeadRoll of R = Ry Rx Rz in FLAME's axes, which are our three angles, cut at
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -21,14 +21,13 @@ import numpy as np
 
 from sfms_robot.frames import POSE, SHAPES, Floats, reorder
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order
-from sfms_robot.lab.corpora.reading import collect, dyad, frames_of, npy, npz_shapes, track, voices_of
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
+from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, npz, npz_shapes, track, voices_of
 
 FPS: Final = 25.0
 LICENCE: Final = "Apache 2.0, as its README says; made from RealTalk"
 SPLITS: Final = ("train", "test", "ood")
 DEMO: Final = "demo"
-PEOPLE: Final = ("speaker1", "speaker2")
 PARTS: Final = {"exp": 50, "pose": 6}
 ARKIT_FOLDER: Final = "ARKit_npy"
 ARKIT_WIDTH: Final = 61
@@ -42,11 +41,12 @@ class Faces:
 
     ending: str
     space: str
-    frames: Callable[[Path], tuple[int, ...]]
+    shape: Callable[[Path], tuple[int, ...]]
     rows: Callable[[Path, int, bool], Floats]
 
-
-# --- the two editions -------------------------------------------------------------------------------------------
+    def people(self, folder: Path) -> list[str]:
+        """Return `<id>_speaker{1,2}` of every face in a folder."""
+        return sorted(file.stem for file in folder.glob(f"*_speaker[12]{self.ending}"))
 
 
 def _flame_shape(file: Path) -> tuple[int, ...]:
@@ -60,9 +60,8 @@ def _flame_shape(file: Path) -> tuple[int, ...]:
 
 
 def _flame_rows(file: Path, frames: int, gaps: bool) -> Floats:
-    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-        parts = [track(f"{file} {key}", arrays[key], frames, width, gaps=gaps) for key, width in PARTS.items()]
-    return np.concatenate(parts, axis=1)
+    parts = zip(PARTS.items(), npz(file, *PARTS), strict=True)
+    return np.concatenate([track(f"{file} {key}", rows, frames, n, gaps=gaps) for (key, n), rows in parts], axis=1)
 
 
 def _arkit_shape(file: Path) -> tuple[int, ...]:
@@ -84,95 +83,59 @@ FLAME: Final = Faces(".npz", "deca56", _flame_shape, _flame_rows)
 ARKIT: Final = Faces(".npy", "arkit58", _arkit_shape, _arkit_rows)
 
 
-def root(folder: Path) -> Path | None:
-    for place in (folder, folder / "data"):
-        if _flame_splits(place) or _voiced(place):
-            return place
-    return None
-
-
-def _flame_splits(place: Path) -> list[str]:
-    return [split for split in (*SPLITS, DEMO) if next((place / split).glob("*_speaker[12].npz"), None)]
-
-
-def _voiced(place: Path) -> bool:
-    """Is this the demo's own folder?"""
-    return all(next(place.glob(f"*_speaker[12]{ending}"), None) for ending in (".npz", ".wav"))
-
-
 def splits(place: Path) -> Mapping[str, str]:
-    return {split: split for split in _flame_splits(place)} or {DEMO: "."}
-
-
-def scan(place: Path, split: str, order: Order | None) -> Dataset:
-    folder = place / split
-    return _scanned("dualtalk", split, folder, folder, FLAME)
-
-
-def arkit_root(folder: Path) -> Path | None:
-    return next((place for place in (folder, folder / "data") if arkit_splits(place)), None)
+    """Return splits with FLAME's faces; the folder of the demo itself is one."""
+    demo = FLAME.people(place) and any(place.glob("*_speaker[12].wav"))
+    return {split: split for split in (*SPLITS, DEMO) if FLAME.people(place / split)} or ({DEMO: "."} if demo else {})
 
 
 def arkit_splits(place: Path) -> Mapping[str, str]:
-    faces = place / ARKIT_FOLDER
-    return {split: split for split in SPLITS if next((faces / split).glob("*_speaker[12].npy"), None)}
+    return {split: split for split in SPLITS if ARKIT.people(place / ARKIT_FOLDER / split)}
 
 
-def arkit_scan(place: Path, split: str, order: Order | None) -> Dataset:
+def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    return _found(split, place / split, place / split, FLAME)
+
+
+def arkit_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
     voices = next((base for base in (place, place / "DualTalk_Dataset") if (base / split).is_dir()), place)
-    return _scanned("dualtalk_arkit", split, voices / split, place / ARKIT_FOLDER / split, ARKIT)
+    return _found(split, voices / split, place / ARKIT_FOLDER / split, ARKIT)
 
 
-# --- either -----------------------------------------------------------------------------------------------------
+def _found(split: str, voices: Path, folder: Path, kind: Faces) -> Iterator[Found]:
+    voiced = any(voices.glob("*_speaker[12].wav"))
+    if not voiced:
+        yield f"{voices}: no .wav files: these clips have no sound"
+    listeners = kind.people(folder)
+    if split not in (DEMO, "."):  # the demo has one face a clip: the other direction does not exist
+        chats = sorted({name[:-1] for name in listeners})
+        listeners = [f"{chat}{person}" for chat in chats for person in "12"]
 
-
-def _scanned(layout: str, split: str, voices: Path, folder: Path, kind: Faces) -> Dataset:
-    chats = sorted({file.stem.rsplit("_", 1)[0] for file in folder.glob(f"*_speaker[12]{kind.ending}")})
-    voiced = next(voices.glob("*_speaker[12].wav"), None) is not None
-
-    def clip(row: int, name: str) -> Clip:
-        chat, listener = name.rsplit("_", 1)
-        stems = [f"{chat}_{person}" for person in (*(one for one in PEOPLE if one != listener), listener)]
+    def clip(listener: str) -> Clip:
+        stems = [f"{listener[:-1]}{'21'[int(listener[-1]) - 1]}", listener]
         faces = [folder / f"{stem}{kind.ending}" for stem in stems]
-        sounds = [voices / f"{stem}.wav" for stem in stems] if voiced else []
         if not faces[1].is_file():
             raise ClipError.of("missing half", faces[1], "no such file")
-        frames = frames_of(name, *(kind.frames(file) for file in faces if file.is_file()))
-        if sounds and not sounds[0].is_file():
-            raise ClipError.of("missing sound", sounds[0], "no such file")
-        return Clip(name=name, frames=frames, row=row, read=partial(_read, name, faces, sounds, frames, kind))
+        frames = frames_of(listener, *(kind.shape(file) for file in faces if file.is_file()))
+        sounds = voices_of(*(voices / f"{stem}.wav" for stem in stems)) if voiced else []
+        return Clip(name=listener, frames=frames, read=partial(_read, listener, faces, sounds, frames, kind))
 
-    faced = [f"{chat}_{person}" for chat in chats for person in PEOPLE]
-    if split in (DEMO, "."):  # one face a clip: the other direction is not missing, nobody made it
-        faced = [stem for stem in faced if (folder / f"{stem}{kind.ending}").is_file()]
-    clips, problems = collect(list(enumerate(faced)), clip)
-    notes = () if voiced else (f"{voices}: no .wav files: these clips have no sound",)
-    return Dataset(
-        layout=layout,
-        split=split,
-        space=kind.space,
-        fps=FPS,
-        clips=clips,
-        problems=tuple(dict.fromkeys(problems)),
-        notes=notes,
-        features=(),
-        licence=LICENCE,
-    )
+    yield from attempt(listeners, clip)
 
 
 def _read(name: str, faces: Sequence[Path], sounds: Sequence[Path], frames: int, kind: Faces) -> Dyad:
     listener = kind.rows(faces[1], frames, False)
     speaker = kind.rows(faces[0], frames, True) if faces[0].is_file() else np.full_like(listener, np.nan)
-    voices = voices_of(sounds, frames, FPS)
-    return replace(dyad(name, speaker, listener, kind.space, FPS, **voices), agent_audio=voices.get("own"))
+    pair = list(zip(faces, (speaker, listener), strict=True))
+    return dyad_of(name, pair, frames, kind.space, FPS, voices=sounds, own=True)
 
 
 LAYOUT: Final = Layout(
     name="dualtalk", about="DualTalk: {train,test,ood,demo}/<id>_speaker{1,2}.{wav,npz}", space="deca56", fps=FPS,
-    order=None, root=root, splits=splits, scan=scan, held_out=0.1,
+    splits=splits, scan=scan, held_out=0.1, licence=LICENCE,
 )  # fmt: skip
 ARKIT_LAYOUT: Final = Layout(
     name="dualtalk_arkit",
     about="DualTalk in ARKit's shapes: ARKit_npy/{train,test,ood}/<id>_speaker{1,2}.npy beside its .wav",
-    space="arkit58", fps=FPS, order=None, root=arkit_root, splits=arkit_splits, scan=arkit_scan, held_out=0.1,
+    space="arkit58", fps=FPS, splits=arkit_splits, scan=arkit_scan, held_out=0.1, licence=LICENCE,
 )  # fmt: skip

@@ -5,14 +5,18 @@
 clip. Metrics use 750 frames. Every pair is read both ways: val and test as the reference doubles them, so that a
 clip's `row` is its row in the appropriateness matrix; train because swapping by chance comes to the same.
 
-Deviation: the reference subtracts a mean face on loading. Here motion stays what the files hold, which is what the
-retargeting of `faceverse58` reads; `faceverse58-centred` is the reference's (`centred`), and never drives a head.
+REACT 2025 and 2026 (MARS): sessions of any length at 30 fps,
+`{train,val,test}/{coefficients,facial-attributes,audio,audio-features}/{speaker,listener}/session{n}/NAME`, the two
+people of a dyad under one name. Roles are given, so pairs are read one way. All listeners of a session count as
+appropriate.
+
+Deviation: the references subtract a mean face or standardise on loading. Here motion stays as the files hold it, which
+is what the retargeting of `faceverse58` reads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -22,75 +26,86 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem
-from sfms_robot.lab.corpora.reading import collect, filed_dyad, frames_of, npy, table, track
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
+from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, pose_last, table, track, voices_of
 
-FPS: Final = 25.0
-WIDTH: Final = 58
+SPACE: Final = "faceverse58"
+FPS, FPS_2025 = 25.0, 30.0
 FRAMES: Final = 750
 ATTRIBUTES: Final = 25  # 15 action units | valence, arousal | 8 expressions
 SPLITS: Final = {"train": "train", "validation": "val", "test": "test"}
 FACES, SOUNDS, EMOTIONS = "3D_FV_files", "Audio_files", "Emotion"
+FACES_2025: Final = "coefficients"
 # The cleaned release names the two people of a chat P1 and P2 in the Emotion tree alone.
-FIRST: Final = ("Expert_video", "P25", "P41", "P45")
-SECOND: Final = ("Novice_video", "P26", "P42", "P46")
-MEAN_FACE: Final = ("mean_face.npy", "external/FaceVerse/mean_face.npy")
+CLEANED: Final = dict.fromkeys(("Expert_video", "P25", "P41", "P45"), "P1") | dict.fromkeys(
+    ("Novice_video", "P26", "P42", "P46"), "P2"
+)
+# feature: folder, role, width
+FEATURES_2025: Final[Mapping[str, tuple[str, str, int]]] = {
+    "attributes": ("facial-attributes", "listener", 25),
+    "speaker_attributes": ("facial-attributes", "speaker", 25),
+    "wav2vec2": ("audio-features", "speaker", 768),
+}
 
 
-def root(folder: Path) -> Path | None:
-    for place in (folder, folder / "data"):
-        if any((place / split / FACES).is_dir() for split in SPLITS.values()):
-            return place
-    return None
+def splits(faces: str, place: Path) -> Mapping[str, str]:
+    """Return the splits that have a folder of faces."""
+    return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / faces).is_dir()}
 
 
-def splits(place: Path) -> Mapping[str, str]:
-    return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / FACES).is_dir()}
-
-
-def scan(place: Path, split: str, order: Order | None) -> Dataset:
+def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
     pairs = _pairs(place / f"{split}.csv")
-    pairs += [(listener, speaker) for speaker, listener in pairs]
     folder = place / split
     heard = (folder / SOUNDS).is_dir()
-
-    def clip(row: int, listener: str) -> Clip:
-        speaker = pairs[row][0]
-        name = listener.replace("/", "+")
-        files = [folder / FACES / f"{person}.npy" for person in (speaker, listener)]
-        frames = min(FRAMES, frames_of(name, *(npy(file).shape for file in files), slack=1))
-        voices = [folder / SOUNDS / f"{person}.wav" for person in (speaker, listener)] if heard else []
-        if voices and not voices[0].is_file():
-            raise ClipError.of("missing sound", voices[0], "no such file")
-        features = {
-            "attributes": partial(attributes, folder, listener, frames),
-            "speaker_attributes": partial(attributes, folder, speaker, frames),
-        }
-        return Clip(
-            name=name,
-            frames=frames,
-            row=row,
-            read=partial(filed_dyad, name, files, voices, frames, "faceverse58", FPS, order == "pose-first"),
-            features=features,
-        )
-
-    clips, problems = collect([(row, listener) for row, (_, listener) in enumerate(pairs)], clip)
-    notes = [] if heard else [f"{folder / SOUNDS}: no such folder: these clips have no sound"]
+    if not heard:
+        yield f"{folder / SOUNDS}: no such folder: these clips have no sound"
     if not (folder / EMOTIONS).is_dir():
-        notes.append(f"{folder / EMOTIONS}: no such folder: no attributes, which the REACT metrics are defined on")
-    return Dataset(
-        layout="react",
-        split=split,
-        space="faceverse58",
-        fps=FPS,
-        clips=clips,
-        problems=_once(problems),
-        notes=tuple(notes),
-    )
+        yield f"{folder / EMOTIONS}: no such folder: no attributes, which the REACT metrics are defined on"
+
+    def clip(pair: tuple[str, str]) -> Clip:
+        faces, sounds = ([folder / kind / f"{person}{end}" for person in pair]
+                         for kind, end in ((FACES, ".npy"), (SOUNDS, ".wav")))  # fmt: skip
+        frames = min(FRAMES, frames_of(pair[1], *(npy(file).shape for file in faces), slack=1))
+        voices = voices_of(*sounds) if heard else []
+        name = pair[1].replace("/", "+")
+        read = partial(_read, name, faces, voices, frames, FPS, order == "pose-first")
+        people = zip(("speaker_attributes", "attributes"), pair, strict=True)
+        features = {feature: partial(attributes, folder, person, frames) for feature, person in people}
+        return Clip(name=name, frames=frames, read=read, features=features)
+
+    yield from attempt(pairs + [(listener, speaker) for speaker, listener in pairs], clip)
+
+
+def scan_2025(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    folder = place / split
+    roles = [folder / FACES_2025 / role for role in ("speaker", "listener")]
+    heard = (folder / "audio").is_dir()
+    if not heard:
+        yield f"{folder / 'audio'}: no such folder: these clips have no sound"
+
+    def clip(path: str) -> Clip:
+        faces = [role / f"{path}.npy" for role in roles]
+        name = path.replace("/", "+")
+        frames = frames_of(name, *(npy(file).shape for file in faces))
+        voices = voices_of(*(folder / "audio" / role.name / f"{path}.wav" for role in roles)) if heard else []
+        features = {
+            feature: partial(_feature, folder / kind / role / f"{path}.npy", frames, width)
+            for feature, (kind, role, width) in FEATURES_2025.items()
+        }
+        read = partial(_read, name, faces, voices, frames, FPS_2025, order == "pose-first")
+        return Clip(name=name, frames=frames, read=read, features=features)
+
+    names = {str(file.relative_to(role).with_suffix("")) for role in roles for file in role.rglob("*.npy")}
+    yield from attempt(sorted(names), clip)
+
+
+def _read(name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, fps: float, pose_first: bool) -> Dyad:
+    pair = [(file, pose_last(npy(file), pose_first)) for file in faces]
+    return dyad_of(name, pair, frames, SPACE, fps, voices=voices)
 
 
 def _pairs(file: Path) -> list[tuple[str, str]]:
-    """(speaker, listener) of every row. Raises ConfigError for a list that is missing or broken."""
+    """Return (speaker, listener) of every row. Raises ConfigError for a list that is missing or broken."""
     if not file.is_file():
         raise ConfigError(f"{file}: no such file: it lists which clips belong together")
     rows = table(file)[1:]
@@ -99,17 +114,13 @@ def _pairs(file: Path) -> list[tuple[str, str]]:
     return [(row[1].strip(), row[2].strip()) for row in rows]
 
 
-def _once(problems: tuple[Problem, ...]) -> tuple[Problem, ...]:
-    """A file that both ways of a pair need is one problem."""
-    return tuple(dict.fromkeys(problems))
-
-
 def attributes(folder: Path, clip: str, frames: int) -> Floats:
-    """(frames, 25) of one clip, as the challenge labels it. Raises ClipError."""
-    named = folder / EMOTIONS / f"{clip}.csv"
-    file = named if named.is_file() else folder / EMOTIONS / f"{_cleaned(clip)}.csv"
-    if not file.is_file():
-        raise ClipError.of("missing feature", named, "no such file")
+    """Return (frames, 25) of one clip, as the challenge labels it. Raises ClipError."""
+    cleaned = "/".join(CLEANED.get(part, part) for part in clip.split("/"))
+    files = [folder / EMOTIONS / f"{name}.csv" for name in (clip, cleaned)]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        raise ClipError.of("missing feature", files[0], "no such file")
     try:
         rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2)
     except ValueError as error:
@@ -117,113 +128,20 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
     return track(str(file), rows, frames, ATTRIBUTES)
 
 
-def _cleaned(clip: str) -> str:
-    parts = clip.split("/")
-    return "/".join("P1" if part in FIRST else "P2" if part in SECOND else part for part in parts)
-
-
-def mean_face(place: Path) -> Floats:
-    """(58,) the face that the reference subtracts, where the user has put it. Raises ConfigError."""
-    tried = [base / name for base in (place, place.parent) for name in MEAN_FACE]
-    file = next((file for file in tried if file.is_file()), None)
-    if file is None:
-        raise ConfigError(f"{place}: faceverse58-centred needs {MEAN_FACE[0]} or {MEAN_FACE[1]} there or above")
-    try:
-        mean = np.asarray(npy(file), np.float32).reshape(-1)
-    except ValueError as error:
-        raise ConfigError(f"{file}: holds no mean face: {error}") from error
-    if mean.shape != (WIDTH,) or not np.isfinite(mean).all():
-        raise ConfigError(f"{file}: a mean face is ({WIDTH},) and finite, this is {mean.shape}")
-    return mean
-
-
-def centred(mean: Floats, clip: Dyad) -> Dyad:
-    """A dyad less the mean face."""
-    return replace(clip, speaker=clip.speaker - mean, listener=clip.listener - mean, space="faceverse58-centred")
-
-
-LAYOUT: Final = Layout(
-    name="react", about="REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", space="faceverse58", fps=FPS,
-    order="exp-first", root=root, splits=splits, scan=scan, features=("attributes", "speaker_attributes"),
-)  # fmt: skip
-
-
-# --- REACT 2025 and 2026 (MARS): sessions of any length at 30 fps, FaceVerse coefficients -------------------------
-#
-# `{train,val,test}/{coefficients,facial-attributes,audio,audio-features}/{speaker,listener}/session{n}/NAME`, the two
-# people of a dyad under one name. Roles are given, so pairs are read one way. All listeners of a session count as
-# appropriate. Motion stays what the files hold; the baseline's loader standardises it.
-
-REACT2025_FPS: Final = 30.0
-# feature: folder, role, width
-FEATURES: Final[Mapping[str, tuple[str, str, int]]] = {
-    "attributes": ("facial-attributes", "listener", 25),
-    "speaker_attributes": ("facial-attributes", "speaker", 25),
-    "wav2vec2": ("audio-features", "speaker", 768),
-}
-
-
-def react2025_root(folder: Path) -> Path | None:
-    for place in (folder, folder / "data"):
-        if any((place / split / "coefficients").is_dir() for split in SPLITS.values()):
-            return place
-    return None
-
-
-def react2025_splits(place: Path) -> Mapping[str, str]:
-    return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / "coefficients").is_dir()}
-
-
-def react2025_scan(place: Path, split: str, order: Order | None) -> Dataset:
-    folder = place / split
-    roles = [folder / "coefficients" / role for role in ("speaker", "listener")]
-    names = sorted({str(file.relative_to(role).with_suffix("")) for role in roles for file in role.rglob("*.npy")})
-    heard = (folder / "audio").is_dir()
-
-    def clip(row: int, path: str) -> Clip:
-        name = path.replace("/", "+")
-        files = [role / f"{path}.npy" for role in roles]
-        frames = frames_of(name, *(npy(file).shape for file in files))
-        voices = [folder / "audio" / role / f"{path}.wav" for role in ("speaker", "listener")] if heard else []
-        if voices and not voices[0].is_file():
-            raise ClipError.of("missing sound", voices[0], "no such file")
-        features = {
-            feature: partial(_feature, folder / kind / role / f"{path}.npy", frames, width)
-            for feature, (kind, role, width) in FEATURES.items()
-        }
-        return Clip(
-            name=name,
-            frames=frames,
-            row=row,
-            read=partial(filed_dyad, name, files, voices, frames, "faceverse58", REACT2025_FPS, order == "pose-first"),
-            features=features,
-        )
-
-    clips, problems = collect(list(enumerate(names)), clip)
-    notes = () if heard else (f"{folder / 'audio'}: no such folder: these clips have no sound",)
-    return Dataset(
-        layout="react2025",
-        split=split,
-        space="faceverse58",
-        fps=REACT2025_FPS,
-        clips=clips,
-        problems=problems,
-        notes=notes,
-    )
-
-
 def _feature(file: Path, frames: int, width: int) -> Floats:
-    """(frames, width); the last row again where a feature ends a frame or two early. Raises ClipError."""
+    """Return (frames, width); the last row again where a feature ends a frame or two early. Raises ClipError."""
     if not file.is_file():
         raise ClipError.of("missing feature", file, "no such file")
     values = npy(file)
     had = min(frames, frames_of(str(file), values.shape, (frames, width)))
-    rows = track(str(file), values, had, width)
-    return np.pad(rows, ((0, frames - had), (0, 0)), mode="edge")
+    return np.pad(track(str(file), values, had, width), ((0, frames - had), (0, 0)), mode="edge")
 
 
-REACT2025_LAYOUT: Final = Layout(
+LAYOUT: Final = Layout(
+    name="react", about="REACT 2023/24: {train,val,test}/3D_FV_files and {split}.csv", space=SPACE, fps=FPS,
+    order="exp-first", splits=partial(splits, FACES), scan=scan,
+)  # fmt: skip
+LAYOUT_2025: Final = Layout(
     name="react2025", about="REACT 2025/26: {train,val,test}/coefficients/{speaker,listener}/session{n}/NAME.npy",
-    space="faceverse58", fps=REACT2025_FPS, order="exp-first",
-    root=react2025_root, splits=react2025_splits, scan=react2025_scan, features=tuple(FEATURES),
+    space=SPACE, fps=FPS_2025, order="exp-first", splits=partial(splits, FACES_2025), scan=scan_2025,
 )  # fmt: skip

@@ -1,7 +1,7 @@
 """ViCo, as two projects prepare it: at 30 fps, without its waveforms.
 
 `dim` (Boese0601/Dyadic-Interaction-Modeling @ 9fc92f72): `vico_processed_30fps/<id>.pkl`, a dict of `audio` (T, 768),
-`video_speaker` and `video_listener` (T, 56), pose first; `RLD_data.csv` tells ids (second column) and splits (last).
+`video_speaker` and `video_listener` (T, 56), pose first; `RLD_data.csv` lists ids (second column) and splits (last).
 `vico` (dc3ea9f/vico_challenge_baseline @ 16424c07): `features/audio_feats/<uuid>.npy` (T, 45),
 `features/video_feats/<uuid>.{speaker,listener}.bin`, torch-saved dicts with `angle.exp.trans` (T, 73) of
 Deep3DFaceRecon, which drives no head here. `metadata/data.csv` lists the uuids.
@@ -11,20 +11,20 @@ A pickle cannot be read in parts: each file is read once for its length, and aga
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt, guarded
 from sfms_robot.lab.corpora.reading import (
-    collect,
-    dyad,
+    dyad_of,
     frames_of,
     npy,
     numbers,
@@ -41,23 +41,40 @@ SPLIT_NAMES: Final = {"train": "train", "valid": "validation", "val": "validatio
 ROLES: Final = ("speaker", "listener")
 
 
-def _splits(table: Mapping[str, str]) -> Mapping[str, str]:
-    return {SPLIT_NAMES.get(theirs, theirs): theirs for theirs in sorted(set(table.values()))}
+def _splits(listed: Callable[[Path], Mapping[str, str]], place: Path) -> Mapping[str, str]:
+    return {SPLIT_NAMES.get(theirs, theirs): theirs for theirs in sorted(set(listed(place).values()))}
 
 
-# --- dim --------------------------------------------------------------------------------------------------------
+def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
+    """Return one array of a pickled dict. Raises ClipError."""
+    if not file.is_file():
+        raise ClipError.of("missing half", file, "no such file")
+    arrays = guarded(str(file), lambda: load(file))
+    if not isinstance(arrays, dict) or key not in arrays:
+        raise ClipError.of("missing half", file, f"has no {key}")
+    return guarded(str(file), lambda: numbers(arrays, key))
 
 
-def dim_root(folder: Path) -> Path | None:
-    places = (folder, folder / "vico_processed_30fps", folder / "data" / "vico_processed_30fps")
-    return next((place for place in places if next(place.glob("*.pkl"), None)), None)
+def _frames(name: str, space: str, *tracks: tuple[Path, str, NDArray[Any]]) -> int:
+    """Return the frames of tracks, each with its file and key. Raises ClipError for another width."""
+    for file, key, rows in tracks:
+        if rows.ndim < 2 or rows.shape[-1] != WIDTHS[space]:
+            raise ClipError.of("wrong dims", file, f"{key} has shape {rows.shape}, expected (T, {WIDTHS[space]})")
+    return frames_of(name, *(rows.shape for _, _, rows in tracks))
+
+
+# --- dim ------------------------------------------------------------------------------------------------------------
+
+
+def _list_file(place: Path) -> Path | None:
+    return next((base / LIST for base in (place, place.parent) if (base / LIST).is_file()), None)
 
 
 def _listed(place: Path) -> dict[str, str]:
     """Return the split of every id; without the list all are train. Raises ConfigError for an invalid list."""
     ids = sorted(file.stem for file in place.glob("*.pkl"))
-    file = next((base / LIST for base in (place, place.parent) if (base / LIST).is_file()), None)
-    if file is None:
+    file = _list_file(place)
+    if file is None or not ids:
         return dict.fromkeys(ids, "train")
     rows = table(file)[1:]
     if not rows or any(len(row) < 5 for row in rows):
@@ -65,50 +82,25 @@ def _listed(place: Path) -> dict[str, str]:
     return {Path(row[1]).stem: row[-1].strip() for row in rows}
 
 
-def dim_splits(place: Path) -> Mapping[str, str]:
-    return _splits(_listed(place))
+def dim_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    listed = _listed(place)
+    if _list_file(place) is None:
+        yield f"{place}: no {LIST} there or above: all clips count as train"
+    elif unlisted := sorted({file.stem for file in place.glob("*.pkl")} - set(listed)):
+        yield f"{len(unlisted)} files are not in {LIST}: {', '.join(unlisted[:3])}"
 
-
-def dim_scan(place: Path, split: str, order: Order | None) -> Dataset:
-    table = _listed(place)
-    ids = [name for name, theirs in table.items() if theirs == split]
-
-    def clip(row: int, name: str) -> Clip:
+    def clip(name: str) -> Clip:
         file = place / f"{name}.pkl"
-        if not file.is_file():
-            raise ClipError.of("missing half", file, "no such file")
-        arrays = guarded(str(file), lambda: unpickle(file))
-        faces = [_shape(file, arrays, f"video_{role}", WIDTHS["deca56"]) for role in ROLES]
-        frames = frames_of(name, *faces)
-        read = partial(_dim_read, name, file, frames, order != "exp-first")
-        return Clip(name=name, frames=frames, row=row, read=read, features={"hubert": partial(_hubert, file, frames)})
+        keys = [f"video_{role}" for role in ROLES]
+        frames = _frames(name, "deca56", *((file, key, _rows(file, unpickle, key)) for key in keys))
 
-    clips, problems = collect(list(enumerate(ids)), clip)
-    unlisted = sorted({file.stem for file in place.glob("*.pkl")} - set(table))
-    notes = [f"{len(unlisted)} files are not in {LIST}: {', '.join(unlisted[:3])}"] if unlisted else []
-    if not any((base / LIST).is_file() for base in (place, place.parent)):
-        notes.append(f"{place}: no {LIST} there or above: all clips count as train")
-    return Dataset(
-        layout="dim", split=split, space="deca56", fps=FPS, clips=clips, problems=problems, notes=tuple(notes)
-    )
+        def read() -> Dyad:
+            pair = [(f"{file} {key}", pose_last(_rows(file, unpickle, key), order != "exp-first")) for key in keys]
+            return dyad_of(name, pair, frames, "deca56", FPS)
 
+        return Clip(name=name, frames=frames, read=read, features={"hubert": partial(_hubert, file, frames)})
 
-def _shape(file: Path, arrays: Any, key: str, width: int) -> tuple[int, ...]:
-    if not isinstance(arrays, dict) or key not in arrays:
-        raise ClipError.of("missing half", file, f"has no {key}")
-    shape = guarded(str(file), lambda: numbers(arrays, key)).shape
-    if len(shape) < 2 or shape[-1] != width:
-        raise ClipError.of("wrong dims", file, f"{key} has shape {shape}, expected (T, {width})")
-    return shape
-
-
-def _dim_read(name: str, file: Path, frames: int, pose_first: bool) -> Dyad:
-    arrays, width = unpickle(file), WIDTHS["deca56"]
-    speaker, listener = (
-        track(f"{file} {role}", pose_last(numbers(arrays, f"video_{role}"), pose_first), frames, width, gaps=gaps)
-        for role, gaps in zip(ROLES, (True, False), strict=True)
-    )
-    return dyad(name, speaker, listener, "deca56", FPS)
+    yield from attempt([name for name, theirs in listed.items() if theirs == split], clip)
 
 
 def _hubert(file: Path, frames: int) -> Floats:
@@ -118,26 +110,21 @@ def _hubert(file: Path, frames: int) -> Floats:
 
 DIM: Final = Layout(
     name="dim", about=f"DIM's ViCo: vico_processed_30fps/<id>.pkl and {LIST}", space="deca56", fps=FPS,
-    order="pose-first", root=dim_root, splits=dim_splits, scan=dim_scan, held_out=0.1, features=("hubert",),
+    order="pose-first", splits=partial(_splits, _listed), scan=dim_scan, held_out=0.1,
+    below=("", "vico_processed_30fps", "data/vico_processed_30fps"),
 )  # fmt: skip
 
 
-# --- the challenge's baseline -----------------------------------------------------------------------------------
+# --- the challenge's baseline ---------------------------------------------------------------------------------------
 
-
-def vico_root(folder: Path) -> Path | None:
-    for place in (folder, folder / "data"):
-        if (place / "features" / "video_feats").is_dir():
-            return place
-    return None
+_VECTORS: Final = "angle.exp.trans"
 
 
 def _uuids(place: Path) -> dict[str, str]:
     """Return the split of every uuid; those without one are train. Raises ConfigError for an invalid list."""
-    file = place / "metadata" / "data.csv"
-    if not file.is_file():
-        found = sorted({path.name.split(".")[0] for path in (place / "features" / "video_feats").glob("*.*.bin")})
-        return dict.fromkeys(found, "train")
+    videos, file = place / "features" / "video_feats", place / "metadata" / "data.csv"
+    if not videos.is_dir() or not file.is_file():
+        return dict.fromkeys(sorted({path.name.split(".")[0] for path in videos.glob("*.*.bin")}), "train")
     header, *lines = table(file) or [[]]
     if "uuid" not in header:
         raise ConfigError(f"{file}: has no column uuid ({', '.join(header) or 'no rows'})")
@@ -145,34 +132,22 @@ def _uuids(place: Path) -> dict[str, str]:
     return {row["uuid"]: row.get("data_split") or row.get("split") or "train" for row in rows if row.get("uuid")}
 
 
-def vico_splits(place: Path) -> Mapping[str, str]:
-    return _splits(_uuids(place))
+def vico_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+    def faces(name: str) -> list[tuple[Path, NDArray[Any]]]:
+        files = [place / "features" / "video_feats" / f"{name}.{role}.bin" for role in ROLES]
+        return [(file, _rows(file, torch_load, _VECTORS)) for file in files]
 
+    def clip(name: str) -> Clip:
+        frames = _frames(name, "deep3d73", *((file, _VECTORS, rows) for file, rows in faces(name)))
+        features = {"mfcc45": partial(_mfcc45, place / "features" / "audio_feats" / f"{name}.npy", frames)}
+        return Clip(
+            name=name,
+            frames=frames,
+            read=lambda: dyad_of(name, faces(name), frames, "deep3d73", FPS),
+            features=features,
+        )
 
-def vico_scan(place: Path, split: str, order: Order | None) -> Dataset:
-    videos, sounds = place / "features" / "video_feats", place / "features" / "audio_feats"
-    width = WIDTHS["deep3d73"]
-
-    def clip(row: int, name: str) -> Clip:
-        files = [videos / f"{name}.{role}.bin" for role in ROLES]
-        for file in files:
-            if not file.is_file():
-                raise ClipError.of("missing half", file, "no such file")
-        frames = frames_of(name, *(_shape(file, torch_load(file), "angle.exp.trans", width) for file in files))
-        features = {"mfcc45": partial(_mfcc45, sounds / f"{name}.npy", frames)}
-        return Clip(name=name, frames=frames, row=row, read=partial(_vico_read, name, files, frames), features=features)
-
-    ids = [name for name, theirs in _uuids(place).items() if theirs == split]
-    clips, problems = collect(list(enumerate(ids)), clip)
-    return Dataset(layout="vico", split=split, space="deep3d73", fps=FPS, clips=clips, problems=problems)
-
-
-def _vico_read(name: str, files: list[Path], frames: int) -> Dyad:
-    speaker, listener = (
-        track(str(file), numbers(torch_load(file), "angle.exp.trans"), frames, WIDTHS["deep3d73"], gaps=gaps)
-        for file, gaps in zip(files, (True, False), strict=True)
-    )
-    return dyad(name, speaker, listener, "deep3d73", FPS)
+    yield from attempt([name for name, theirs in _uuids(place).items() if theirs == split], clip)
 
 
 def _mfcc45(file: Path, frames: int) -> Floats:
@@ -183,5 +158,5 @@ def _mfcc45(file: Path, frames: int) -> Floats:
 
 VICO: Final = Layout(
     name="vico", about="ViCo challenge baseline: features/{audio_feats,video_feats}", space="deep3d73", fps=FPS,
-    order=None, root=vico_root, splits=vico_splits, scan=vico_scan, held_out=0.1, features=("mfcc45",),
+    splits=partial(_splits, _uuids), scan=vico_scan, held_out=0.1,
 )  # fmt: skip
