@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from typer import Argument, Exit, Option
 
@@ -18,11 +17,6 @@ EPILOG = "\n\n".join(
     f"[bold]{name}[/bold]{'' if bench.in_all else ' (not part of all)'}: {bench.about}"
     for name, bench in BENCHES.items()
 )
-
-
-class LiveAudio(StrEnum):
-    mic = "mic"
-    push = "push"
 
 
 def bench_names() -> list[str]:
@@ -37,7 +31,9 @@ def bench(
     minutes: float | None = Option(
         None, min=0.0, help="For 'fuzz' and 'live': so long; else a million bytes each, 10 min, 30 of torture."
     ),
-    audio: LiveAudio | None = Option(None, help="For 'live': an emulated microphone (the default), or calls."),
+    audio: Literal["mic", "push"] | None = Option(
+        None, help="For 'live': an emulated microphone (the default), or calls."
+    ),
     torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
     against: Path | None = Option(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
@@ -60,7 +56,7 @@ def bench(
         "head": head,
         "frames": frames,
         "minutes": minutes,
-        "audio": audio and audio.value,
+        "audio": audio,
         "torture": torture or None,
         "against": against,
         "hours": hours,

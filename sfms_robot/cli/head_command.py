@@ -121,14 +121,15 @@ def _print_check(checked: Mapping[str, Any]) -> None:
         }
         for row in checked["joints"]
     ]
-    over = {row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1}
-    title = f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces"
-    print_rows(rows, title, alarming=lambda row: row["joint"] in over)
+    over = [row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1]
+    print_rows(rows, f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces")
     say(
         "used: share of the range. clipped: of the time, at an end that is not rest. speed, jerk: of the limit, the "
-        "99th percentile of what the faces ask; red above 100 %.",
+        "99th percentile of what the faces ask.",
         "dim",
     )
+    if over:
+        say(f"too fast for the limits: {cell(over)}", "bold red")
     for row in checked["joints"]:
         say(f"{row['joint']}: {cell(row['channels'], 'not driven by any channel')}")
     if (neck := checked["neck"]) is not None:
@@ -159,7 +160,13 @@ def show_head(
         from sfms_robot.app.head.head_scene import draw_scene
         from sfms_robot.app.output_paths import checked_png
 
-        show(draw_scene(name, checked_png(urdf, "--urdf"), packages), json)
+        drawn = draw_scene(name, checked_png(urdf, "--urdf"), packages)
+        show(
+            drawn,
+            json,
+            heading="{name}: {urdf}, drawn as {picture}",
+            note="follows: joint of the head, joint of the URDF",
+        )
         return
     from sfms_robot.config.overlay import provenance, refusals
 
@@ -193,7 +200,7 @@ def calibrate(
 
     outcome = lead_through(name, port, _Terminal(), joint, again)
     print()  # ends the line of the last question
-    show(outcome.as_dict(), json)
+    show(outcome.as_dict(), json, heading="{head}: {exit}, written to {file}")
     if outcome.torque_unconfirmed:
         print(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}", file=sys.stderr)
     if outcome.problems:
@@ -228,7 +235,8 @@ def pose(
     from sfms_robot.app.head.pose import pose_head
     from sfms_robot.app.options import HeadOptions
 
-    show(pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold), json)
+    posed = pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold)
+    show(posed, json, heading="{head} on {port}: {face}, {exit}")
 
 
 @app.command("fit")
@@ -255,7 +263,12 @@ def fit(
     from sfms_robot.app.options import HeadOptions
 
     def fitted(found: HeadFit) -> None:
-        show(found.as_dict(), json)
+        show(
+            found.as_dict(),
+            json,
+            heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
+            note="rms in joint units (1 = half the range), on held-out frames",
+        )
 
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")

@@ -10,7 +10,7 @@ import typer
 
 import sfms_robot
 from sfms_robot.cli.main import app
-from sfms_robot.cli.show_servo import print_table
+from sfms_robot.cli.show import print_rows
 from sfms_robot.emulator.launch import EmulatedServo, launch
 
 
@@ -144,7 +144,7 @@ ROWS = [
 
 def test_what_reads_a_pipe_finds_whole_rows(capsys, monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
-    print_table(ROWS)
+    print_rows(ROWS)
     rows = capsys.readouterr().out.splitlines()
     for row in ROWS:
         assert any(all(str(value).strip() in line for value in row.values()) for line in rows)
@@ -152,7 +152,7 @@ def test_what_reads_a_pipe_finds_whole_rows(capsys, monkeypatch):
 
 def test_a_narrow_terminal_folds_texts_and_keeps_numbers(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "50")
-    print_table(ROWS)
+    print_rows(ROWS)
     told = capsys.readouterr().out
     assert "…" not in told and max(map(len, told.splitlines())) <= 50
     assert "11" in told and "12" in told and told.count("overheating") >= 8
