@@ -32,7 +32,7 @@ test-all: install
 	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)"
 
 lint: install
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
