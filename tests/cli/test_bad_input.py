@@ -91,7 +91,10 @@ CASES = [
     (TABLE + " 3 --train", 2, ["--train needs --models DIR"]),
     (TABLE + " 4 --data {tmp}/folder.png --models {tmp}/m", 2, ["no face tracks (*.csv, *.csv.gz) below it"]),
     ("evaluate tokenizer", 2, ["--data is needed without --table"]),
-    *((f"fleet {word} halt", 2, [f"fleet halt {word.split()[0]}"]) for word in ("--zenoh file.json5", "--json", "--insecure")),
+    *(
+        (f"fleet {word} halt", 2, [f"fleet halt {word.split()[0]}"])
+        for word in ("--zenoh file.json5", "--json", "--insecure")
+    ),
 ]
 
 
