@@ -15,10 +15,10 @@ os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in 
 import pytest
 from ended import Ended
 from hypothesis import settings
-from sound_server import SoundServer
 
 from sfms_robot.cli.main import main
 from sfms_robot.data import head_names
+from sfms_robot.emulator.sound_server import SoundServer
 
 # A busy computer is not a failure: no deadlines.
 settings.register_profile("quick", max_examples=20, deadline=None, derandomize=True)

@@ -1,8 +1,9 @@
-"""No command talks to anybody but this computer, and none looks a name up: every group of commands, watched.
+"""No command contacts another computer or looks a name up: every group of commands under a watcher.
 
-Two watchers. `strace` sees every socket of every process, native libraries' too; it is used where it may be. The other
-is a hook inside every Python process, in a network namespace with nothing but loopback where one may be had: it sees
-what Python does, and what a library tries besides has nowhere to go. Both must see a stranger when there is one.
+There are two watchers. `strace` sees every socket of every process, those of native libraries too; not every system
+allows it. The other is a hook inside every Python process, in a network namespace that has only loopback where the
+system grants one: it sees the calls of Python, and a library that tries something else reaches nothing. Tests show that
+both see a stranger.
 """
 
 import ipaddress
@@ -19,16 +20,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-
-from sfms_robot.frames import BLENDSHAPES, POSE_CHANNELS
-from sfms_robot.lab.corpora import clips
+from ended import PROGRAM
+from tiny_sfms_training import configuration, write_dyads
 
 ROOT = Path(__file__).parents[1]
-START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
 HEAD = "interbotix_wxxms"
 LIMIT_S = 240.0
 CALLS = "connect,bind,sendto,sendmsg,sendmmsg"
-NAMES_PORT = 53  # also on loopback: who asks there looks a name up
+NAMES_PORT = 53  # also on loopback: a question there looks a name up
 
 HOOK = """
 import json, os, socket, sys
@@ -64,7 +63,7 @@ def works(*words):
 
 
 class Strace:
-    """Watches from outside."""
+    """The watcher outside the processes."""
 
     def __init__(self, folder):
         self.file = folder / "strace.txt"
@@ -77,7 +76,7 @@ class Strace:
         return works("strace", "--seccomp-bpf", "-f", "-qq", "-e", f"trace={CALLS}", "-o", os.devnull, "true")
 
     def addressed(self):
-        """(call, host, port) of every address of the internet that was named."""
+        """Return (call, host, port) of every internet address that was used."""
         return [
             (call, host, int(port))
             for line in self.file.read_text().splitlines()
@@ -88,7 +87,7 @@ class Strace:
 
 
 class Hook:
-    """Watches from inside."""
+    """The watcher inside the Python processes."""
 
     def __init__(self, folder):
         (folder / "sitecustomize.py").write_text(HOOK)
@@ -118,21 +117,21 @@ class Watched:
         self.environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
 
     def start(self, *words, program=None):
-        command = [*self.watcher.command, *(program or START), *map(str, words)]
+        command = [*self.watcher.command, *(program or PROGRAM), *map(str, words)]
         return subprocess.Popen(
             command, cwd=self.folder, env=self.environment, text=True, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
 
     def run(self, *words, codes=(0,), program=None):
-        """Until it ends, which it must do well."""
+        """Run a command to its end; its exit code must be one of `codes`. Return stdout."""
         with self.start(*words, program=program) as running:
             out, err = running.communicate(timeout=LIMIT_S)
         assert running.returncode in codes, (words, running.returncode, err)
         return out
 
     def strangers(self):
-        """Whoever was addressed beyond loopback, and every look at a name."""
+        """Return the calls that left loopback or looked a name up."""
         return [each for each in self.watcher.addressed() if is_stranger(*each)]
 
 
@@ -149,7 +148,7 @@ def is_stranger(call, host, port):
 
 @pytest.fixture(params=WATCHERS, ids=lambda watcher: watcher.__name__.lower())
 def watched(request, tmp_path):
-    """Both watchers, for what is quick."""
+    """Commands under each watcher, for quick tests."""
     if not request.param.usable():
         pytest.skip("strace may not be used here")
     return Watched(request.param(tmp_path), tmp_path)
@@ -157,7 +156,7 @@ def watched(request, tmp_path):
 
 @pytest.fixture
 def best(tmp_path):
-    """The one that sees most, for what takes its time."""
+    """Commands under the watcher that sees most."""
     return Watched((Strace if Strace.usable() else Hook)(tmp_path), tmp_path)
 
 
@@ -238,37 +237,10 @@ def test_commands_that_speak_to_servos_stay_here(best):
     assert best.strangers() == []
 
 
-def dyad(name, seed):
-    rng = np.random.default_rng(seed)
-    motion = (0.2 + 0.1 * np.sin(np.arange(110)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
-    return clips.Dyad(
-        name=name,
-        audio=rng.normal(0, 0.05, 110 * 640).astype(np.float32),
-        speaker=motion,
-        listener=motion,
-        listening=np.ones(110, bool),
-    )
-
-
-def training():
-    phase = {"steps": 1, "batch": 2, "learning_rate": 0.005, "evaluate_every": 1}
-    groups = {"neck": POSE_CHANNELS, "face": BLENDSHAPES}
-    return {
-        "seed": 2,
-        "listener": {
-            "kind": "sfms", "placement": "static", "tokenizer_width": 8, "predictor_width": 8, "predictor_layers": 1,
-            "heads": 2,
-            "groups": {name: {"channels": list(of), "levels": [3, 3], "keyframes": 6} for name, of in groups.items()},
-        },
-        "tokenizer": phase, "predictor": {**phase, "calibration_rounds": 0},
-    }  # fmt: skip
-
-
 @pytest.mark.slow
 def test_commands_that_learn_and_measure_stay_here(best):
-    clips.save(best.folder / "data" / "train", [dyad("a", 0)])
-    clips.save(best.folder / "data" / "validation", [dyad("b", 1)])
-    (best.folder / "tiny.yaml").write_text(yaml.safe_dump(training(), sort_keys=False))
+    write_dyads(best.folder / "data")
+    (best.folder / "tiny.yaml").write_text(yaml.safe_dump(configuration(steps=1), sort_keys=False))
     best.run("data", "check", "data")
     flags = ["--config", "tiny.yaml", "--data", "data", "--out", "out", "--device", "cpu"]
     best.run("train", "tokenizer", *flags, "--tensorboard")
@@ -287,7 +259,7 @@ def test_a_listener_that_is_served_and_a_fleet_stay_here(best):
             assert line, server.communicate()
         best.run("run", "--head", HEAD, "--listener", "zenoh/sfms-small", "--fleet", "one", "--duration", "2")
         best.run("fleet", "--json")
-        best.run("fleet", "halt", codes=(1,))  # nobody is there any more
+        best.run("fleet", "halt", codes=(1,))  # no head is left
         os.killpg(server.pid, signal.SIGTERM)
         server.communicate(timeout=LIMIT_S)
     assert best.strangers() == []
