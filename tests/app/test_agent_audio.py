@@ -59,12 +59,12 @@ def listened(listener, **options):
 
 
 def test_a_voice_shorter_than_the_run_ends_and_the_head_goes_on(seeded, tmp_path):
-    said = voice(tmp_path / "said.wav", 1.0)
-    done = listened(seeded, agent_audio=said, duration_s=3.0)
-    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 75, 0)
-    mute = listened(seeded, duration_s=3.0)
+    said = voice(tmp_path / "said.wav", 0.6)
+    done = listened(seeded, agent_audio=said, duration_s=2.0)
+    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 50, 0)
+    mute = listened(seeded, duration_s=2.0)
     assert done["wire"]["main"]["sha256"] != mute["wire"]["main"]["sha256"]
-    assert done == listened(seeded, agent_audio=said, duration_s=3.0)
+    assert done == listened(seeded, agent_audio=said, duration_s=2.0)
 
 
 def test_a_robot_that_only_speaks_needs_nobody_to_hear(seeded, tmp_path):

@@ -124,6 +124,7 @@ def test_streams_and_channels_go_their_own_ways():
     assert np.abs(together - np.eye(12)).max() < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sfms-small", "arig-small"])
 def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
     """Ten minutes of 150 streams: some sway further than most people, all together they do not."""

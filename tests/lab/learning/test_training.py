@@ -70,7 +70,7 @@ def data(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("placement", ["exact", "static", "learned"])
+@pytest.mark.parametrize("placement", ["exact", "static", pytest.param("learned", marks=pytest.mark.slow)])
 def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placement):
     chosen = settings(placement)
     first = tokenizer.train_tokenizer(chosen, data, tmp_path)
@@ -118,8 +118,8 @@ WRITTEN = {"tokenizer": tokenizer.WEIGHTS, "listener": checkpoint.WEIGHTS}
     ("phase", "placement", "stop"),
     [
         ("tokenizer", "exact", 17),
-        ("tokenizer", "learned", 9),
         ("listener", "exact", 8),
+        pytest.param("tokenizer", "learned", 9, marks=pytest.mark.slow),
         pytest.param("tokenizer", "static", 29, marks=pytest.mark.slow),
         pytest.param("listener", "exact", 1, marks=pytest.mark.slow),
         pytest.param("listener", "learned", 11, marks=pytest.mark.slow),

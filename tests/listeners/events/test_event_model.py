@@ -23,7 +23,7 @@ from sfms_robot.listeners.events.evidence import sense
 from sfms_robot.listeners.events.model import AT_PERSON, LEAD_FRAMES, EventMemory, EventModel
 
 MODEL = EventModel.load()
-MINUTES = 4
+MINUTES = 2
 FRAMES = round(MINUTES * 60 / FRAME_S)
 NOBODY = np.zeros(0, np.float32)
 MOST_NODS = 12.0  # a minute, of a head that takes itself for addressed all along
