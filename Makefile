@@ -6,6 +6,7 @@ INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); $(BIN)/python -m pip ins
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := -n auto --dist loadfile  # a file of tests to a process, as many processes as cores
 TESTS := not hardware and not gpu
+REALTIME = $(shell grep -lr --include='test_*.py' mark.realtime tests)  # the other files need not be loaded
 
 .PHONY: run test test-all lint bench install clean
 
@@ -25,11 +26,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 test: install
 	$(PYTEST) $(PARALLEL) -m "not realtime and not slow and $(TESTS)"
-	$(PYTEST) -m "realtime and not slow and $(TESTS)"
+	$(PYTEST) -m "realtime and not slow and $(TESTS)" $(REALTIME)
 
 test-all: install
 	$(PYTEST) $(PARALLEL) --all-tools --hypothesis-profile thorough --durations 40 -m "not realtime and $(TESTS)"
-	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)"
+	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)" $(REALTIME)
 
 lint: install
 	$(BIN)/ruff check --no-cache .

@@ -72,6 +72,7 @@ def test_a_robot_that_only_speaks_needs_nobody_to_hear(seeded, tmp_path):
     assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 50, 0)
 
 
+@pytest.mark.slow
 @trained
 def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_path):
     listened(SHIPPED, agent_audio=voice(tmp_path / "said.wav", 4.0), duration_s=9.0, record=tmp_path / "run")

@@ -87,6 +87,7 @@ def test_pictures_are_drawn_without_a_display(tmp_path):
     assert instants == pick_instants(times_s, frames)
 
 
+@pytest.mark.slow
 def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
     pytest.importorskip("vtkmodules")
     scene = scene_of(load_head("op3_head"))

@@ -227,6 +227,7 @@ def test_a_message_that_is_too_long_ends_the_connection(page):
             visitor.recv(timeout=WAIT_S)
 
 
+@pytest.mark.slow
 def test_while_one_floods_the_others_are_served(page):
     with visit(page) as flooder, visit(page) as other:
         assert heard(other)["type"] == "hello"

@@ -70,7 +70,9 @@ def data(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("placement", ["exact", "static", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "placement", ["exact", *(pytest.param(each, marks=pytest.mark.slow) for each in ("static", "learned"))]
+)
 def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placement):
     chosen = settings(placement)
     first = tokenizer.train_tokenizer(chosen, data, tmp_path)
@@ -92,6 +94,7 @@ def test_training_repeats_bit_for_bit(data, tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
+@pytest.mark.slow
 def test_more_training_reconstructs_better(data, tmp_path):
     few = settings(tokenizer={"steps": 1, "batch": 8, "learning_rate": 5e-3})
     many = settings(tokenizer={"steps": 120, "batch": 8, "learning_rate": 5e-3})
@@ -143,6 +146,7 @@ def test_a_phase_interrupted_and_resumed_writes_the_same_bytes(data, tmp_path, p
     assert resumed | {"resumed_at": None} == figures and resumed["resumed_at"] == stop
 
 
+@pytest.mark.slow
 def test_a_listener_is_not_resumed_on_another_tokenizer_or_other_data(data, tmp_path):
     tokenizer.train_tokenizer(settings(), data, tmp_path)
     with pytest.raises(KeyboardInterrupt):

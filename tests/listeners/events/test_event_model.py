@@ -172,7 +172,10 @@ def test_nods_rise_with_the_knob_and_none_at_nought():
     assert nods[0] == 0 and nods == sorted(nods) and nods[-1] > 2 * nods[1] > 0
 
 
-@pytest.mark.parametrize("kind", ["blink", "gaze_shift", "smile", "mm_hm", "tilt"])
+@pytest.mark.parametrize(
+    "kind",
+    ["blink", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("gaze_shift", "smile", "mm_hm", "tilt"))],
+)
 def test_other_kinds_have_knobs_too(kind):
     counts = [len(of(kind, listen(conversation(), calmness=Calmness(**{kind: knob}))[0])) for knob in (0, 4, 20)]
     assert counts[0] == 0 and counts[1] < counts[2]
