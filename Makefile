@@ -4,7 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); $(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := -n auto --dist loadfile  # a file of tests to a process, as many processes as cores
+# A file of tests to a process. One process more than there are cores: many tests wait for servos and for children.
+WORKERS = $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
+PARALLEL = -n $(WORKERS) --dist loadfile
 TESTS := not hardware and not gpu
 REALTIME = $(shell grep -lr --include='test_*.py' mark.realtime tests)  # the other files need not be loaded
 

@@ -82,6 +82,7 @@ def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_pat
     assert np.std(talking) > 2 * np.std(after) and np.mean(talking) > 2 * np.mean(after)
 
 
+@pytest.mark.slow
 def test_a_recording_of_a_head_that_speaks_moves_a_head_and_a_listener_as_the_run_did(seeded, tmp_path):
     said = voice(tmp_path / "said.wav", 2.0)
     done = listened(seeded, agent_audio=said, duration_s=3.0, record=tmp_path / "run")

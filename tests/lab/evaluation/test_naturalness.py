@@ -20,6 +20,7 @@ def cut(motions, seed=0):
     return [windows(motion, rng) for motion in motions]
 
 
+@pytest.mark.slow
 def test_the_same_motion_cannot_be_told_apart_and_another_pace_can():
     rng = np.random.default_rng(3)
     slow, as_slow = ([sway(rng, 0.6) for _ in range(DYADS)] for _ in range(2))
