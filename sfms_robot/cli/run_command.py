@@ -257,10 +257,13 @@ def _print_run(report: Mapping[str, Any]) -> None:
         f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
         "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
         "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, silent: {cell(bus['silent'])}",
+        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
+        f"silent: {cell(bus['silent'], 'none')}",
     }
     if "recording" in report:
-        facts["recording"] = f"{report['recording']['bytes'] * 1e-6:.1f} MB"
+        kept = report["recording"]
+        problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")
+        facts["recording"] = f"{kept['bytes'] * 1e-6:.1f} MB" + (f", INCOMPLETE: {problem}" if problem else "")
     if report["torque_unconfirmed"]:
         facts["torque"] = f"NOT confirmed off: {cell(report['torque_unconfirmed'])}"
     say(f"{report['head']} listened for {report['duration_s']:g} s ({report['exit']})", "bold")
