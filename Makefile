@@ -4,8 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); $(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := -n auto --dist loadfile  # a file of tests to a process, as many processes as cores
+# A file of tests to a process. One process more than there are cores: many tests wait for servos and for children.
+WORKERS = $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
+PARALLEL = -n $(WORKERS) --dist loadfile
 TESTS := not hardware and not gpu
+REALTIME = $(shell grep -lr --include='test_*.py' mark.realtime tests)  # the other files need not be loaded
 
 .PHONY: run test test-all lint bench install clean
 
@@ -25,11 +28,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 test: install
 	$(PYTEST) $(PARALLEL) -m "not realtime and not slow and $(TESTS)"
-	$(PYTEST) -m "realtime and not slow and $(TESTS)"
+	$(PYTEST) -m "realtime and not slow and $(TESTS)" $(REALTIME)
 
 test-all: install
 	$(PYTEST) $(PARALLEL) --all-tools --hypothesis-profile thorough --durations 40 -m "not realtime and $(TESTS)"
-	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)"
+	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)" $(REALTIME)
 
 lint: install
 	$(BIN)/ruff check --no-cache .

@@ -15,10 +15,10 @@ os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in 
 import pytest
 from ended import Ended
 from hypothesis import settings
-from sound_server import SoundServer
 
 from sfms_robot.cli.main import main
 from sfms_robot.data import head_names
+from sfms_robot.emulator.sound_server import SoundServer
 
 # A busy computer is not a failure: no deadlines.
 settings.register_profile("quick", max_examples=20, deadline=None, derandomize=True)
@@ -26,6 +26,7 @@ settings.register_profile("thorough", max_examples=100, deadline=None, print_blo
 settings.load_profile("quick")
 
 EVERY_RUN = {"face28", "reachy_mini"}  # heads of `make test`; tests of the others are marked slow
+ALIKE = {"dynamixel1-mx", "scs", "maestro-crc"}  # families much like one that every run tests: slow too
 MISSING = ("needs ", "could not import ")  # reasons to skip that a complete machine does not have
 
 
@@ -50,7 +51,7 @@ def pytest_addoption(parser):
 
 def pytest_collection_modifyitems(config, items):
     skip = pytest.mark.skip(reason="real servos: --port FAMILY=DEVICE")
-    left_out = set(head_names()) - EVERY_RUN
+    left_out = set(head_names()) - EVERY_RUN | ALIKE
     for item in items:
         if "hardware" in item.keywords and not config.getoption("--port"):
             item.add_marker(skip)

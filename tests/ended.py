@@ -1,7 +1,10 @@
-"""How a command line ended."""
+"""The command line in a process, and how it ended."""
 
 import json
+import sys
 from typing import NamedTuple
+
+PROGRAM = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
 
 
 class Ended(NamedTuple):
@@ -11,7 +14,7 @@ class Ended(NamedTuple):
 
     @property
     def told(self):
-        """The last line of stdout, as JSON: NaN and Infinity are none."""
+        """The last line of stdout, as JSON: NaN and Infinity are errors."""
         return json.loads(self.out.splitlines()[-1], parse_constant=_no_json)
 
     @property

@@ -12,16 +12,7 @@ import sfms_robot
 
 PACKAGE = Path(sfms_robot.__file__).parent
 BASE = {
-    "errors",
-    "frames",
-    "ports",
-    "signals",
-    "data",
-    "config",
-    "ranges",
-    "endpoint",
-    "network",
-    "plugins",
+    *("errors", "frames", "ports", "signals", "data", "config", "ranges", "endpoint", "network", "plugins"),
     "processes",
 }
 PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
@@ -35,53 +26,74 @@ ALLOWED = {
     "lab": BASE | PEERS | {"viewer", "emulator", "app", "lab"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}
+SDK_FILES = {"servo/chain/sdk_packets.py", "lab/bench/bus_bench.py"}  # of Dynamixel's maker: one file, and its bench
 
-MODULES = sorted(PACKAGE.rglob("*.py"))
+
+@pytest.fixture(scope="module")
+def trees():
+    """Return the syntax tree of every module, by its path in the package."""
+    return {
+        str(file.relative_to(PACKAGE)): ast.parse(file.read_text(encoding="utf-8")) for file in PACKAGE.rglob("*.py")
+    }
 
 
-def imports_of(module: Path) -> set[tuple[str, ...]]:
-    """Every `sfms_robot.x.y` that a module imports, as ("x", "y")."""
-    found: set[tuple[str, ...]] = set()
-    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+def imported(tree) -> set[str]:
+    """Return the dotted names that a module imports anywhere."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{module}: relative import"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        found |= {tuple(name.split(".")[1:]) for name in names if name.split(".")[0] == "sfms_robot"}
+            assert node.level == 0, f"relative import: {ast.unparse(node)}"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
 
-def layer_of(module: Path) -> str:
-    return module.relative_to(PACKAGE).parts[0].removesuffix(".py")
+def own(tree) -> set[tuple[str, ...]]:
+    """Return every `sfms_robot.x.y` that a module imports, as ("x", "y")."""
+    return {tuple(name.split(".")[1:]) for name in imported(tree) if name.split(".")[0] == "sfms_robot"}
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_module_imports_only_what_its_layer_may(module: Path) -> None:
-    layer = layer_of(module)
-    if layer == "__init__":
-        return
-    for target in imports_of(module):
-        if not target or target[0] == "__version__":
-            continue
-        assert target[0] in ALLOWED[layer], f"{layer} may not import {'.'.join(target)}"
-        if layer == "emulator" and target[0] == "servo":
-            assert set(target[1:2]) <= SERVO_PARTS_FOR_THE_EMULATOR, f"emulator may not import {'.'.join(target)}"
+def layer_of(path: str) -> str:
+    return path.split("/")[0].removesuffix(".py")
 
 
-def test_no_two_classes_share_a_name() -> None:
-    trees = [ast.parse(module.read_text(encoding="utf-8")) for module in MODULES]
-    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
-    assert not [name for name, count in names.items() if count > 1]
+def test_modules_import_only_what_their_layer_may(trees):
+    wrong = [
+        f"{path} may not import {'.'.join(target)}"
+        for path, tree in trees.items()
+        for target in own(tree)
+        if layer_of(path) != "__init__" and target and target[0] != "__version__"
+        if target[0] not in ALLOWED[layer_of(path)]
+        or (layer_of(path), target[0]) == ("emulator", "servo")
+        and not set(target[1:2]) <= SERVO_PARTS_FOR_THE_EMULATOR
+    ]
+    assert wrong == []
 
 
-def test_every_layer_has_a_rule() -> None:
-    assert {layer_of(module) for module in MODULES} - {"__init__"} <= set(ALLOWED)
+def test_no_two_classes_share_a_name(trees):
+    names = Counter(node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port() -> None:
+def test_every_layer_has_a_rule(trees):
+    assert {layer_of(path) for path in trees} - {"__init__"} <= set(ALLOWED)
+
+
+def test_no_two_modules_import_one_another(trees):
+    names = {path: tuple(path.removesuffix(".py").split("/")) for path in trees}
+    parts = {name[:-1] if name[-1] == "__init__" else name: trees[path] for path, name in names.items()}
+    known = {name: {target if target in parts else target[:-1] for target in own(tree)} for name, tree in parts.items()}
+    assert [(a, b) for a in parts for b in known[a] - {a} if a in known.get(b, ())] == []
+
+
+def test_the_vendors_sdk_is_known_to_one_file_and_to_the_bench_that_measures_it(trees):
+    assert {
+        path for path, tree in trees.items() if "dynamixel_sdk" in {name.split(".")[0] for name in imported(tree)}
+    } == SDK_FILES
+
+
+def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port():
     code = (
         "import sys; from sfms_robot.cli.main import app\n"
         "try: app(['--help'])\n"
@@ -93,29 +105,6 @@ def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_python_keeps_out_of_the_data_folders() -> None:
-    root = PACKAGE.parent
+def test_python_keeps_out_of_the_data_folders():
     for folder in ("configs", "firmware_maps", "sim"):
-        assert not list((root / folder).rglob("*.py"))
-
-
-def test_no_two_modules_import_one_another() -> None:
-    paths = {path.relative_to(PACKAGE).with_suffix("").parts: path for path in MODULES}
-    modules = {parts[:-1] if parts[-1] == "__init__" else parts: path for parts, path in paths.items()}
-    imported = {
-        name: {target if target in modules else target[:-1] for target in imports_of(path)}
-        for name, path in modules.items()
-    }
-    assert not [(a, b) for a in modules for b in imported[a] - {a} if a in imported.get(b, ())]
-
-
-def test_the_vendors_sdk_is_known_to_one_file_and_to_the_bench_that_measures_it():
-    knows = {
-        str(module.relative_to(PACKAGE))
-        for module in MODULES
-        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
-        if name and name.split(".")[0] == "dynamixel_sdk"
-    }
-    assert knows == {"servo/chain/sdk_packets.py", "lab/bench/bus_bench.py"}
+        assert not list((PACKAGE.parent / folder).rglob("*.py"))

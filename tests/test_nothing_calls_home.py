@@ -1,12 +1,9 @@
-"""No command talks to anybody but this computer, and none looks a name up: every group of commands, watched.
+"""No command contacts another computer or looks a name up: every group of commands under `strace`.
 
-Two watchers. `strace` sees every socket of every process, native libraries' too; it is used where it may be. The other
-is a hook inside every Python process, in a network namespace with nothing but loopback where one may be had: it sees
-what Python does, and what a library tries besides has nowhere to go. Both must see a stranger when there is one.
+It sees every socket of every process, those of native libraries too. The first tests show that it sees a stranger.
 """
 
 import ipaddress
-import json
 import os
 import re
 import shutil
@@ -19,172 +16,81 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-
-from sfms_robot.frames import BLENDSHAPES, POSE_CHANNELS
-from sfms_robot.lab.corpora import clips
+from ended import PROGRAM
+from tiny_sfms_training import configuration, write_dyads
 
 ROOT = Path(__file__).parents[1]
-START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
 HEAD = "interbotix_wxxms"
 LIMIT_S = 240.0
-CALLS = "connect,bind,sendto,sendmsg,sendmmsg"
-NAMES_PORT = 53  # also on loopback: who asks there looks a name up
-
-HOOK = """
-import json, os, socket, sys
-
-def look(event, arguments):
-    if event in ("socket.connect", "socket.bind", "socket.sendto", "socket.sendmsg"):
-        if arguments[0].family in (socket.AF_INET, socket.AF_INET6) and arguments[1] is not None:
-            note(event, arguments[1][0], arguments[1][1])
-    elif event in ("socket.getaddrinfo", "socket.gethostbyname", "socket.gethostbyaddr"):
-        note(event, arguments[0], 0)
-
-def note(call, host, port):
-    with open(os.environ["ADDRESSES"], "a") as file:
-        file.write(json.dumps([call, str(host), int(port or 0)]) + "\\n")
-
-note("started", "127.0.0.1", 0)
-sys.addaudithook(look)
-"""
-# Loopback up, then the command: a new namespace has it down.
-LOOPBACK_UP = """
-import fcntl, os, socket, struct, sys
-with socket.socket() as any_socket:
-    fcntl.ioctl(any_socket, 0x8914, struct.pack("16sh14x", b"lo", 0x41))
-os.execvp(sys.argv[1], sys.argv[1:])
-"""
-ALONE = ["unshare", "-n", sys.executable, "-S", "-c", LOOPBACK_UP]
-
-
-def works(*words):
-    return (
-        shutil.which(words[0]) is not None and subprocess.run(words, capture_output=True, check=False).returncode == 0
-    )
-
-
-class Strace:
-    """Watches from outside."""
-
-    def __init__(self, folder):
-        self.file = folder / "strace.txt"
-        trace = ["strace", "--seccomp-bpf", "-f", "-qq", "-s", "0", "-e", f"trace={CALLS}", "-e", "signal=none"]
-        self.command = [*trace, "-A", "-o", str(self.file)]
-        self.environment = {}
-
-    @staticmethod
-    def usable():
-        return works("strace", "--seccomp-bpf", "-f", "-qq", "-e", f"trace={CALLS}", "-o", os.devnull, "true")
-
-    def addressed(self):
-        """(call, host, port) of every address of the internet that was named."""
-        return [
-            (call, host, int(port))
-            for line in self.file.read_text().splitlines()
-            for call, port, host in re.findall(
-                r"(\w+)\(.*sin6?_port=htons\((\d+)\),.*?(?:inet_addr\(|inet_pton\(AF_INET6, )\"([^\"]+)\"", line
-            )
-        ]
-
-
-class Hook:
-    """Watches from inside."""
-
-    def __init__(self, folder):
-        (folder / "sitecustomize.py").write_text(HOOK)
-        self.file = folder / "addresses.txt"
-        self.command = ALONE if works(*ALONE, "true") else []
-        self.environment = {"PYTHONPATH": str(folder), "ADDRESSES": str(self.file)}
-
-    @staticmethod
-    def usable():
-        return True
-
-    def addressed(self):
-        return [tuple(json.loads(line)) for line in self.file.read_text().splitlines()]
-
-
-WATCHERS = [Strace, Hook]
+STRACE = ["strace", "--seccomp-bpf", "-f", "-qq", "-s", "0", "-e", "signal=none"]
+CALLS = ["-e", "trace=connect,bind,sendto,sendmsg,sendmmsg"]
+ADDRESS = r"sin6?_port=htons\((\d+)\),.*?(?:inet_addr\(|inet_pton\(AF_INET6, )\"([^\"]+)\""
+NAMES_PORT = 53  # also on loopback: a question there looks a name up
+SOCKET = "import socket; socket.socket(socket.{}, socket.SOCK_DGRAM)"
 
 
 class Watched:
-    """Commands under a watcher, each in the same empty folder."""
+    """Commands under strace, each in the same empty folder."""
 
-    def __init__(self, watcher, folder):
-        self.watcher, self.folder = watcher, folder
-        paths = [watcher.environment.get("PYTHONPATH"), str(ROOT), *sys.path]
+    def __init__(self, folder):
+        self.folder, self.trace = folder, folder / "strace.txt"
         homes = {name: str(folder / name) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")}
-        self.environment = {**os.environ, **homes, **watcher.environment}
-        self.environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        self.environment = {**os.environ, **homes, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
-    def start(self, *words, program=None):
-        command = [*self.watcher.command, *(program or START), *map(str, words)]
+    def start(self, *words, program=PROGRAM):
         return subprocess.Popen(
-            command, cwd=self.folder, env=self.environment, text=True, stdin=subprocess.DEVNULL,
+            [*STRACE, *CALLS, "-A", "-o", self.trace, *program, *map(str, words)],
+            cwd=self.folder, env=self.environment, text=True, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
 
-    def run(self, *words, codes=(0,), program=None):
-        """Until it ends, which it must do well."""
+    def run(self, *words, codes=(0,), program=PROGRAM):
+        """Run a command to its end; its exit code must be one of `codes`. Return stdout."""
         with self.start(*words, program=program) as running:
             out, err = running.communicate(timeout=LIMIT_S)
         assert running.returncode in codes, (words, running.returncode, err)
         return out
 
+    def addressed(self):
+        """Return (host, port) of every internet address that was used."""
+        return [(host, int(port)) for port, host in re.findall(ADDRESS, self.trace.read_text())]
+
     def strangers(self):
-        """Whoever was addressed beyond loopback, and every look at a name."""
-        return [each for each in self.watcher.addressed() if is_stranger(*each)]
-
-
-def is_stranger(call, host, port):
-    if port == NAMES_PORT:
-        return True
-    if host in ("", "None", "localhost") and call != "bind":
-        return False
-    try:
-        return not ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return True  # a name
-
-
-@pytest.fixture(params=WATCHERS, ids=lambda watcher: watcher.__name__.lower())
-def watched(request, tmp_path):
-    """Both watchers, for what is quick."""
-    if not request.param.usable():
-        pytest.skip("strace may not be used here")
-    return Watched(request.param(tmp_path), tmp_path)
+        """Return the addresses beyond loopback, and those at which names are looked up."""
+        return [
+            (host, port)
+            for host, port in self.addressed()
+            if port == NAMES_PORT or not ipaddress.ip_address(host).is_loopback
+        ]
 
 
 @pytest.fixture
-def best(tmp_path):
-    """The one that sees most, for what takes its time."""
-    return Watched((Strace if Strace.usable() else Hook)(tmp_path), tmp_path)
-
-
-def python(code):
-    return [sys.executable, "-c", code]
+def watched(tmp_path):
+    if shutil.which("strace") is None:
+        pytest.skip("needs strace")
+    if subprocess.run([*STRACE, *CALLS, "-o", os.devnull, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("strace is not permitted here")
+    return Watched(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("code", "seen"),
+    ("family", "call", "seen"),
     [
-        ("import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).connect(('192.0.2.1', 9))", "192.0.2.1"),
-        ("import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).bind(('0.0.0.0', 0))", "0.0.0.0"),
-        ("import socket; socket.socket(socket.AF_INET6, socket.SOCK_DGRAM).connect(('2001:db8::1', 9))", "2001:db8::1"),
+        ("AF_INET", "connect(('192.0.2.1', 9))", "192.0.2.1"),
+        ("AF_INET", "bind(('0.0.0.0', 0))", "0.0.0.0"),
+        ("AF_INET6", "connect(('2001:db8::1', 9))", "2001:db8::1"),
     ],
 )
-def test_a_watcher_sees_a_stranger(watched, code, seen):
-    watched.run(program=python(code), codes=(0, 1))
-    assert seen in [host for _, host, _ in watched.strangers()]
+def test_strace_sees_a_stranger(watched, family, call, seen):
+    watched.run(program=[sys.executable, "-c", f"{SOCKET.format(family)}.{call}"], codes=(0, 1))
+    assert seen in [host for host, _ in watched.strangers()]
 
 
-def test_a_watcher_sees_into_children(watched):
-    inner = "import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).connect(('127.0.0.1', 9))"
-    watched.run(
-        program=python(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}], check=True)")
-    )
-    assert ("127.0.0.1", 9) in [(host, port) for _, host, port in watched.watcher.addressed()]
-    assert watched.strangers() == []
+def test_strace_sees_into_children_and_loopback_is_no_stranger(watched):
+    inner = f"{SOCKET.format('AF_INET')}.connect(('127.0.0.1', 9))"
+    outer = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}], check=True)"
+    watched.run(program=[sys.executable, "-c", outer])
+    assert ("127.0.0.1", 9) in watched.addressed() and watched.strangers() == []
 
 
 def test_a_name_that_is_looked_up_is_a_stranger(watched):
@@ -199,108 +105,83 @@ LOOK_UPS = [
 
 
 @pytest.mark.parametrize("words", LOOK_UPS, ids=" ".join)
-def test_commands_that_look_something_up_address_nobody(best, words):
-    best.run(*words)
-    assert best.strangers() == []
+def test_commands_that_look_something_up_address_nobody(watched, words):
+    watched.run(*words)
+    assert watched.strangers() == []
 
 
 @pytest.mark.slow
-def test_commands_that_listen_and_move_stay_here(best):
+def test_commands_that_listen_and_move_stay_here(watched):
     with socket.create_server(("127.0.0.1", 0)) as found:
         port = found.getsockname()[1]
-    best.run(
+    watched.run(
         "run", "--head", HEAD, "--duration", "2", "--record", "kept", "--status", "0", "--agent-audio", f"tcp:{port}"
     )
-    best.run("run", "--head", HEAD, "--duration", "2", "--view", "0")
-    best.run("run", "--head", HEAD, "--fast", "--duration", "1", "--listener", "arig-small", "--agent-audio", "katie")
-    best.run("demo", "--head", HEAD, "--fast", "--duration", "2", "--out", "shown")
-    best.run("replay", "kept", "--json")
-    assert best.strangers() == []
+    watched.run("run", "--head", HEAD, "--duration", "2", "--view", "0")
+    watched.run(
+        "run", "--head", HEAD, "--fast", "--duration", "1", "--listener", "arig-small", "--agent-audio", "katie"
+    )
+    watched.run("demo", "--head", HEAD, "--fast", "--duration", "2", "--out", "shown")
+    watched.run("replay", "kept", "--json")
+    assert watched.strangers() == []
 
 
 @pytest.mark.slow
-def test_commands_that_speak_to_servos_stay_here(best):
-    device = best.folder / "servos"
-    (best.folder / "poses.csv").write_text("x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad\n0,0,0,0,0.1,0\n")
-    with best.start("emulate", "--head", HEAD, "--link", device) as emulator:
+def test_commands_that_speak_to_servos_stay_here(watched):
+    device = watched.folder / "servos"
+    (watched.folder / "poses.csv").write_text("x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad\n0,0,0,0,0.1,0\n")
+    with watched.start("emulate", "--head", HEAD, "--link", device) as emulator:
         while not device.is_symlink():
             assert emulator.poll() is None, emulator.communicate()
         line = ["--port", device, "--baud", "1000000"]
-        best.run("servo", "scan", "--ids", "1-2", *line)
-        best.run("servo", "ping", "1-2", *line)
-        best.run("servo", "read", "1", "all", *line)
-        best.run("servo", "dump", "dump.yaml", "--ids", "1", *line)
-        best.run("doctor", "--head", HEAD, "--port", device)
-        best.run("run", "--head", HEAD, "--port", device, "--dry-run")
-        best.run("head", "solve", "reachy_mini", "--poses", "poses.csv")
+        watched.run("servo", "scan", "--ids", "1-2", *line)
+        watched.run("servo", "ping", "1-2", *line)
+        watched.run("servo", "read", "1", "all", *line)
+        watched.run("servo", "dump", "dump.yaml", "--ids", "1", *line)
+        watched.run("doctor", "--head", HEAD, "--port", device)
+        watched.run("run", "--head", HEAD, "--port", device, "--dry-run")
+        watched.run("head", "solve", "reachy_mini", "--poses", "poses.csv")
         os.killpg(emulator.pid, signal.SIGTERM)
         emulator.communicate(timeout=LIMIT_S)
-    assert best.strangers() == []
-
-
-def dyad(name, seed):
-    rng = np.random.default_rng(seed)
-    motion = (0.2 + 0.1 * np.sin(np.arange(110)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
-    return clips.Dyad(
-        name=name,
-        audio=rng.normal(0, 0.05, 110 * 640).astype(np.float32),
-        speaker=motion,
-        listener=motion,
-        listening=np.ones(110, bool),
-    )
-
-
-def training():
-    phase = {"steps": 1, "batch": 2, "learning_rate": 0.005, "evaluate_every": 1}
-    groups = {"neck": POSE_CHANNELS, "face": BLENDSHAPES}
-    return {
-        "seed": 2,
-        "listener": {
-            "kind": "sfms", "placement": "static", "tokenizer_width": 8, "predictor_width": 8, "predictor_layers": 1,
-            "heads": 2,
-            "groups": {name: {"channels": list(of), "levels": [3, 3], "keyframes": 6} for name, of in groups.items()},
-        },
-        "tokenizer": phase, "predictor": {**phase, "calibration_rounds": 0},
-    }  # fmt: skip
+    assert watched.strangers() == []
 
 
 @pytest.mark.slow
-def test_commands_that_learn_and_measure_stay_here(best):
-    clips.save(best.folder / "data" / "train", [dyad("a", 0)])
-    clips.save(best.folder / "data" / "validation", [dyad("b", 1)])
-    (best.folder / "tiny.yaml").write_text(yaml.safe_dump(training(), sort_keys=False))
-    best.run("data", "check", "data")
+def test_commands_that_learn_and_measure_stay_here(watched):
+    write_dyads(watched.folder / "data")
+    (watched.folder / "tiny.yaml").write_text(yaml.safe_dump(configuration(steps=1), sort_keys=False))
+    watched.run("data", "check", "data")
     flags = ["--config", "tiny.yaml", "--data", "data", "--out", "out", "--device", "cpu"]
-    best.run("train", "tokenizer", *flags, "--tensorboard")
-    best.run("train", "listener", *flags, "--no-tensorboard")
-    best.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
-    best.run("bench", "retarget")
-    assert best.strangers() == []
+    watched.run("train", "tokenizer", *flags, "--tensorboard")
+    watched.run("train", "listener", *flags, "--no-tensorboard")
+    watched.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
+    watched.run("bench", "retarget")
+    assert watched.strangers() == []
 
 
 @pytest.mark.slow
-def test_a_listener_that_is_served_and_a_fleet_stay_here(best):
+def test_a_listener_that_is_served_and_a_fleet_stay_here(watched):
     pytest.importorskip("zenoh")
     pytest.importorskip("prometheus_client")
-    with best.start("serve", "--hop", "3", "--everybody", "--metrics", "0") as server:
+    with watched.start("serve", "--hop", "3", "--everybody", "--metrics", "0") as server:
         while "up to" not in (line := server.stderr.readline()):
             assert line, server.communicate()
-        best.run("run", "--head", HEAD, "--listener", "zenoh/sfms-small", "--fleet", "one", "--duration", "2")
-        best.run("fleet", "--json")
-        best.run("fleet", "halt", codes=(1,))  # nobody is there any more
+        watched.run("run", "--head", HEAD, "--listener", "zenoh/sfms-small", "--fleet", "one", "--duration", "2")
+        watched.run("fleet", "--json")
+        watched.run("fleet", "halt", codes=(1,))  # no head is left
         os.killpg(server.pid, signal.SIGTERM)
         server.communicate(timeout=LIMIT_S)
-    assert best.strangers() == []
+    assert watched.strangers() == []
 
 
 @pytest.mark.slow
-def test_a_webcam_stays_here(best):
+def test_a_webcam_stays_here(watched):
     """MediaPipe's later releases contact their maker; those that are asked for do not."""
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("mediapipe")
-    video = cv2.VideoWriter(str(best.folder / "grey.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, (320, 240))
+    video = cv2.VideoWriter(str(watched.folder / "grey.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, (320, 240))
     for _ in range(50):
         video.write(np.full((240, 320, 3), 128, np.uint8))
     video.release()
-    best.run("run", "--head", HEAD, "--audio", "none", "--face", "webcam:grey.avi", "--duration", "2")
-    assert best.strangers() == []
+    watched.run("run", "--head", HEAD, "--audio", "none", "--face", "webcam:grey.avi", "--duration", "2")
+    assert watched.strangers() == []

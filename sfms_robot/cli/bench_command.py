@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from typer import Argument, Exit, Option
 
@@ -20,11 +19,6 @@ EPILOG = "\n\n".join(
 )
 
 
-class LiveAudio(StrEnum):
-    mic = "mic"
-    push = "push"
-
-
 def bench_names() -> list[str]:
     """Return the names of the benches."""
     return [ALL, *BENCHES]
@@ -34,7 +28,9 @@ def bench(
     name: str = Argument(ALL, autocompletion=bench_names, help="The bench; all: see below."),
     head: str | None = Option(None, help="For 'lead' and 'memory': this head."),
     minutes: float | None = Option(None, min=0.0, help="For 'live': so long; else 10 min, 30 with --torture."),
-    audio: LiveAudio | None = Option(None, help="For 'live': an emulated microphone (the default), or calls."),
+    audio: Literal["mic", "push"] | None = Option(
+        None, help="For 'live': an emulated microphone (the default), or calls."
+    ),
     torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
     against: Path | None = Option(
         None, help="A folder with another installation: it becomes the peer, and the two run in turn."
@@ -53,7 +49,7 @@ def bench(
     options = {
         "head": head,
         "minutes": minutes,
-        "audio": audio and audio.value,
+        "audio": audio,
         "torture": torture or None,
         "against": against,
         "hours": hours,

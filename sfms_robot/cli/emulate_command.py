@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
-from typing import Any, cast
+from typing import Literal
 
 import typer
 
 from sfms_robot.cli.show import print_json
 
 
-class Timing(StrEnum):
-    wire = "wire"
-    instant = "instant"
-
-
-class BehindSilent(StrEnum):
-    chain_break = "chain_break"
-    skip = "skip"
-
-
 def emulate(
     head: str | None = typer.Option(None, help="All servos of a shipped head, or of a folder with a head.yaml."),
     servo: str | None = typer.Option(None, help="MODEL:IDS[,MODEL:IDS...], as in xl330-m288:1-9,ax-12a:20."),
     link: str | None = typer.Option(None, help="Symbolic link to make; of a head with several buses, PATH-BUS each."),
-    timing: Timing = typer.Option(
-        Timing.wire, help="Replies in the time that bytes and return delays take, or at once."
+    timing: Literal["wire", "instant"] = typer.Option(
+        "wire", help="Replies in the time that bytes and return delays take, or at once."
     ),
     baud: int | None = typer.Option(None, min=1, help="Rate of the servos; default: the head's, or 1 Mbit/s."),
     voltage: float | None = typer.Option(None, min=0.0, help="Supply; default: one the servos are content with."),
@@ -39,8 +28,8 @@ def emulate(
     start: list[str] = typer.Option(
         [], help="IDS=TICKS: where servos are found, outside their limits or beyond one turn, too. Repeatable."
     ),
-    behind_silent: BehindSilent = typer.Option(
-        BehindSilent.chain_break, help="In a sync read, ids behind a silent one are silent too, or answer."
+    behind_silent: Literal["chain_break", "skip"] = typer.Option(
+        "chain_break", help="In a sync read, ids behind a silent one are silent too, or answer."
     ),
     virtual: bool = typer.Option(False, help="Virtual time: answers only through the control socket."),
     seed: int = typer.Option(0, min=0, help="Seed of the faults that are left to chance."),
@@ -53,12 +42,12 @@ def emulate(
         head=head,
         servo=servo,
         link=link,
-        timing=cast(Any, timing.value),
+        timing=timing,
         baud=baud,
         voltage=voltage,
         faults=fault,
         virtual=virtual,
-        behind_silent=cast(Any, behind_silent.value),
+        behind_silent=behind_silent,
         seed=seed,
         stored=stored,
         starts=start,

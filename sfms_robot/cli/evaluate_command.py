@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from typer import BadParameter, Option, Typer
 
@@ -17,32 +16,13 @@ from sfms_robot.cli.train_command import ORDER, Order, interruptible
 app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
 
-class Size(StrEnum):
-    small = "small"
-    paper = "paper"
-
-
-class TableName(StrEnum):
-    """1 and 2 of SFMS; those of ARIG."""
-
-    one = "1"
-    two = "2"
-    arig_1 = "arig-1"
-    arig_2 = "arig-2"
-    arig_4 = "arig-4"
-
-
-class Part(StrEnum):
-    """Of meetings and voices (`corpora.clips`)."""
-
-    train = "train"
-    validation = "validation"
-    test = "test"
-
-
+Part = Literal["train", "validation", "test"]  # of meetings and voices (`corpora.clips`)
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
+_INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
+_ANSWERS = "{participants} people, {answers} answers"
+_TABLES = {3: "Table 3: where keyframes go", 4: "Table 4: kinds of codes"}  # of the SFMS paper
 HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
@@ -55,7 +35,7 @@ def tokenizer(
     ),
     models: Path | None = Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
     train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
-    size: Size = Option(Size.small, help="Of what is trained; paper: for a GPU."),
+    size: Literal["small", "paper"] = Option("small", help="Of what is trained; paper: for a GPU."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
@@ -68,12 +48,12 @@ def tokenizer(
 
         if data is None:
             raise BadParameter("--data is needed without --table")
-        show(evaluate_tokenizer(listener, data, order.value if order else None), json)
+        show(evaluate_tokenizer(listener, data, order), json)
         return
     from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options: dict[str, Any] = {"train": train, "size": size.value, "steps": steps, "jobs": jobs, "plots": plots}
-    show(interruptible(lambda: evaluate_table(table, data, models, **options)), json)
+    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "jobs": jobs, "plots": plots}
+    show(interruptible(lambda: evaluate_table(table, data, models, **options)), json, _print_tokenizers)
 
 
 @app.command("listener")
@@ -82,7 +62,7 @@ def listener_(
         [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
     ),
     data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
-    table: TableName | None = Option(
+    table: Literal["1", "2", "arig-1", "arig-2", "arig-4"] | None = Option(
         None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
     ),
     samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
@@ -100,10 +80,10 @@ def listener_(
     """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
     from sfms_robot.lab.evaluation.listener_tables import evaluate_listener
 
-    of_arig = table is not None and table.value.startswith("arig")
+    of_arig = table is not None and table.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
     if table is None:
-        show(evaluate_listener(listener, data, seed, order.value if order else None, hop), json)
+        show(evaluate_listener(listener, data, seed, order, hop), json)
         return
     if of_arig:
         if order is not None or hop is not None:
@@ -111,15 +91,16 @@ def listener_(
         from sfms_robot.lab.evaluation.arig_tables import arig_table
 
         trained: dict[str, Any] = {"models": models, "training": config, "steps": steps}
-        show(interruptible(lambda: arig_table(table.value, listener, data, clips=clips, seed=seed, **trained)), json)
+        found = interruptible(lambda: arig_table(table, listener, data, clips=clips, seed=seed, **trained))
+        show(found, json, note=_INTERVALS)
         return
     from sfms_robot.lab.evaluation.arig_tables import sfms_table
 
     options: dict[str, Any] = {
-        "samples": samples, "limit": clips, "seed": seed, "order": order.value if order else None, "hop": hop,
+        "samples": samples, "limit": clips, "seed": seed, "order": order, "hop": hop,
         "models": models, "steps": steps,
     }  # fmt: skip
-    show(interruptible(lambda: sfms_table(int(table.value), listener, data, **options)), json)
+    show(interruptible(lambda: sfms_table(int(table), listener, data, **options)), json, note=_INTERVALS)
 
 
 @app.command()
@@ -149,7 +130,7 @@ def papers(
 def timing(
     listener: str = LISTENER,
     data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    split: Part = Option(Part.test, help="People of the meetings: test to report, validation to choose."),
+    split: Part = Option("test", help="People of the meetings: test to report, validation to choose."),
     allow_training: bool = Option(False, "--allow-training", help="Play people that listeners learned from."),
     meetings: int | None = Option(None, min=1, help="At most this many, spread over the people; all of them."),
     minutes: float = Option(
@@ -170,7 +151,7 @@ def timing(
     options = TimingOptions(
         listener=listener,
         data=data,
-        split=split.value,
+        split=split,
         allow_training=allow_training,
         meetings=meetings,
         minutes=minutes,
@@ -181,7 +162,14 @@ def timing(
         engine=engine_named(engine),
         own_voice=own_voice,
     )
-    show(evaluate_timing(options), json)
+    found = evaluate_timing(options)
+    show(
+        found,
+        json,
+        heading="{people} people of {split}, {meetings} meetings, {minutes} minutes, {seeds} seeds",
+        keys=("rows", "detector", "asked_and_seen", "notes"),
+        note="in brackets: 95 % intervals over people. detector: known events, found in motion",
+    )
 
 
 @app.command()
@@ -190,7 +178,7 @@ def robustness(
     data: Path | None = Option(
         None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
     ),
-    split: Part = Option(Part.test, help="People of the voices: test to report, validation to choose."),
+    split: Part = Option("test", help="People of the voices: test to report, validation to choose."),
     speakers: int | None = Option(None, min=1, help="At most this many; all of the part."),
     minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
     seeds: int = Option(8, min=1, help="Number of times that each is played."),
@@ -202,9 +190,9 @@ def robustness(
     from sfms_robot.lab.evaluation.robustness import evaluate_robustness
 
     found = evaluate_robustness(
-        listener, data, split=split.value, speakers=speakers, minutes=minutes, seeds=seeds, seed=seed, jobs=jobs
+        listener, data, split=split, speakers=speakers, minutes=minutes, seeds=seeds, seed=seed, jobs=jobs
     )
-    show(found, json)
+    show(found, json, heading="{listener}: events a minute beside those of people, {people}")
 
 
 @app.command()
@@ -240,7 +228,8 @@ def metrics_(
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
     from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 
-    show(evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed), json)
+    found = evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed)
+    show(found, json, note="interval: 95 % over clips")
 
 
 @app.command()
@@ -280,7 +269,7 @@ def people(
     from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
-        show(people_study.summary(people_study.read_answers(results)), json)
+        show(people_study.summary(people_study.read_answers(results)), json, heading=_ANSWERS)
         return
     study = people_study.prepare(listener, data, voices=voices, seconds=seconds, seed=seed, folder=out)
 
@@ -291,7 +280,7 @@ def people(
     try:
         people_study.serve(study, view, ask)
     finally:
-        show(study.results(), json)
+        show(study.results(), json, heading=_ANSWERS)
 
 
 @app.command()
@@ -313,7 +302,15 @@ def _quiet(*_: Any) -> None:
 def _print_paper(name: str, found: Mapping[str, Any]) -> None:
     """Print one table of `evaluate papers` when it is finished."""
     say(f"ARIG, table {name.removeprefix('arig-')}" if name.startswith("arig") else f"SFMS, table {name}", "bold")
-    print_report(found)
+    (_print_tokenizers if name in ("3", "4") else print_report)(found)
+
+
+def _print_tokenizers(found: Mapping[str, Any]) -> None:
+    """Print table 3 or 4 of the SFMS paper, or both."""
+    for table in found.get("tables", [found]):
+        print_report(table, _TABLES[table["table"]], ("rows", "ratios", "truth_silhouette", "not_trained"))
+    say(f"{found['windows']} windows of {found['data']}; mse is the {found['unit']}", "dim")
+    say("The paper's figures are of other motion: compare ratios.", "dim")
 
 
 def _print_interaction(result: Mapping[str, Any]) -> None:

@@ -120,14 +120,15 @@ def _print_check(checked: Mapping[str, Any]) -> None:
         }
         for row in checked["joints"]
     ]
-    over = {row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1}
-    title = f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces"
-    print_rows(rows, title, alarming=lambda row: row["joint"] in over)
+    over = [row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1]
+    print_rows(rows, f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces")
     say(
         "used: share of the range. clipped: of the time, at an end that is not rest. speed, jerk: of the limit, the "
-        "99th percentile of what the faces ask; red above 100 %.",
+        "99th percentile of what the faces ask.",
         "dim",
     )
+    if over:
+        say(f"too fast for the limits: {cell(over)}", "bold red")
     for row in checked["joints"]:
         say(f"{row['joint']}: {cell(row['channels'], 'not driven by any channel')}")
     if (neck := checked["neck"]) is not None:
@@ -158,7 +159,13 @@ def show_head(
         from sfms_robot.app.head.head_scene import draw_scene
         from sfms_robot.app.output_paths import checked_png
 
-        show(draw_scene(name, checked_png(urdf, "--urdf"), packages), json)
+        drawn = draw_scene(name, checked_png(urdf, "--urdf"), packages)
+        show(
+            drawn,
+            json,
+            heading="{name}: {urdf}, drawn as {picture}",
+            note="follows: joint of the head, joint of the URDF",
+        )
         return
     from sfms_robot.config.overlay import provenance, refusals
 
@@ -192,7 +199,7 @@ def calibrate(
 
     outcome = lead_through(name, port, partial(print, flush=True), input, joint, again)
     print()  # ends the line of the last question
-    show(outcome.as_dict(), json)
+    show(outcome.as_dict(), json, heading="{head}: {exit}, written to {file}")
     if outcome.torque_unconfirmed:
         print(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}", file=sys.stderr)
     if outcome.problems:
@@ -217,7 +224,8 @@ def pose(
     from sfms_robot.app.head.pose import pose_head
     from sfms_robot.app.options import HeadOptions
 
-    show(pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold), json)
+    posed = pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold)
+    show(posed, json, heading="{head} on {port}: {face}, {exit}")
 
 
 @app.command("fit")
@@ -243,10 +251,16 @@ def fit(
     from sfms_robot.app.head.fit import fit_head, see_virtual_face
     from sfms_robot.app.options import HeadOptions
 
+    fitted = partial(
+        show,
+        json=json,
+        heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
+        note="rms in joint units (1 = half the range), on held-out frames",
+    )
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")
     if recording is not None:
-        show(fit_head(name, recording), json)
+        fitted(fit_head(name, recording))
         return
     if port != "sim" and record is None:
         raise ConfigError("head fit --babble on a real port needs --record DIR, where the face track goes too")
@@ -256,7 +270,7 @@ def fit(
         report = move(servos, folder, minutes=minutes, seed=seed)
         if port == "sim" and report["exit"] == "done":
             see_virtual_face(name, folder)
-            show(fit_head(name, folder, practice=True), json)
+            fitted(fit_head(name, folder, practice=True))
             return
     seconds = round(report["duration_s"], 1)
     moved = {"head": report["head"], "exit": report["exit"], "seconds": seconds, "record": str(record)}

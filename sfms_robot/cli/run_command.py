@@ -220,7 +220,8 @@ def run(
 
         with level_meter() as meter:
             found = check_sound("mic" if audio == "default" else audio, duration, None if json else meter)
-        show(found, json)
+        verdict = "not fit to listen to" if found["findings"] else "fit to listen to"
+        show(found, json, heading="{audio}, {seconds} s: " + verdict)
         return
     with ExitStack() as stack:
         # The listener loads from here on, in its own process, while this one imports the parts that drive a head.
@@ -238,7 +239,7 @@ def run(
             from sfms_robot.app.listen.page_session import page_session
 
             report = stack.enter_context(page_session(page, options)).run(panel, feed)
-    show(report, json, None if dry_run else _print_run)
+    show(report, json, None if dry_run else _print_run, heading="{head} on {port}: torque stays off")
 
 
 def _print_run(report: Mapping[str, Any]) -> None:
@@ -256,10 +257,13 @@ def _print_run(report: Mapping[str, Any]) -> None:
         f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
         "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
         "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, silent: {cell(bus['silent'])}",
+        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
+        f"silent: {cell(bus['silent'], 'none')}",
     }
     if "recording" in report:
-        facts["recording"] = f"{report['recording']['bytes'] * 1e-6:.1f} MB"
+        kept = report["recording"]
+        problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")
+        facts["recording"] = f"{kept['bytes'] * 1e-6:.1f} MB" + (f", INCOMPLETE: {problem}" if problem else "")
     if report["torque_unconfirmed"]:
         facts["torque"] = f"NOT confirmed off: {cell(report['torque_unconfirmed'])}"
     say(f"{report['head']} listened for {report['duration_s']:g} s ({report['exit']})", "bold")
@@ -363,15 +367,18 @@ def replay(
     from sfms_robot.app.replay.pictures import replay_run
 
     found = replay_run(folder, plot, sheet)
+    heading, keys = "{head} listened for {duration_s} s", list(found)
     if port is not None:
         from sfms_robot.app.listen.panel import live_panel
         from sfms_robot.app.replay.play_back import play_back
 
         panel = None if json else live_panel
         found = {**play_back(folder, panel, head=head, port=port, fast=fast, yes=yes), "recording": found}
+        heading = "{head} on {port} repeated {duration_s} of {recorded_s} s ({exit})"
+        keys = ["torque_unconfirmed", "whole", "ticks", "limits", "motion", "joints"]
     if view is not None:
         _view(folder, view)
-    show(found, json)
+    show(found, json, heading=heading, keys=keys)
 
 
 def _view(folder: Path, view: str) -> None:

@@ -7,64 +7,46 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
+from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import print_json
+from sfms_robot.cli.show import JSON, print_json, print_rows, show
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
     from sfms_robot.app.servo.serial_line import FoundServo, Wire
 
-app = typer.Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
+app = Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
 
 _SHOWN = ("model", "family", "protocol", "number", "firmware", "watchdog")  # the rest is in --json
 
 
-class Family(StrEnum):
-    dynamixel2 = "dynamixel2"
-    dynamixel1 = "dynamixel1"
-    feetech = "feetech"
-
-
-class Keep(StrEnum):
-    all = "all"
-    id = "keep-id"
-    id_and_baud = "keep-id-and-baud"
-
-
-Ids = Annotated[str, typer.Argument(metavar="ID", help="One id, or several: 1-9,12.")]
-OneId = Annotated[int, typer.Argument(metavar="ID")]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before EEPROM is written.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, last line of stdout.")]
+Family = Literal["dynamixel2", "dynamixel1", "feetech"]
+IDS = Argument(..., metavar="ID", help="One id, or several: 1-9,12.")
+ONE_ID = Argument(..., metavar="ID")
+YES = Option(False, "--yes", "-y", help="Do not ask before EEPROM is written.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wiring:
     """Where the servos of a command are. A field is an option of every command."""
 
-    port: Annotated[
-        str | None, typer.Option("--port", help="Serial device, or 'sim'. Default: the only one there is.")
-    ] = None
-    baud: Annotated[int | None, typer.Option("--baud", min=1, help="Look at this rate only. Default: every rate.")] = (
-        None
-    )
-    family: Annotated[Family, typer.Option("--family", help="The protocol of the servos.")] = Family.dynamixel2
-    head: Annotated[str, typer.Option("--head", help="The head whose servos --port sim emulates.")] = "face28"
-    model: Annotated[
-        str | None, typer.Option("--model", help="Take the servos for this model. Default: by their model number.")
-    ] = None
-    json: JsonOption = False
+    port: str | None = Option(None, "--port", help="Serial device, or 'sim'. Default: the only one there is.")
+    baud: int | None = Option(None, "--baud", min=1, help="Look at this rate only. Default: every rate.")
+    family: Family = Option("dynamixel2", "--family", help="The protocol of the servos.")
+    head: str = Option("face28", "--head", help="The head whose servos --port sim emulates.")
+    model: str | None = Option(None, "--model", help="Take the servos for this model. Default: by their model number.")
+    json: bool = JSON
 
     def open(self) -> AbstractContextManager[Wire]:
         """Return the wire to the servos, open inside a `with` block."""
         from sfms_robot.app.servo.serial_line import open_wire
 
-        return open_wire(self.port, self.family.value, self.baud, self.head, self.model)
+        return open_wire(self.port, self.family, self.baud, self.head, self.model)
 
 
 def on_wire(command: Callable[..., None]) -> Callable[..., None]:
@@ -91,7 +73,7 @@ def on_wire(command: Callable[..., None]) -> Callable[..., None]:
 @on_wire
 def scan(
     on: Wiring,
-    ids: Annotated[str | None, typer.Option("--ids", help="Ask these one by one, as 1-9,12. Default: all.")] = None,
+    ids: str | None = Option(None, "--ids", help="Ask these one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
     from sfms_robot.app.servo.serial_line import protocol_hint
@@ -108,7 +90,7 @@ def scan(
 
 @app.command()
 @on_wire
-def ping(on: Wiring, ids: Ids) -> None:
+def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
@@ -127,8 +109,8 @@ def ping(on: Wiring, ids: Ids) -> None:
 @on_wire
 def read(
     on: Wiring,
-    ids: Ids,
-    registers: Annotated[list[str], typer.Argument(metavar="REGISTER...", help="Names, or 'all'.")],
+    ids: str = IDS,
+    registers: list[str] = Argument(..., metavar="REGISTER...", help="Names, or 'all'."),
 ) -> None:
     """Read registers by name: raw and in their unit."""
     from sfms_robot.app.servo.single_servo import read_registers
@@ -140,9 +122,9 @@ def read(
 @on_wire
 def monitor(
     on: Wiring,
-    ids: Annotated[str | None, typer.Argument(metavar="ID", help="1-9,12. Default: all.")] = None,
-    samples: Annotated[int | None, typer.Option(min=1, help="End after so many samples. Default: Ctrl-C ends.")] = None,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=50.0, help="Samples per second.")] = 5.0,
+    ids: str | None = Argument(None, metavar="ID", help="1-9,12. Default: all."),
+    samples: int | None = Option(None, min=1, help="End after so many samples. Default: Ctrl-C ends."),
+    rate: float = Option(5.0, "--rate", min=0.1, max=50.0, help="Samples per second."),
 ) -> None:
     """Show position, load, voltage, temperature and faults, live. Reads only."""
     from sfms_robot.app.servo.single_servo import samples as looks
@@ -158,16 +140,16 @@ def monitor(
         else:
             from sfms_robot.cli.show_servo import live
 
-            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}, Ctrl-C ends")
+            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}")
     if on.json:
         print_json({"samples": taken})
 
 
 @app.command()
 def maps(
-    files: list[Path] = typer.Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
-    check: bool = typer.Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
-    json: bool = typer.Option(False, "--json", help="Print as one JSON object."),
+    files: list[Path] = Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
+    check: bool = Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
+    json: bool = JSON,
 ) -> None:
     """List the servo models and boards that have a firmware map."""
     from sfms_robot.app.servo.maps import check_maps, list_maps
@@ -177,28 +159,25 @@ def maps(
         _show([{key: row[key] for key in _SHOWN} for row in rows], {"maps": rows}, json)
         return
     findings = check_maps(files or [])
-    if json:
-        print_json({"sound": not findings, "findings": [each._asdict() for each in findings]})
-    else:
-        for each in findings:
-            print(f"{each.file}: {each.problem}")
-        print("the firmware maps are sound" if not findings else f"{len(findings)} problem(s)")
+    lines = [f"{each.file}: {each.problem}" for each in findings] or ["the firmware maps are sound"]
+    checked = {"sound": not findings, "findings": [each._asdict() for each in findings]}
+    show(checked, json, lambda _: print("\n".join(lines)))
     if findings:
-        raise typer.Exit(2)
+        raise Exit(2)
 
 
 def doctor(
-    port: str | None = typer.Option(
+    port: str | None = Option(
         None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
     ),
-    head: str | None = typer.Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
-    baud: int | None = typer.Option(None, min=1, help="Without a head: look at this rate only. Default: every rate."),
-    family: Family | None = typer.Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
-    fix: bool = typer.Option(
+    head: str | None = Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
+    baud: int | None = Option(None, min=1, help="Without a head: look at this rate only. Default: every rate."),
+    family: Family | None = Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
+    fix: bool = Option(
         False, "--fix", help="Mend stored values, in the servos or in the head's file; asks before each."
     ),
-    yes: bool = typer.Option(False, "--yes", "-y", help="With --fix: do not ask."),
-    json: bool = typer.Option(False, "--json", help="Print the report as one JSON object, last line of stdout."),
+    yes: bool = Option(False, "--yes", "-y", help="With --fix: do not ask."),
+    json: bool = JSON,
 ) -> None:
     """Look before you run: port, adapter, every servo, its stored values, wire budget. Reads only, except with --fix.
 
@@ -209,13 +188,8 @@ def doctor(
 
     confirm = confirmation(yes) if fix else None
     with _bar("looking", hidden=json or fix) as progress:
-        report = examine(port, head, family and family.value, baud, progress, confirm)
-    if json:
-        print_json(report)
-    else:
-        print_doctor(report)
-    if report["exit_code"]:
-        sys.exit(report["exit_code"])
+        report = examine(port, head, family, baud, progress, confirm)
+    show(report, json, print_doctor)
 
 
 # --- changing ---------------------------------------------------------------------------------------------------
@@ -225,10 +199,10 @@ def doctor(
 @on_wire
 def write(
     on: Wiring,
-    ids: Ids,
-    register: Annotated[str, typer.Argument(help="Its name in the firmware map.")],
-    value: Annotated[str, typer.Argument(help="Raw number, or one with the register's unit: 90deg.")],
-    yes: YesOption = False,
+    ids: str = IDS,
+    register: str = Argument(..., help="Its name in the firmware map."),
+    value: str = Argument(..., help="Raw number, or one with the register's unit: 90deg."),
+    yes: bool = YES,
 ) -> None:
     """Write a register and read it back. EEPROM is asked about first, and refused while torque is on."""
     from sfms_robot.app.servo.single_servo import write_register
@@ -242,9 +216,9 @@ def write(
 @on_wire
 def move(
     on: Wiring,
-    servo: OneId,
-    to: Annotated[str | None, typer.Option("--to", help="Ticks, or degrees of its shaft: 180deg.")] = None,
-    by: Annotated[str | None, typer.Option("--by", help="From its present position: ticks, or -5deg.")] = None,
+    servo: int = ONE_ID,
+    to: str | None = Option(None, "--to", help="Ticks, or degrees of its shaft: 180deg."),
+    by: str | None = Option(None, "--by", help="From its present position: ticks, or -5deg."),
 ) -> None:
     """Move one servo slowly, and leave torque and profile as they were."""
     from sfms_robot.app.servo.move import move as go
@@ -254,13 +228,11 @@ def move(
 
 @app.command()
 def release(
-    head: Annotated[str, typer.Option("--head", help="Head whose servos are released.")] = "face28",
-    port: Annotated[
-        str, typer.Option("--port", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim.")
-    ] = "auto",
-    everything: Annotated[bool, typer.Option("--all", help="Every id on the wires, at the rates of the head.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before --all.")] = False,
-    json: JsonOption = False,
+    head: str = Option("face28", "--head", help="Head whose servos are released."),
+    port: str = Option("auto", "--port", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim."),
+    everything: bool = Option(False, "--all", help="Every id on the wires, at the rates of the head."),
+    yes: bool = Option(False, "--yes", "-y", help="Do not ask before --all."),
+    json: bool = JSON,
 ) -> None:
     """Take torque off a head's servos, whatever state they are in; the head may fall."""
     from sfms_robot.app.servo.move import release_head
@@ -280,8 +252,8 @@ def release(
 @on_wire
 def dump(
     on: Wiring,
-    file: Annotated[Path, typer.Argument(help="Is written; must not exist yet.")],
-    ids: Annotated[str | None, typer.Option("--ids", help="1-9,12. Default: all.")] = None,
+    file: Path = Argument(..., help="Is written; must not exist yet."),
+    ids: str | None = Option(None, "--ids", help="1-9,12. Default: all."),
 ) -> None:
     """Write all registers of servos to a YAML file."""
     from sfms_robot.app.servo.single_servo import check_new, save_dump
@@ -299,13 +271,11 @@ def dump(
 @on_wire
 def restore(
     on: Wiring,
-    file: Annotated[Path, typer.Argument(help="As `servo dump` wrote it.")],
-    source: Annotated[
-        int | None, typer.Option("--from", help="Id in the file. Default: each servo of the file.")
-    ] = None,
-    into: Annotated[int | None, typer.Option("--into", help="Id on the wire, with --from. Default: the same.")] = None,
-    identity: Annotated[bool, typer.Option("--identity", help="Give it id and rate of the file as well.")] = False,
-    yes: YesOption = False,
+    file: Path = Argument(..., help="As `servo dump` wrote it."),
+    source: int | None = Option(None, "--from", help="Id in the file. Default: each servo of the file."),
+    into: int | None = Option(None, "--into", help="Id on the wire, with --from. Default: the same."),
+    identity: bool = Option(False, "--identity", help="Give it id and rate of the file as well."),
+    yes: bool = YES,
 ) -> None:
     """Write the EEPROM of a dumped servo to one of the same model. Shows the differences and asks."""
     from sfms_robot.app.servo.single_servo import Dump
@@ -321,17 +291,17 @@ def restore(
     confirm = confirmation(yes)
     with on.open() as wire:
         rows = [row for servo, was in pairs.items() for row in write_back(wire.find(servo), was, confirm, identity)]
-    _show(rows, {"written": rows}, on.json, None if rows else "nothing differs")
+    _show(rows, {"written": rows}, on.json, "" if rows else "nothing differs")
 
 
 @app.command("set-id")
 @on_wire
 def set_id(
     on: Wiring,
-    old: Annotated[int, typer.Argument(help="The id it has.")],
-    new: Annotated[int, typer.Argument(help="The id it gets.")],
-    in_chain: Annotated[bool, typer.Option("--in-chain", help="Other servos may be on the wire meanwhile.")] = False,
-    yes: YesOption = False,
+    old: int = Argument(..., help="The id it has."),
+    new: int = Argument(..., help="The id it gets."),
+    in_chain: bool = Option(False, "--in-chain", help="Other servos may be on the wire meanwhile."),
+    yes: bool = YES,
 ) -> None:
     """Give a servo another id. Best with that one servo on the wire."""
     from sfms_robot.app.servo.single_servo import set_id as change
@@ -343,9 +313,9 @@ def set_id(
 @on_wire
 def set_baud(
     on: Wiring,
-    ids: Ids,
-    rate: Annotated[int, typer.Argument(metavar="BAUD", help="The rate it gets, bits per second.")],
-    yes: YesOption = False,
+    ids: str = IDS,
+    rate: int = Argument(..., metavar="BAUD", help="The rate it gets, bits per second."),
+    yes: bool = YES,
 ) -> None:
     """Give servos another rate, and check that they answer at it."""
     from sfms_robot.app.servo.single_servo import set_baud as change
@@ -356,7 +326,7 @@ def set_baud(
 
 @app.command()
 @on_wire
-def reboot(on: Wiring, ids: Ids, yes: YesOption = False) -> None:
+def reboot(on: Wiring, ids: str = IDS, yes: bool = YES) -> None:
     """Start servos over: torque goes off, latched hardware errors are cleared."""
     from sfms_robot.app.servo.single_servo import reboot as restart
 
@@ -368,16 +338,16 @@ def reboot(on: Wiring, ids: Ids, yes: YesOption = False) -> None:
 @on_wire
 def factory_reset(
     on: Wiring,
-    servo: OneId,
-    keep: Annotated[
-        Keep, typer.Option("--reset", help="The settings that get their factory values.")
-    ] = Keep.id_and_baud,
-    yes: YesOption = False,
+    servo: int = ONE_ID,
+    keep: Literal["all", "keep-id", "keep-id-and-baud"] = Option(
+        "keep-id-and-baud", "--reset", help="The settings that get their factory values."
+    ),
+    yes: bool = YES,
 ) -> None:
     """Set a servo to its factory values."""
     from sfms_robot.app.servo.single_servo import factory_reset as reset
 
-    _each(str(servo), on, "servos", lambda seen: [reset(seen, keep.value, confirmation(yes)).row()])
+    _each(str(servo), on, "servos", lambda seen: [reset(seen, keep, confirmation(yes)).row()])
 
 
 # --- shared -----------------------------------------------------------------------------------------------------
@@ -435,13 +405,8 @@ def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], list[dict
     _show(rows, {key: rows}, on.json)
 
 
-def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str | None = None) -> None:
-    if json:
-        print_json(result)
-        return
-    from sfms_robot.cli.show_servo import print_table
-
-    print_table([_for_people(row) for row in rows], title)
+def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str = "") -> None:
+    show(result, json, lambda _: print_rows([_for_people(row) for row in rows], title))
 
 
 def _for_people(row: dict[str, Any]) -> dict[str, Any]:

@@ -9,44 +9,85 @@ import json as to_json
 import math
 import os
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 from typer import Exit, Option
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
-_NESTED = 12
+_NESTED = 12  # keys of a mapping that is printed inside a table
+_WIDE = 12  # columns; a table with more is turned, a row for each
+_UNPRINTED = ("version", "exit_code", "error")
+_WORDS = {
+    "blind": "cannot show",
+    "current_mA": "mA",
+    "firmware": "fw",
+    "load_percent": "load %",
+    "missing": "to calibrate first (until then 20 % of the travel, 0.3 of the speed)",
+    "model_number": "number",
+    "paper_mse_e2": "paper mse e-2",
+    "position_deg": "deg",
+    "position_rad": "rad",
+    "return_delay_us": "delay us",
+    "temperature_degC": "degC",
+    "torque_unconfirmed": "torque not confirmed off",
+    "voltage_V": "V",
+    "whole": "complete",
+}  # keys of results that are printed in other words; of any other key the underscores become spaces
 
 
-def show(result: Mapping[str, Any], json: bool, printed: Callable[[Mapping[str, Any]], None] | None = None) -> None:
+def show(
+    result: Mapping[str, Any],
+    json: bool,
+    printed: Callable[[Mapping[str, Any]], None] | None = None,
+    *,
+    heading: str = "",
+    keys: Sequence[str] = (),
+    note: str = "",
+) -> None:
     """Print the result of a command, and its `error` to stderr. Raises typer.Exit with its `exit_code`, if not 0.
 
-    `printed` prints it for people; None: `print_report`.
+    `printed` prints it for people; None: `print_report`, which also explains the other arguments.
     """
     if json:
         print_json(result)
+    elif printed is not None:
+        printed(result)
     else:
-        (printed or print_report)(result)
+        print_report(result, heading, keys, note)
     if result.get("error"):
         print(f"sfms-robot: {result['error']}", file=sys.stderr)
     if result.get("exit_code"):
         raise Exit(result["exit_code"])
 
 
-def print_report(result: Mapping[str, Any]) -> None:
-    """Print a line for each value; a table for a list of rows, and for a mapping of names to rows."""
-    for key, value in result.items():
-        title = key.replace("_", " ")
+def print_report(result: Mapping[str, Any], heading: str = "", keys: Sequence[str] = (), note: str = "") -> None:
+    """Print a heading, the values of `keys` (default: all), and a note.
+
+    A value is a line, or a table where it is a list of rows or a mapping of names to rows. Heading and note may hold
+    values, as in "{head} on {port}", which are then not printed again.
+    """
+    texts = defaultdict(lambda: "-", {key: cell(value) for key, value in result.items()})
+    named = {name for _, name, _, _ in Formatter().parse(heading + note)}
+    if heading:
+        say(heading.format_map(texts), "bold")
+    for key, value in ((key, result[key]) for key in keys or result if key in result):
         if isinstance(value, Mapping) and value and all(isinstance(each, Mapping) for each in value.values()):
             value = [{"": name, **each} for name, each in value.items()]
         if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            print_rows(value, None if key == "rows" else title)
-        elif key not in ("version", "exit_code", "error"):
-            say(f"{title}: {cell(value)}")
+            print_rows(value, "" if key == "rows" else _words(key))
+        elif key not in named and key not in _UNPRINTED:
+            say(f"{_words(key)}: {cell(value, 'none')}")
+    if note:
+        say(note.format_map(texts), "dim")
 
 
 def print_json(result: Mapping[str, Any]) -> None:
@@ -77,45 +118,71 @@ def say(line: str, style: str = "") -> None:
     screen().print(line, style=style, markup=False, soft_wrap=True)
 
 
-def print_rows(
-    rows: Sequence[Mapping[str, Any]],
-    title: str | None = None,
-    *,
-    alarming: Callable[[Mapping[str, Any]], bool] = lambda row: False,
-) -> None:
-    """Print a table whose columns are the keys of the rows; nothing without rows. `alarming` rows are red.
+def print_rows(rows: Sequence[Mapping[str, Any]], title: str = "") -> None:
+    """Print a title, and a table unless there are no rows."""
+    if title:
+        say(title, "bold")
+    if rows:
+        screen().print(table_of(rows))
 
-    A column of mappings with more than `_NESTED` keys is left to --json.
+
+def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return rows as a table: a column for each key that is not empty in all of them.
+
+    A key `interval` of figures by name is printed behind these figures. A mapping with more than `_NESTED` keys is left
+    to --json. A table of more than `_WIDE` columns and few rows is turned: a line for each key.
     """
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    if not rows:
-        return
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    columns = {key: value for row in reversed(rows) for key, value in row.items()}
-    order = dict.fromkeys(key for row in rows for key in row)
-    keys = [key for key in order if not (isinstance(columns[key], Mapping) and len(columns[key]) > _NESTED)]
-    for key in keys:
-        numbers = all(isinstance(row.get(key), int | float | None) for row in rows)
-        table.add_column(key, justify="right" if numbers else "left", no_wrap=numbers, overflow="fold")
-    for row in rows:
-        cells = [Text(cell(row.get(key))) for key in keys]
-        table.add_row(*cells, style="bold red" if alarming(row) else "")
-    screen().print(table)
+    def shown(value: Any) -> bool:
+        return value not in (None, "", [], {}) and not (isinstance(value, Mapping) and len(value) > _NESTED)
+
+    rows = [_with_intervals(row) for row in rows]
+    keys = [key for key in dict.fromkeys(chain(*rows)) if any(shown(row.get(key)) for row in rows)]
+    lines = [list(map(_words, keys)), *([cell(row.get(key)) for key in keys] for row in rows)]
+    if len(keys) > max(_WIDE, len(rows)):
+        lines = [list(column) for column in zip(*lines, strict=True)]
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading, *cells in zip(*lines, strict=True):
+        numbers = all(each[:1] in "-+.0123456789" for each in cells)
+        # In a narrow terminal texts are folded, numbers stay whole.
+        table.add_column(Text(heading), justify="right" if numbers else "left", no_wrap=numbers, overflow="fold")
+    for line in lines[1:]:
+        table.add_row(*map(Text, line))
+    return table
+
+
+def _words(key: str) -> str:
+    return _WORDS.get(key, key.replace("_", " "))
+
+
+def _with_intervals(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    ends = row.get("interval")
+    if not isinstance(ends, Mapping):
+        return row
+    figures = {key: value for key, value in row.items() if key != "interval"}
+    return {key: f"{cell(each)} [{cell(ends[key])}]" if ends.get(key) else each for key, each in figures.items()}
 
 
 def cell(value: object, missing: str = "-") -> str:
-    """Return a value as text: a float in four digits, "a 1, b 2" for a mapping, "a, b" for a list.
+    """Return a value as text: "yes" or "no", a float in four digits or three decimals, "a 1, b 2" for a mapping.
 
-    `missing` for None and NaN, and for what is empty.
+    `missing` for None and NaN, and for what is empty. A list is "a, b".
     """
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {cell(each)}" for key, each in value.items()) or missing
+        return ", ".join(f"{key} {_nested(each)}" for key, each in value.items()) or missing
     if isinstance(value, list | tuple):
-        nested = [f"[{cell(each)}]" if isinstance(each, list | tuple) else cell(each) for each in value]
-        return ", ".join(nested) or missing
+        return ", ".join(map(_nested, value)) or missing
     if value is None or value != value:
         return missing
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1 else f"{round(value, 3):g}"
+    return str(value)
+
+
+def _nested(value: object) -> str:
+    return f"[{cell(value)}]" if isinstance(value, list | tuple) else cell(value)

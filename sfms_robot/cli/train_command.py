@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Argument, Exit, Option, Typer
 
@@ -28,30 +27,14 @@ _LAYOUTS = (
 )
 
 
-class Order(StrEnum):
-    exp_first = "exp-first"
-    pose_first = "pose-first"
-
-
-class Placement(StrEnum):
-    exact = "exact"
-    static = "static"
-    static_paper = "static_paper"
-    learned = "learned"
-
-
-class DeviceName(StrEnum):
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
+Order = Literal["exp-first", "pose-first"]
+DeviceName = Literal["auto", "cpu", "cuda"]
 CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
 DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
 OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
 RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
 OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
-DEVICE = Option(DeviceName.auto, help="auto: the GPU if there is one.")
+DEVICE = Option("auto", help="auto: the GPU if there is one.")
 STEPS = Option(None, min=1, help="Another number of steps than the file's.")
 TENSORBOARD = Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
 ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
@@ -76,7 +59,9 @@ def tokenizer(
     overwrite: bool = OVERWRITE,
     device: DeviceName = DEVICE,
     steps: int | None = STEPS,
-    placement: Placement | None = Option(None, help="Another keyframe placement than the file's, to compare."),
+    placement: Literal["exact", "static", "static_paper", "learned"] | None = Option(
+        None, help="Another keyframe placement than the file's, to compare."
+    ),
     tensorboard: bool | None = TENSORBOARD,
     order: Order | None = ORDER,
     accumulate: int | None = ACCUMULATE,
@@ -95,11 +80,11 @@ def tokenizer(
         data=data,
         out=out,
         resume=resume,
-        device=device.value,
+        device=device,
         steps=steps,
-        changes={"placement": placement.value} if placement else {},
+        changes={"placement": placement} if placement else {},
         tensorboard=tensorboard,
-        order=order.value if order else None,
+        order=order,
         overwrite=overwrite,
         accumulate=accumulate,
         scratch=scratch,
@@ -133,10 +118,10 @@ def listener(
         data=data,
         out=out,
         resume=resume,
-        device=device.value,
+        device=device,
         steps=steps,
         tensorboard=tensorboard,
-        order=order.value if order else None,
+        order=order,
         overwrite=overwrite,
         accumulate=accumulate,
         scratch=scratch,
@@ -158,7 +143,9 @@ def _train(
         from sfms_robot.config import load_training
         from sfms_robot.lab.learning.dry_run import dry_run as estimate
 
-        show(estimate(load_training(file)), json)
+        show(
+            estimate(load_training(file)), json, keys=("rows", "hours"), note="hours of all stages, computed; {assumed}"
+        )
         return
     from sfms_robot.lab.learning.train_runs import TrainOptions
 
@@ -228,7 +215,8 @@ def compose(
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
     from sfms_robot.lab.corpora.data_commands import compose_dyads
 
-    show(compose_dyads(data, out, minutes, seed, overwrite), json)
+    composed = compose_dyads(data, out, minutes, seed, overwrite)
+    show(composed, json, heading=f"minutes of dyads written to {out}")
 
 
 @data_app.command()
@@ -243,7 +231,7 @@ def check(
     """Read a whole data set once: its contents, and everything that is wrong with it."""
     from sfms_robot.lab.corpora.data_commands import check_data
 
-    report = check_data(folder, layout, order.value if order else None, window)
+    report = check_data(folder, layout, order, window)
     show(report, json, partial(_print_data, channels=channels))
     if not report["usable"]:
         raise Exit(2)
@@ -264,7 +252,7 @@ def convert(
     """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
     from sfms_robot.lab.corpora.data_commands import convert_data
 
-    converted = convert_data(folder, out, layout, order.value if order else None, flame_matrix, flame_order)
+    converted = convert_data(folder, out, layout, order, flame_matrix, flame_order)
     show(converted, json, _print_conversion)
 
 
@@ -288,7 +276,7 @@ def _print_data(report: Mapping[str, Any], channels: bool) -> None:
     """Print splits, their problems, and if wanted the range of every channel."""
     order = f", {report['order']}" if report["order"] else ""
     splits, first = report["splits"], report["splits"][0]
-    say(report["folder"])
+    say(f"{'usable' if report['usable'] else 'not usable'}: {report['folder']}", "bold")
     if report["licence"]:
         say(f"licence: {report['licence']}")
     rows = [
@@ -296,7 +284,7 @@ def _print_data(report: Mapping[str, Any], channels: bool) -> None:
             **{name: split[name] for name in ("split", "clips", "minutes")},
             "frames": _span(split["frames"]),
             "listening": None if split["listening_share"] is None else f"{split['listening_share']:.0%}",
-            **{name: cell(split[name]) for name in ("sound", "features")},
+            **{name: split[name] for name in ("sound", "features")},
         }
         for split in splits
     ]
@@ -310,19 +298,19 @@ def _print_data(report: Mapping[str, Any], channels: bool) -> None:
             "split": split["split"],
             "problem": problem["kind"],
             "count": problem["count"],
-            "where": cell(problem["names"][:_SHOWN]) + (", ..." if problem["count"] > _SHOWN else ""),
+            "where": cell(problem["names"][:_SHOWN])
+            + (f" and {problem['count'] - _SHOWN} more" if problem["count"] > _SHOWN else ""),
             "first": problem["first"],
         }
         for split in splits
         for problem in split["problems"]
     ]
-    print_rows(problems, "left out, or wrong")
+    print_rows(problems, "left out, or wrong" if problems else "")
     for note in dict.fromkeys(note for split in splits for note in split["notes"]):
         say(note, "dim")
     for split in splits:
         if split["speaker_unknown_frames"]:
             say(f"{split['split']}: the speaker's face is unknown in {split['speaker_unknown_frames']} frames", "dim")
-    say("usable" if report["usable"] else "not usable")
 
 
 def _span(frames: Mapping[str, float] | None) -> str:

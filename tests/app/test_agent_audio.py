@@ -59,16 +59,17 @@ def listened(listener, **options):
 
 
 def test_a_voice_shorter_than_the_run_ends_and_the_head_goes_on(seeded, tmp_path):
-    said = voice(tmp_path / "said.wav", 1.0)
-    done = listened(seeded, agent_audio=said, duration_s=3.0)
-    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 75, 0)
-    mute = listened(seeded, duration_s=3.0)
+    said = voice(tmp_path / "said.wav", 0.6)
+    done = listened(seeded, agent_audio=said, duration_s=2.0)
+    assert (done["exit"], done["frames"], done["limits"]["violations"]) == ("done", 50, 0)
+    mute = listened(seeded, duration_s=2.0)
     assert done["wire"]["main"]["sha256"] != mute["wire"]["main"]["sha256"]
-    assert done == listened(seeded, agent_audio=said, duration_s=3.0)
-    alone = listened(seeded, audio="none", face="none", agent_audio=said)  # nobody to hear
-    assert (alone["exit"], alone["frames"], alone["limits"]["violations"]) == ("done", 25, 0)
+    assert done == listened(seeded, agent_audio=said, duration_s=2.0)
+    alone = listened(seeded, audio="none", face="none", agent_audio=said)  # with no person at all
+    assert (alone["exit"], alone["frames"], alone["limits"]["violations"]) == ("done", 15, 0)
 
 
+@pytest.mark.slow
 @trained
 def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_path):
     listened(SHIPPED, agent_audio=voice(tmp_path / "said.wav", 4.0), duration_s=9.0, record=tmp_path / "run")
@@ -78,6 +79,7 @@ def test_the_jaw_moves_with_the_robots_own_voice_and_rests_when_it_stops(tmp_pat
     assert np.std(talking) > 2 * np.std(after) and np.mean(talking) > 2 * np.mean(after)
 
 
+@pytest.mark.slow
 def test_a_recording_of_a_head_that_speaks_moves_a_head_and_a_listener_as_the_run_did(seeded, tmp_path):
     said = voice(tmp_path / "said.wav", 2.0)
     done = listened(seeded, agent_audio=said, duration_s=3.0, record=tmp_path / "run")

@@ -35,7 +35,7 @@ def named_clip(kind):
     return next(clip[:200] for name, clip in named_faces() if name == kind)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_held_out_faces_come_three_times_nearer(seed, record_property):
     head = load_head("face28")
     units, rng, joints = Units.of(head), np.random.default_rng(seed), len(head.joints)

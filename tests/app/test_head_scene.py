@@ -25,6 +25,7 @@ def test_a_head_without_a_picture_says_what_is_missing(tmp_path):
         draw_scene(str(tmp_path), tmp_path / "a.png")
 
 
+@pytest.mark.slow
 def test_all_heads_are_drawn_side_by_side(tmp_path):
     draw_shipped_heads(tmp_path / "all.png")
     data = (tmp_path / "all.png").read_bytes()

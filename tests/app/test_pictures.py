@@ -98,6 +98,7 @@ def test_pictures_are_drawn_without_a_display_and_without_the_head(tmp_path, hea
     assert width == pytest.approx(1800 if head == "op3_head" else 1600, abs=20) and 1000 < height < 1400
 
 
+@pytest.mark.slow
 def test_the_robot_is_drawn_beside_the_face_and_moves(tmp_path):
     pytest.importorskip("vtkmodules")
     run = run_of(tmp_path, "op3_head")

@@ -85,7 +85,7 @@ def test_the_report_has_what_it_promises(report):
     assert (bus["errors"], bus["silent"], bus["faults"]) == (0, [], [])
 
 
-@pytest.mark.parametrize("listener", ["sfms-small", "arig-small"])
+@pytest.mark.parametrize("listener", ["sfms-small", pytest.param("arig-small", marks=pytest.mark.slow)])
 def test_nothing_is_imported_for_the_first_time_while_torque_is_on(listener, tmp_path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:  # a service manager
         manager.bind(str(tmp_path / "notify"))
@@ -110,7 +110,14 @@ def test_one_seed_is_one_command_stream_and_another_seed_another(report):
     assert other["wire"]["main"]["sha256"] != report["wire"]["main"]["sha256"]
 
 
-@pytest.mark.parametrize(("audio", "face"), [("katie", "none"), ("none", "none"), ("none", "face.csv.gz")])
+@pytest.mark.parametrize(
+    ("audio", "face"),
+    [
+        ("none", "none"),
+        pytest.param("katie", "none", marks=pytest.mark.slow),
+        pytest.param("none", "face.csv.gz", marks=pytest.mark.slow),
+    ],
+)
 def test_a_missing_modality_is_normal(audio, face, tmp_path):
     if face != "none":
         face = str(data_dir("sim") / "speakers" / "facegood_1114_3_16" / face)

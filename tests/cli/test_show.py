@@ -1,4 +1,4 @@
-"""`--json`: every command has it, prints it in one place, and what it prints is JSON to a reader that is strict."""
+"""Every command has --json and prints it in one place, as JSON that a strict reader accepts; no table cuts a row."""
 
 import ast
 import io
@@ -23,7 +23,7 @@ FIGURES = st.recursive(
 
 
 def finite(value):
-    """Two lists of figures are the same where these are: tuples are lists, what is no number is nothing."""
+    """Return a value as JSON holds it: tuples are lists, NaN and infinity are null."""
     if isinstance(value, dict):
         return {key: finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -32,13 +32,13 @@ def finite(value):
 
 
 @given(told=st.dictionaries(st.text(), FIGURES))
-def test_whatever_a_command_tells_is_one_line_of_json(told):
+def test_any_result_is_one_line_of_json(told):
     with redirect_stdout(io.StringIO()) as out:
         show.print_json(told)
     assert out.getvalue().count("\n") == 1 and Ended(0, out.getvalue(), "").told == finite(told)
 
 
-def test_figures_that_cannot_be_told_are_null(capsys):
+def test_nan_and_infinity_are_null(capsys):
     nothing = float("nan")
     show.print_json({"auc": nothing, "interval": (nothing, float("inf")), "rows": [{"share": -float("inf")}]})
     assert capsys.readouterr().out == '{"auc": null, "interval": [null, null], "rows": [{"share": null}]}\n'
@@ -57,7 +57,7 @@ def test_json_is_printed_in_one_place(file):
 
 
 def commands(command, words=()):
-    """Every command of the program, as (words, command)."""
+    """Yield every command of the program, as (words, command)."""
     inner = getattr(command, "commands", {})
     for name, each in inner.items():
         yield from commands(each, (*words, name))
@@ -68,3 +68,22 @@ def commands(command, words=()):
 @pytest.mark.parametrize(("words", "command"), [*commands(typer.main.get_command(app))])
 def test_every_command_has_it(words, command):
     assert any("--json" in each.opts for each in command.params), words
+
+
+ROWS = [
+    {"id": 11, "joint": "a_joint_with_quite_a_long_name", "model": "xl330-m288", "faults": "input voltage, overload"},
+    {"id": 12, "joint": "a_second_joint", "model": "xl330-m288", "faults": "overheating, " * 8},
+]
+
+
+def test_a_pipe_holds_whole_rows_and_a_narrow_terminal_folds_texts_but_not_numbers(capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    show.print_rows(ROWS)
+    lines = capsys.readouterr().out.splitlines()
+    for row in ROWS:
+        assert any(all(str(value).strip() in line for value in row.values()) for line in lines)
+    monkeypatch.setenv("COLUMNS", "50")
+    show.print_rows(ROWS)
+    narrow = capsys.readouterr().out
+    assert "…" not in narrow and max(map(len, narrow.splitlines())) <= 50
+    assert "11" in narrow and "12" in narrow and narrow.count("overheating") >= 8

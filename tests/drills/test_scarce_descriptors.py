@@ -26,6 +26,7 @@ def limited(running, descriptors):
     resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
 
 
+@pytest.mark.slow
 def test_beside_400_slow_clients_of_its_status_a_run_goes_on(device, chain, tmp_path):
     log = tmp_path / "log"
     with log.open("w") as stderr, run(HEAD, device, *WORDS, "--json", stderr=stderr) as running, ExitStack() as stack:

@@ -24,7 +24,7 @@ def test_every_example_is_tried_and_under_forty_lines():
         assert len(path.read_text(encoding="utf-8").splitlines()) < 40, path.name
 
 
-SLOW = ("puppeteer.py", "voice_agent.py")
+SLOW = ("own_source.py", "puppeteer.py", "servos_alone.py", "voice_agent.py")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in RUNS])

@@ -48,7 +48,7 @@ def test_each_event_is_told_once_before_it_begins_and_with_why(lively):
     assert drawn and all(event.draw < event.probability and event.evidence for event in drawn)
 
 
-@pytest.mark.parametrize("hop", [1, 2, 4])
+@pytest.mark.parametrize("hop", [pytest.param(1, marks=pytest.mark.slow), 2, 4])
 def test_a_plan_tells_of_an_event_before_the_first_frame_that_shows_it(when, hop):
     plans, _ = plans_of(EventfulListener(told_listener(hop=hop), when, LIVELY), speech(300))
     begun = [(plan.times_s[0] - FRAME_S, event.start_s) for plan in plans for event in plan.events]
@@ -65,6 +65,7 @@ def test_eyes_stay_at_the_person_when_nothing_is_decided_whatever_the_head_does(
     assert np.ptp(np.degrees(shown[:, 1:3]), axis=0).max() > 0.5 and np.degrees(np.abs(gaze)).max() < 3.0
 
 
+@pytest.mark.slow
 def test_eyes_go_where_a_gaze_shift_says(lively):
     plans, _ = plans_of(lively, speech(600))
     events = [event for plan in plans for event in plan.events]
@@ -86,11 +87,11 @@ def test_eyes_go_where_a_gaze_shift_says(lively):
 
 def test_memory_holds_what_is_under_way_and_no_more(lively):
     memory, longest = lively.start(0), 0
-    for frame in speech(1500):
+    for frame in speech(500):
         _, memory = lively.step(frame, memory)
         longest = max(longest, len(memory.when.done))
     assert longest < 300 and len(memory.gaze) <= lively.horizon + 1
-    assert len(target_at([e for e in memory.when.done if e.target_rad], 61.0)) == 2
+    assert len(target_at([e for e in memory.when.done if e.target_rad], 21.0)) == 2
 
 
 def test_a_stream_that_begins_late_in_a_run_tells_times_of_the_run(lively):

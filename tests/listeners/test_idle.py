@@ -82,6 +82,7 @@ def test_channels_go_together_as_they_are_mixed_and_every_other_stream_is_mirror
     assert np.mean(np.abs(r)) == pytest.approx(0.91, abs=0.05) and min(r) < -0.6 and max(r) > 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sfms-small", "arig-small"])
 def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
     """Ten minutes of 150 streams: some sway further than most people, all together they do not."""

@@ -23,7 +23,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
@@ -136,7 +136,7 @@ def figures() -> dict[str, Any]:
 
 
 def options() -> dict[str, dict[str, str]]:
-    """Return every option and argument of every command: its flags, type and default."""
+    """Return every option and argument of every command: its flags, type or choices, and default."""
     import typer
 
     from sfms_robot.cli.main import app
@@ -147,11 +147,14 @@ def options() -> dict[str, dict[str, str]]:
         if not hasattr(command, "commands"):
             yield " ".join(words), command
 
+    def kind(annotation: Any) -> str:
+        return "|".join(get_args(annotation)) if get_origin(annotation) is Literal else annotation.__name__
+
     return {
         words: {
             ", ".join([*each.opts, *each.secondary_opts]): " ".join(
                 [
-                    str(getattr(each.type_descriptor.annotation, "__name__", each.type_descriptor.annotation)),
+                    kind(each.type_descriptor.annotation),
                     "required" if each.required else f"= {getattr(each.default, 'value', each.default)}",
                 ]
             )

@@ -34,7 +34,8 @@ class Fault(NamedTuple):
 
 
 MOTION, WIRE, SOURCES, LOOP = "tests/motion", "tests/servo", "tests/sources", "tests/runtime tests/drills"
-LIMITS, TIMELINE = "motion/limits.py", "motion/timeline.py"
+LIMITS, TIMELINE, STARTUP = "motion/limits.py", "motion/timeline.py", "servo/chain/startup.py"
+DXL2, PROTOCOL1, MAESTRO, SSC32 = (f"servo/codecs/{name}.py" for name in ("dxl2", "protocol1", "maestro", "ssc32"))
 FAULTS = (
     # limiter
     Fault(LIMITS, "limits.speed * _HEADROOM", "limits.speed * 1.01", MOTION),
@@ -80,45 +81,30 @@ FAULTS = (
     Fault(TIMELINE, "(1 - ease((asked_s - curve.made_at_s - STALL_S) / EASE_S))[:, None]", "1.0", MOTION),
     Fault(TIMELINE, "slopes[:kept], bends[:kept] = past.slopes[:kept], past.bends[:kept]", "pass", MOTION),
     # codecs
-    Fault("servo/codecs/dxl2.py", "(len(body) + 2).to_bytes", "(len(body) + 3).to_bytes", WIRE),
-    Fault(
-        "servo/codecs/dxl2.py", '_LOOKALIKE: Final = b"\\xff\\xff\\xfd"', '_LOOKALIKE: Final = b"\\xff\\xfd\\xfd"', WIRE
-    ),
-    Fault("servo/codecs/dxl2.py", "if 7 <= again <= total - 6:", "if False:", WIRE),
-    Fault("servo/codecs/dxl2.py", "if not whole and not _proved(data[:end]):", "if not whole and False:", WIRE),
-    Fault(
-        "servo/codecs/dxl2.py",
-        "return Packet(servo, STATUS, body[2:], body[1])",
-        "return Packet(servo, STATUS, body[2:], 0)",
-        WIRE,
-    ),
-    Fault("servo/codecs/protocol1.py", "bytes([~sum(body) & 0xFF])", "bytes([sum(body) & 0xFF])", WIRE),
-    Fault(
-        "servo/codecs/protocol1.py", "if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:", "if False:", WIRE
-    ),
-    Fault("servo/codecs/protocol1.py", "if servo == 0xFF or length < 2:", "if length < 2:", WIRE),
-    Fault("servo/codecs/protocol1.py", "bytes([length, servo, address])", "bytes([servo, length, address])", WIRE),
-    Fault("servo/codecs/protocol1.py", "bytes([address, length, *servos])", "bytes([length, address, *servos])", WIRE),
-    Fault("servo/codecs/maestro.py", "bytes([value & 0x7F, value >> 7])", "bytes([value >> 7, value & 0x7F])", WIRE),
-    Fault("servo/codecs/maestro.py", "if not 0 <= value <= MAX_WORD:", "if not 0 <= value:", WIRE),
-    Fault("servo/codecs/ssc32.py", "if not MIN_PULSE_US <= move.pulse_us <= MAX_PULSE_US:", "if False:", WIRE),
-    Fault("servo/codecs/ssc32.py", 'f"#{channel}L"', 'f"#{channel}H"', WIRE),
+    Fault(DXL2, "(len(body) + 2).to_bytes", "(len(body) + 3).to_bytes", WIRE),
+    Fault(DXL2, '_LOOKALIKE: Final = b"\\xff\\xff\\xfd"', '_LOOKALIKE: Final = b"\\xff\\xfd\\xfd"', WIRE),
+    Fault(DXL2, "if 7 <= again <= total - 6:", "if False:", WIRE),
+    Fault(DXL2, "if not whole and not _proved(data[:end]):", "if not whole and False:", WIRE),
+    Fault(DXL2, "return Packet(servo, STATUS, body[2:], body[1])", "return Packet(servo, STATUS, body[2:], 0)", WIRE),
+    Fault(PROTOCOL1, "bytes([~sum(body) & 0xFF])", "bytes([sum(body) & 0xFF])", WIRE),
+    Fault(PROTOCOL1, "if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:", "if False:", WIRE),
+    Fault(PROTOCOL1, "if servo == 0xFF or length < 2:", "if length < 2:", WIRE),
+    Fault(PROTOCOL1, "bytes([length, servo, address])", "bytes([servo, length, address])", WIRE),
+    Fault(PROTOCOL1, "bytes([address, length, *servos])", "bytes([length, address, *servos])", WIRE),
+    Fault(MAESTRO, "bytes([value & 0x7F, value >> 7])", "bytes([value >> 7, value & 0x7F])", WIRE),
+    Fault(MAESTRO, "if not 0 <= value <= MAX_WORD:", "if not 0 <= value:", WIRE),
+    Fault(SSC32, "if not MIN_PULSE_US <= move.pulse_us <= MAX_PULSE_US:", "if False:", WIRE),
+    Fault(SSC32, 'f"#{channel}L"', 'f"#{channel}H"', WIRE),
     # startup
     Fault(
-        "servo/chain/startup.py",
-        'self._write(self._field("goal_position"), goal)',
-        'self._write(self._field("goal_position"), 0)',
-        WIRE,
+        STARTUP, 'self._write(self._field("goal_position"), goal)', 'self._write(self._field("goal_position"), 0)', WIRE
     ),
     Fault(
-        "servo/chain/startup.py",
-        "if table.model_number is not None and found.model_number != table.model_number:",
-        "if False:",
-        WIRE,
+        STARTUP, "if table.model_number is not None and found.model_number != table.model_number:", "if False:", WIRE
     ),
-    Fault("servo/chain/startup.py", "if limits is not None and not _inside(present, limits):", "if False:", WIRE),
-    Fault("servo/chain/startup.py", "if len(answer.data) != length:", "if False:", WIRE),
-    Fault("servo/chain/startup.py", "return limits[0] <= ticks <= limits[1]", "return limits[0] <= ticks", WIRE),
+    Fault(STARTUP, "if limits is not None and not _inside(present, limits):", "if False:", WIRE),
+    Fault(STARTUP, "if len(answer.data) != length:", "if False:", WIRE),
+    Fault(STARTUP, "return limits[0] <= ticks <= limits[1]", "return limits[0] <= ticks", WIRE),
     # halt
     Fault("runtime/halt.py", 'if door in ("device", cause[1]) and', "if", LOOP),
     Fault("runtime/halt.py", "        if active:\n", "        if False:\n", LOOP),

@@ -23,7 +23,7 @@ def adversarial(rng) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", HEADS)
-@pytest.mark.parametrize("intensity", [1.0, 2.0])
+@pytest.mark.parametrize("intensity", [pytest.param(1.0, marks=pytest.mark.slow), 2.0])
 def test_angles_are_finite_and_inside_the_range_for_ten_thousand_wild_frames(name, intensity):
     head = load_head(name)
     retargeter = HeadRetargeter(head)

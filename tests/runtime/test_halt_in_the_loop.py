@@ -126,7 +126,7 @@ def torque(chain: Chain, joint: str) -> bool:
     return bool(chain.state(HEAD.joints[joint].id)["torque"])
 
 
-@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=2, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(halted=st.integers(60, 250), resumed=st.integers(0, 120))
 @example(halted=100, resumed=0)  # the very tick in which all have eased in
 def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_is_released(chain, halted, resumed):
@@ -211,7 +211,7 @@ def test_joints_come_back_a_few_per_tick_while_those_that_hold_go_on(chain):
     assert ran.log.audited.violations == 0
 
 
-@pytest.mark.parametrize("after", [1, 10, 40])
+@pytest.mark.parametrize("after", [1, pytest.param(10, marks=pytest.mark.slow), 40])
 def test_a_second_halt_while_joints_come_back_halts_again(chain, after):
     torques: list[list[str]] = []
 

@@ -237,6 +237,7 @@ def test_too_much_nonsense_and_a_message_that_is_too_long_end_the_connection(pag
         assert heard(another)["type"] == "hello"
 
 
+@pytest.mark.slow
 def test_while_one_floods_the_others_are_served(page):
     with visit(page) as flooder, visit(page) as other:
         assert heard(other)["type"] == "hello"

@@ -26,6 +26,7 @@ def test_a_joint_that_stands_still_has_no_delay():
     assert np.isnan(found[0]) and found[1] == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
     found = delays(name, duration_s=4.0)

@@ -29,6 +29,8 @@ UNCHECKED = ("maestro", "ssc32")
 IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in BOARDS} | {
     (MANY_TURNS, family) for family in ("dynamixel1", "scs")
 }
+EVERY_RUN = ("dynamixel2", "maestro")  # families of `make test`
+SOME = [each if each in EVERY_RUN else pytest.param(each, marks=pytest.mark.slow) for each in FAMILIES]
 SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
 
 
@@ -48,7 +50,7 @@ def test_unknown_family_is_named():
         head_of("hitec")
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SOME)
 def test_nothing_escapes_and_everybody_comes_back(family):
     fault = SHORT[list(FAMILIES).index(family) % len(SHORT)]
     outcome = one(family, fault, ticks=300)
@@ -56,7 +58,7 @@ def test_nothing_escapes_and_everybody_comes_back(family):
     assert outcome.ticks == 300
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SOME)
 def test_servos_found_outside_their_range_come_in_and_nothing_escapes(family):
     outcome = one(family, OUTSIDE, ticks=300)
     assert outcome.possible and outcome.passed and outcome.refused is None, outcome
@@ -72,19 +74,19 @@ def test_servos_that_contradict_the_heads_file_are_refused_or_mended(family, cas
         assert "limit" in outcome.refused
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SOME)
 def test_torque_is_off_at_once_though_nobody_answers(family):
     outcome = one(family, MUTE_AT_STOP)
     assert outcome.off_s is not None and outcome.off_s <= 0.02 and outcome.stop_s <= 0.5 and outcome.passed, outcome
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SOME)
 def test_bus_that_dies_takes_no_other_with_it(family):
-    outcome = one(family, HALF_DEAD, ticks=1000 if family in ("maestro", "dynamixel2") else 250)
+    outcome = one(family, HALF_DEAD, ticks=250)
     assert outcome.passed, outcome
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", SOME)
 def test_corrupted_byte_moves_no_servo_out_of_its_limits_where_packets_have_a_checksum(family):
     outcome = one(family, CORRUPT, ticks=500)
     [(name, said)] = corrupted_bytes([outcome]).items()

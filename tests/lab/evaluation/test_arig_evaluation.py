@@ -51,6 +51,7 @@ def evaluate(capsys):
     return run
 
 
+@pytest.mark.slow
 def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_gets(evaluate, listener, data):
     code, out, _ = evaluate("interaction", "--listener", listener, "--data", data, "--json")
     found = json.loads(out)
@@ -61,6 +62,7 @@ def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_
     assert sum(map(sum, table)) == 3 * (300 - 1), "every frame but the first of each dyad"
 
 
+@pytest.mark.slow
 def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(evaluate, listener, data, tmp_path):
     shutil.copytree(data, tmp_path, dirs_exist_ok=True)
     for place, scene in ((".", "listening"), ("speaking", "speaking"), ("interaction", "interaction")):

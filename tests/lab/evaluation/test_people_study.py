@@ -202,6 +202,7 @@ def test_strengths_are_found_again():
     np.testing.assert_allclose(bradley_terry(wins), true, atol=0.08)
 
 
+@pytest.mark.slow
 def test_who_always_wins_has_a_finite_strength_and_intervals_need_people():
     given = answers({"a": 6}, people=3) + answers({"b": 6}, left="b", right="c", people=3)
     strengths = summary(given)["bradley_terry"]["person"]

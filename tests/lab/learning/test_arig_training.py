@@ -49,6 +49,10 @@ from sfms_robot.signals.mel import FLOOR, LN_PER_DB
 ARKIT = MotionSpace("arkit58", np.zeros(58))
 WINDOW = 24
 SWAYS = {"events": True, "draws": "innovation", "sway": True}
+ABLATIONS = (
+    {"state_guidance": False}, {"visual": False}, {"interaction": "linear"}, {"context_chunks": 4}, {"draws": "step"},
+    {"events": True, "draws": "innovation"},
+)  # fmt: skip
 A_LISTENER, A_TOLD = (settings(listener={"events": events}).listener for events in (False, True))
 
 
@@ -76,10 +80,9 @@ def quiet(**changes) -> config.ArigPhase:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"state_guidance": False}, {"visual": False}, {"discrete": True}, {"interaction": "linear"},
-     {"context_chunks": 4}, {"draws": "step"}, {"events": True, "draws": "innovation"}, SWAYS],
+    [{}, {"discrete": True}, SWAYS, *(pytest.param(each, marks=pytest.mark.slow) for each in ABLATIONS)],
     ids=lambda changes: "-".join(changes) or "full",
-)  # fmt: skip
+)
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
     figures = train_arig(settings(listener=changes, steps=4), data, tmp_path)
     assert figures["steps"] == 4 and np.isfinite(figures["held_out_noise"])
@@ -89,6 +92,7 @@ def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, chan
     assert plan.frames.shape == (1, 58) and np.isfinite(plan.frames).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"discrete": True}, {"interaction": "linear"}], ids=str)
 def test_it_trains_in_16_bits(data, tmp_path, monkeypatch, changes):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
@@ -96,6 +100,7 @@ def test_it_trains_in_16_bits(data, tmp_path, monkeypatch, changes):
     assert np.isfinite(figures["loss"])
 
 
+@pytest.mark.slow
 def test_losses_fall(data, tmp_path):
     few = train_arig(settings(steps=2), data, tmp_path / "few")
     more = train_arig(settings(steps=60), data, tmp_path / "more")

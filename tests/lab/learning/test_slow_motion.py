@@ -59,6 +59,7 @@ def test_what_is_fitted_on_sway_is_its_amplitudes():
     assert 0.2 < float(spread) < 0.5  # that of 0.3, and of how much each is seen to sway in four minutes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lateral", [(), (1,)])
 def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral):
     """Two channels that go opposite ways, the second one lateral or not; the third by itself."""

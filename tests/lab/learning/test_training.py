@@ -71,7 +71,9 @@ def data(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("placement", ["exact", "static", "learned"])
+@pytest.mark.parametrize(
+    "placement", ["exact", *(pytest.param(each, marks=pytest.mark.slow) for each in ("static", "learned"))]
+)
 def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placement):
     chosen = settings(placement)
     first = tokenizer.train_tokenizer(chosen, data, tmp_path)
@@ -86,6 +88,7 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0
 
 
+@pytest.mark.slow
 def test_more_training_reconstructs_better(data, tmp_path):
     few = settings(tokenizer={"steps": 1, "batch": 8, "learning_rate": 5e-3})
     many = settings(tokenizer={"steps": 120, "batch": 8, "learning_rate": 5e-3})
@@ -112,8 +115,8 @@ WRITTEN = {"tokenizer": tokenizer.WEIGHTS, "listener": checkpoint.WEIGHTS}
     ("phase", "placement", "stop"),
     [
         ("tokenizer", "exact", 17),
-        ("tokenizer", "learned", 9),
         ("listener", "exact", 8),
+        pytest.param("tokenizer", "learned", 9, marks=pytest.mark.slow),
         pytest.param("tokenizer", "static", 29, marks=pytest.mark.slow),
         pytest.param("listener", "exact", 1, marks=pytest.mark.slow),
         pytest.param("listener", "learned", 11, marks=pytest.mark.slow),
@@ -137,6 +140,7 @@ def test_a_phase_interrupted_and_resumed_writes_the_same_bytes(data, tmp_path, p
     assert resumed | {"resumed_at": None} == figures and resumed["resumed_at"] == stop
 
 
+@pytest.mark.slow
 def test_a_listener_is_not_resumed_on_another_tokenizer_or_other_data(data, tmp_path):
     tokenizer.train_tokenizer(settings(), data, tmp_path)
     with pytest.raises(KeyboardInterrupt):

@@ -92,6 +92,7 @@ def test_after_ten_minutes_of_talk_and_events_a_head_is_where_people_hold_theirs
     assert (last.std(0) > 0.2 * (high - low) / 4.65).all()  # alive
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
 def test_whatever_its_face_was_left_in_it_comes_back_to_rest():
     """Each part of the face, 0.4 away from where it rests and with nothing told: five seconds later it is back."""
@@ -119,7 +120,7 @@ def drifting(samples: np.ndarray, ppm: float) -> list[np.ndarray]:
     return [samples[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end <= len(samples)]
 
 
-@pytest.mark.parametrize("ppm", [PPM, -PPM])
+@pytest.mark.parametrize("ppm", [PPM, pytest.param(-PPM, marks=pytest.mark.slow)])
 def test_ten_minutes_of_clock_drift_do_not_add_up(ppm: float):
     """What is heard in a frame is what was said in it: 1920 samples of drift in all, one at most in any frame."""
     rng = np.random.default_rng(0)

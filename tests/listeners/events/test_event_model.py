@@ -24,7 +24,7 @@ from sfms_robot.listeners.events.evidence import sense
 from sfms_robot.listeners.events.model import AT_PERSON, EventModel
 
 MODEL = EventModel.load()
-MINUTES = 4
+MINUTES = 2
 FRAMES = round(MINUTES * 60 / FRAME_S)
 NOBODY = np.zeros(0, np.float32)
 MOST_NODS = 12.0  # a minute, of a head that takes itself for addressed all along
@@ -146,7 +146,14 @@ def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
     assert (high >= low).all() and high.max() > 0
 
 
-@pytest.mark.parametrize("kind", ["nod", "blink", "gaze_shift", "smile", "mm_hm", "tilt"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "nod",
+        "blink",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("gaze_shift", "smile", "mm_hm", "tilt")),
+    ],
+)
 def test_a_kind_happens_more_often_with_its_knob_and_never_at_nought(kind):
     counts = [len(of(kind, listen(conversation(), calmness=Calmness(**{kind: knob}))[0])) for knob in (0, 4, 20)]
     assert counts[0] == 0 and counts[1] < counts[2]

@@ -72,7 +72,7 @@ def test_everybody_is_back_after_a_bad_time(family):
     assert rig.bus.statistics()["silent"] == [] and rig.torques() == [1] * 12
 
 
-@pytest.mark.parametrize("held_s", [0.0, 0.002, 0.016])
+@pytest.mark.parametrize("held_s", [0.0, pytest.param(0.002, marks=pytest.mark.slow), 0.016])
 @pytest.mark.parametrize(("baud", "rate_hz"), [(1_000_000, 100), (57_600, 20)])
 @pytest.mark.parametrize("away", [{2}, {1, 2, 3, 4}], ids=["one", "all"])
 @pytest.mark.parametrize("family", CHAINS)

@@ -4,11 +4,11 @@ import json
 import signal
 import socket
 import subprocess
-import sys
 from contextlib import closing
 from urllib.request import urlopen
 
 import pytest
+from ended import PROGRAM
 
 from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key
 from sfms_robot.errors import ConfigError
@@ -16,30 +16,26 @@ from sfms_robot.network import Router, close_session, serve_session, session_con
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
-COMMAND = [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", "fleet"]
+ALONE = {"scouting": {"multicast": {"enabled": False}}}
 
 
 @pytest.fixture
 def zenoh(tmp_path):
-    """A file that leads to a router of its own."""
+    """Return the configuration file of a client, and keep the router running that it names."""
     pytest.importorskip("zenoh", reason="needs the extra [remote]")
     with socket.create_server(("127.0.0.1", 0)) as free:
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     file = tmp_path / "robot.json5"
-    file.write_text(
-        json.dumps(
-            {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
-        )
-    )
+    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}, **ALONE}))
     router = serve_session(session_config("serve", endpoint=endpoint))
     yield file
     close_session(router)
 
 
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
-def test_a_page_says_where_it_is_as_json_and_serves_until_it_is_told_to_stop(zenoh, ending):
-    words = ["page", "--port", "0", "--zenoh", str(zenoh), "--json"]
-    with subprocess.Popen([*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(zenoh, ending):
+    words = ["fleet", "page", "--port", "0", "--zenoh", str(zenoh), "--json"]
+    with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         told = json.loads(process.stdout.readline())
         with urlopen(f"{told['url']}heads") as answer:
@@ -84,9 +80,6 @@ def test_documents_that_are_none_are_counted_and_the_first_is_logged(zenoh, comm
     assert "sfms/" in line and "only counted" in line
 
 
-OPEN = {"scouting": {"multicast": {"enabled": False}}}
-
-
 @pytest.mark.parametrize(
     ("words", "mode", "key", "endpoints"),
     [
@@ -105,7 +98,7 @@ def test_a_router_beyond_loopback_without_tls_needs_to_be_asked_for(
     words, mode, key, endpoints, tmp_path, command_line
 ):
     file = tmp_path / "open.json5"
-    file.write_text(json.dumps({"mode": mode, key: {"endpoints": endpoints}, **OPEN}))
+    file.write_text(json.dumps({"mode": mode, key: {"endpoints": endpoints}, **ALONE}))
     ended = command_line(*words, "--zenoh", file)
     wrong = list(endpoints.values())[0][-1] if isinstance(endpoints, dict) else endpoints[-1]
     assert ended.code == 2 and f"{file}: {key}.endpoints: expected loopback or TLS, got {wrong}" in ended.complaint
@@ -116,14 +109,14 @@ def test_a_router_beyond_loopback_without_tls_needs_to_be_asked_for(
 @pytest.mark.parametrize(
     ("settings", "wrong"),
     [
-        ({"mode": "router", **OPEN}, "listen.endpoints"),  # of itself a router listens on every address
+        ({"mode": "router", **ALONE}, "listen.endpoints"),  # a router listens on every address by default
         ({"mode": "client"}, "scouting.multicast.enabled"),
         ({"mode": "client", "connect": {"endpoints": ["tls/192.0.2.1:7447"]}}, None),
         ({"mode": "client", "connect": {"endpoints": ["tcp/localhost:1", "tcp/[::1]:1", "tcp/127.0.0.9:1"]}}, None),
-        ({"mode": "peer", "listen": {"endpoints": ["quic/192.0.2.1:1"]}, **OPEN}, None),
+        ({"mode": "peer", "listen": {"endpoints": ["quic/192.0.2.1:1"]}, **ALONE}, None),
     ],
 )  # fmt: skip
-def test_what_zenoh_would_do_unasked_counts_too(settings, wrong, tmp_path):
+def test_the_defaults_of_zenoh_count_too(settings, wrong, tmp_path):
     pytest.importorskip("zenoh", reason="needs the extra [remote]")
     file = tmp_path / "given.json5"
     file.write_text(json.dumps(settings))
@@ -132,9 +125,3 @@ def test_what_zenoh_would_do_unasked_counts_too(settings, wrong, tmp_path):
     else:
         with pytest.raises(ConfigError, match=wrong):
             session_config("call", Router(file))
-
-
-@pytest.mark.parametrize("words", [("--zenoh", "file.json5"), ("--json",), ("--insecure",)])
-def test_an_option_before_the_command_is_not_dropped(command_line, words):
-    ended = command_line("fleet", *words, "halt")
-    assert ended.code == 2 and f"fleet halt {words[0]}" in ended.complaint

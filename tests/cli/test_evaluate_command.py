@@ -1,4 +1,4 @@
-"""`sfms-robot evaluate tokenizer --table`: trained from nothing, kept, scored on any folder; what it refuses."""
+"""`sfms-robot evaluate tokenizer --table`: trained from nothing, kept, scored on any folder."""
 
 from pathlib import Path
 
@@ -9,8 +9,6 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
 from sfms_robot.lab.evaluation.tokenizer_tables import missing_in
 from sfms_robot.signals.tracks import Track, write_track
-
-TABLE = ("evaluate", "tokenizer", "--table")
 
 
 @pytest.fixture
@@ -32,7 +30,7 @@ def tracks(tmp_path: Path) -> Path:
 def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
     tmp_path: Path, tracks: Path, command_line, caplog: pytest.LogCaptureFixture
 ) -> None:
-    options = (*TABLE, "4", "--models", tmp_path / "m", "--data", tracks, "--json")
+    options = ("evaluate", "tokenizer", "--table", "4", "--models", tmp_path / "m", "--data", tracks, "--json")
     trained = command_line(*options, "--train", "--steps", 2, "--plots", tmp_path / "p")
     first = trained.told
     assert trained.code == 0
@@ -47,26 +45,7 @@ def test_a_table_trains_what_is_missing_keeps_it_and_scores_any_folder(
     assert again.code == 0 and again.told == first, "nothing is trained a second time"
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ((*TABLE, "5"), "--table '5' is not one of 3, 4, all"),
-        ((*TABLE, "3", "--train"), "--train needs --models DIR"),
-        (("evaluate", "tokenizer"), "--data is needed without --table"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(command_line, words, said):
-    ended = command_line(*words)
-    assert ended.code == 2 and said in ended.err
-
-
 def test_an_installed_package_says_how_to_get_the_tokenizers_it_does_not_carry(tmp_path: Path) -> None:
     said = r"2 tokenizers of this table are not there \(a, ...\): add --models DIR, which trains what is missing"
     with pytest.raises(ConfigError, match=said):
         missing_in(tmp_path / "tokenizers", ["a", "b"], may_train=False)
-
-
-def test_a_folder_without_tracks_is_refused_before_anything_is_trained(tmp_path: Path, command_line) -> None:
-    ended = command_line(*TABLE, "4", "--data", tmp_path, "--models", tmp_path / "m")
-    assert ended.code == 2 and "no face tracks (*.csv, *.csv.gz) below it" in ended.err
-    assert not (tmp_path / "m").exists()
