@@ -29,7 +29,7 @@ import numpy as np
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
-from sfms_robot.signals.spaces import angles_of
+from sfms_robot.signals.rotations import angles_of
 from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
 
 PORT: Final = 39539  # what the protocol gives those who receive

@@ -26,7 +26,7 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
 from sfms_robot.signals.quantiles import Quantiles
-from sfms_robot.signals.spaces import angles_of
+from sfms_robot.signals.rotations import angles_of
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.worker import SourceWorker
 
