@@ -1,4 +1,4 @@
-"""Paths of the files that ship with the package."""
+"""Paths of the files that ship with the package, and of the user's own."""
 
 from __future__ import annotations
 
@@ -25,6 +25,13 @@ def data_dir(name: Shipped) -> Path:
     if (checkout / "pyproject.toml").is_file() and (checkout / name).is_dir():
         return checkout / name
     raise FileNotFoundError(f"the package's own folder {name!r} is missing: reinstall sfms-robot")
+
+
+def user_dir() -> Path:
+    """Return the folder of this user's files: overlays of heads, firmware maps, the key of a fleet."""
+    from platformdirs import user_config_path
+
+    return user_config_path("sfms-robot", appauthor=False)
 
 
 def shipped_names(folder: Path, marker: str) -> list[str]:
