@@ -6,7 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final, Literal
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, did_you_mean
 
 SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
 
@@ -60,7 +60,8 @@ def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
     for folder in (root / name, Path(name)):
         if (folder / marker).is_file():
             return folder
-    choices = ", ".join(shipped_names(root, marker))
-    raise ConfigError(
-        f"{kind.removesuffix('s')} {name!r} is neither a shipped name nor a folder with a {marker} ({choices})"
-    )
+    if Path(name).name == marker and Path(name).is_file():
+        return Path(name).parent
+    choices, one = shipped_names(root, marker), kind.removesuffix("s")
+    problem = f"{one} {name!r} is neither a shipped name nor a folder with a {marker} ({', '.join(choices)})"
+    raise ConfigError(problem + did_you_mean(name, choices))
