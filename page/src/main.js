@@ -177,8 +177,8 @@ class Page {
     if (names) this.#state('fault', `torque is not confirmed off: ${names}`);
     else this.#state('ended', this.hello.replay ? 'this is a recording' : 'the run has ended');
     this.#startReplay().then(
-      () => { if (!names && !this.hello.replay) this.notice('The run has ended. This is its replay.'); },
-      () => { if (!names) this.notice('The run has ended.'); },
+      () => { if (!names && !this.hello.replay) this.notice('The run has ended. This is its replay.', 0, true); },
+      () => { if (!names) this.notice('The run has ended.', 0, true); },
     );
   }
 
@@ -229,8 +229,9 @@ class Page {
     if (!this.connection.send('halt')) this.notice('NOT HALTED: there is no connection. Use the switch of the robot.', 10000);
   }
 
-  /** One line at the top; for `ms`, or until the next one. */
-  notice(text, ms = 0) {
+  /** Show one line at the top for `ms`, or until the next one; `calm`: information, no warning. */
+  notice(text, ms = 0, calm = false) {
+    find('notice').classList.toggle('calm', calm);
     clearTimeout(this.noticeTimer);
     find('notice').textContent = text;
     find('notice').hidden = !text;
