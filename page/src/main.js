@@ -28,7 +28,8 @@ class Page {
     this.status = {};
     this.newest = null;
     this.shownEvent = null;
-    this.still = false; // nothing is drawn anew: for who takes a picture of the page
+    this.still = false; // while a picture of the page is taken, nothing is drawn
+    this.ended = false; // the run has ended: a connection that closes is no news
     this.timeline = new Timeline(find('timeline'));
     this.stage = this.#stage();
     this.human = fetch(HUMAN, { credentials: 'same-origin' });
@@ -91,13 +92,14 @@ class Page {
     on('controls', (controls) => { this.panels?.held(controls); if (controls.held === 'other') this.panels?.release(); });
     on('over', ({ report }) => this.#over(report.torque_unconfirmed ?? []));
     on('error', ({ error }) => this.notice(error, 6000));
-    connection.addEventListener('closed', () => this.#state('no connection', 'trying again'));
+    connection.addEventListener('closed', () => this.ended || this.#state('no connection', 'trying again'));
   }
 
   #begin(hello) {
     if (hello.version !== VERSION) { this.#wrongVersion(hello.version); return; }
     const same = this.hello?.urdf === hello.urdf && this.hello?.head === hello.head;
     this.hello = hello;
+    this.ended = false;
     this.unconfirmed = {};
     this.notice('');
     this.panels?.release();
@@ -131,7 +133,7 @@ class Page {
 
   #picture(frame) {
     this.stage?.show(frame.m, frame.u);
-    if (frame.s) this.#state(frame.s, (frame.w ?? []).join(', '));
+    if (frame.s && (!this.ended || this.hello.replay)) this.#state(frame.s, (frame.w ?? []).join(', '));
     const faults = { ...frame.f, ...this.unconfirmed };
     const told = JSON.stringify(faults);
     if (told !== this.faults && this.stage) this.#showFaults(faults, told);
@@ -142,7 +144,10 @@ class Page {
     this.stage.robot?.showFaults(faults);
     this.stage.redraw();
     const { kindOfFault } = await import('./robot.js');
-    find('faults').replaceChildren(...Object.entries(faults).map(([name, text]) => make('li', { className: kindOfFault(text) }, `${name}: ${text}`)));
+    const alike = {}; // one line for what several joints share
+    for (const [name, text] of Object.entries(faults)) (alike[text] ??= []).push(name);
+    const line = (names) => (names.length > 2 ? `${names.slice(0, 2).join(', ')} and ${names.length - 2} more` : names.join(', '));
+    find('faults').replaceChildren(...Object.entries(alike).map(([text, names]) => make('li', { className: kindOfFault(text), title: names.join(', ') }, `${line(names)}: ${text}`)));
   }
 
   #state(name, why) {
@@ -167,8 +172,14 @@ class Page {
     const names = unconfirmed.join(', ');
     this.unconfirmed = Object.fromEntries(unconfirmed.map((name) => [name, 'not confirmed off']));
     if (names) this.notice(`Torque is NOT confirmed off: ${names}. Switch off the supply before you touch the head.`);
-    this.#state(names ? 'fault' : 'over', names ? `torque is not confirmed off: ${names}` : 'the run has ended');
-    this.#startReplay().catch((error) => this.notice(error.message, 6000));
+    this.ended = true;
+    find('halt').hidden = true;
+    if (names) this.#state('fault', `torque is not confirmed off: ${names}`);
+    else this.#state('ended', this.hello.replay ? 'this is a recording' : 'the run has ended');
+    this.#startReplay().then(
+      () => { if (!names && !this.hello.replay) this.notice('The run has ended. This is its replay.', 0, true); },
+      () => { if (!names) this.notice('The run has ended.', 0, true); },
+    );
   }
 
   async #startReplay() {
@@ -195,7 +206,7 @@ class Page {
       this.timeline.clear();
       find('replay').hidden = true;
     };
-    find('live').hidden = this.hello.replay; // of a recording there is none
+    find('live').hidden = this.hello.replay || this.ended; // there is no run to go back to
     find('replay').hidden = false;
     replay.seek(replay.startS);
     replay.play();
@@ -218,8 +229,9 @@ class Page {
     if (!this.connection.send('halt')) this.notice('NOT HALTED: there is no connection. Use the switch of the robot.', 10000);
   }
 
-  /** One line at the top; for `ms`, or until the next one. */
-  notice(text, ms = 0) {
+  /** Show one line at the top for `ms`, or until the next one; `calm`: information, no warning. */
+  notice(text, ms = 0, calm = false) {
+    find('notice').classList.toggle('calm', calm);
     clearTimeout(this.noticeTimer);
     find('notice').textContent = text;
     find('notice').hidden = !text;

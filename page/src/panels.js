@@ -9,12 +9,13 @@ import { visitorPanel } from './visitor-panel.js';
 const SHOW_S = 1.0, AGAIN_MS = 400, EXPRESSION_S = 2.5;
 const RATES = { nod: 'nods', smile: 'smiles', gaze_shift: 'looks away', blink: 'blinks', mm_hm: '“mm-hm”', laugh: 'laughs', brow_raise: 'raises brows', shake: 'shakes', tilt: 'tilts' };
 const MOST_PER_MINUTE = { blink: 40, gaze_shift: 30 };
-const OF_A_RECORDING = ['servos']; // nobody is there to be told anything
+const OF_A_RECORDING = ['servos']; // a recording takes no commands
+const TABLES = ['servos', 'channels', 'knobs']; // long lists, which stand under the curves
 const GROUPS = [['Head', 0, 6], ['Brows and cheeks', 6, 14], ['Eyes', 14, 28], ['Jaw', 28, 32], ['Mouth', 32, 55], ['Nose and tongue', 55, 58]];
 
-/** Fills #controls anew for the run that `hello` tells of. Returns {held(controls), release(), servos}. */
+/** Fill #controls and #tables for the run of `hello`. Return {held(controls), release(), servos}. */
 export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
-  const open = new Set([...document.querySelectorAll('#controls > details[open]')].map((each) => each.dataset.name));
+  const open = new Set([...document.querySelectorAll('main > section > details[open]')].map((each) => each.dataset.name));
   const first = !find('controls').children.length;
   const servos = new ServoTable(chooseJoint);
   servos.begin(hello);
@@ -23,11 +24,12 @@ export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
   const parts = {
     person: ['The person', visitorPanel(hello, connection, visitor), true],
     listener: ['The listener', listenerPanel(hello, connection), false],
-    face: ['Show a face', [faces.expressions, faces.actions, ...faces.groups], true],
+    face: ['Show a face', [faces.expressions, faces.actions], true],
     look: ['Where it looks', look.elements, false],
-    knobs: ['How much it shows', knobsPanel(hello, connection), false],
-    servos: ['Servos', [servos.element], false],
     recording: ['Record and replay', recordingPanel(hello, connection, replays), false],
+    servos: ['Servos', [servos.element], true],
+    knobs: ['How much it shows', knobsPanel(hello, connection), false],
+    channels: ['Channels of the face', faces.groups, false],
   };
   const there = Object.entries(parts).filter(([name]) => !hello.replay || OF_A_RECORDING.includes(name));
   const panels = there.map(([name, [title, children, shown]]) => {
@@ -35,7 +37,9 @@ export function buildPanels(hello, connection, visitor, replays, chooseJoint) {
     element.dataset.name = name;
     return element;
   });
-  find('controls').replaceChildren(held.element, ...panels);
+  const [tables, controls] = [true, false].map((long) => panels.filter(({ dataset }) => TABLES.includes(dataset.name) === long));
+  find('controls').replaceChildren(held.element, ...controls);
+  find('tables').replaceChildren(...tables);
   return { servos, held: held.show, release: () => { faces.letGo(); look.letGo(); } };
 }
 

@@ -10,7 +10,7 @@ export function recordingPanel(hello, connection, replays) {
   });
   const said = make('p', { className: 'sent', role: 'status' });
   const replay = make('button', { type: 'button', onclick: async () => {
-    try { await replays(); said.textContent = ''; } catch (error) { said.textContent = error.message; }
+    try { await replays(); said.textContent = ''; } catch (error) { said.textContent = error instanceof TypeError ? 'The program has ended: there is nothing to replay from.' : error.message; }
   } }, 'Replay the run so far');
   const show = (now) => {
     record.setAttribute('aria-pressed', String(now.on));

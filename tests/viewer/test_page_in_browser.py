@@ -225,7 +225,7 @@ def test_a_recording_has_nothing_to_halt_and_nobody_to_tell(browser, tmp_path):
     with ServedRun("replay", str(tmp_path / "run")) as served:
         browser.open(served.url)
         browser.until("page.replay && !document.getElementById('replay').hidden")
-        shown = "[...document.querySelectorAll('#controls > details')].map((each) => each.dataset.name)"
+        shown = "[...document.querySelectorAll('main > section > details')].map((each) => each.dataset.name)"
         assert browser.ask("document.getElementById('halt').hidden") and browser.ask(shown) == ["servos"]
 
 
@@ -407,3 +407,14 @@ def test_torque_that_the_end_of_a_run_could_not_confirm_off_is_named(own_page, r
     )
     page.until("document.getElementById('notice').textContent.startsWith('Torque is NOT confirmed off: head_pan.')")
     page.until("document.getElementById('faults').textContent === 'head_pan: not confirmed off'")
+
+
+def test_a_run_that_has_ended_stays_as_its_replay(tmp_path):
+    with ServedRun("run", "--port", "sim", "--head", "op3_head", "--duration", "5", "--seed", "1") as run:
+        with Page(tmp_path, size=WINDOW) as page:
+            page.open(run.url)
+            page.until("page.ended && page.replay")
+            run.process.wait()
+            page.until("!page.connection.open")
+            assert page.ask("document.getElementById('state-name').textContent") == "ended"
+            assert page.ask("document.getElementById('notice').textContent") == "The run has ended. This is its replay."

@@ -16,6 +16,7 @@ from typing import Any, Final, Literal, cast
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
 from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
+from sfms_robot.config.firmware import user_maps
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
 from sfms_robot.servo.families import servo_families
@@ -249,7 +250,11 @@ Judged = Iterator[tuple[Severity, str, str]]  # severity, problem, fix
 def judge_servo(state: ServoState, line: Line) -> Iterator[Finding]:
     """Yield the problems of settings and health of a servo whose registers were read."""
     seen, want = state.seen, line.wanted.get(state.seen.id)
-    judged: Judged = iter([("error" if want else "warning", f"model {seen.model} has no firmware map", "")])
+    fix = (
+        f"copy the map of its nearest relative in firmware_maps/ to {user_maps()}, name file and model as the servo is "
+        f"called, and set model_number: {seen.model_number} and the registers of its manual"
+    )
+    judged: Judged = iter([("error" if want else "warning", f"model {seen.model} has no firmware map", fix)])
     if seen.table is not None:
         judged = chain(_health(state, seen.table, want, line), _stored(state, seen.table, want, line))
     for severity, problem, fix in judged:
