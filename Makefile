@@ -37,7 +37,7 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/sfms-robot bench --write docs/performance.md
+	$(BIN)/sfms-robot bench --write docs/science/performance.md
 
 clean:
 	rm -rf $(VENV) build dist

@@ -47,7 +47,7 @@ def bench(
     budget: bool = Option(
         False, "--budget", help="For 'listener': operations and bytes a frame, counted, and what small computers need."
     ),
-    write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
+    write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/science/performance.md)."),
     json: bool = JSON,
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: a figure misses its limit."""

@@ -69,7 +69,7 @@ def page_facts(
     source: Mapping[str, bool],
     choices: bool,
 ) -> dict[str, Any]:
-    """Return the `hello` of docs/protocol.md, but for what visitors differ in.
+    """Return the `hello` of docs/reference/protocol.md, but for what visitors differ in.
 
     Args:
         speaker: name of the recorded person; None: a live person.

@@ -218,7 +218,7 @@ STUDY = {
 @pytest.mark.slow
 @pytest.mark.skipif("SFMS_ROBOT_AMI" not in os.environ, reason="AMI tables: SFMS_ROBOT_AMI=DIR")
 def test_all_meetings_teach_what_a_study_found_in_them():
-    """To what another sixth of the steps leaves, but for instants at which a step begins (docs/listening.md).
+    """To what another sixth of the steps leaves, but for instants at which a step begins (docs/science/listening.md).
 
     Those are the value just as an own nod ends (-0.08 there, some 0.3 here) and, of a silence of over 2 s, two that
     cannot occur here.
