@@ -6,8 +6,8 @@ FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 CHECKED = if [ -z '$(PYTHON)' ] || ! $(PYTHON) -c '$(FITS)'; then \
-	echo 'sfms-robot needs Python 3.11 to 3.14, found: $(shell python3 --version 2>&1)' >&2; exit 2; fi
-INSTALL = $(CHECKED); test -d $(VENV) || $(PYTHON) -m venv $(VENV); \
+	echo "sfms-robot needs Python 3.11 to 3.14, found: $$($(or $(PYTHON),python3) --version 2>&1)" >&2; exit 2; fi
+INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := -n auto --dist loadfile  # a file of tests to a process, as many processes as cores
@@ -22,6 +22,7 @@ install: $(VENV)/.installed
 
 # What a run and its plots need: no torch. `make install` adds the tools of developers to the same environment.
 $(VENV)/.run: pyproject.toml
+	@$(CHECKED)
 	@echo 'Installing sfms-robot with its plots into $(VENV): about 450 MB, one to two minutes, once.'
 	@$(INSTALL) -e '.[plots]'
 	touch $@
@@ -40,7 +41,7 @@ test-all: install
 	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)"
 
 lint: install
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
