@@ -23,7 +23,7 @@ install: $(VENV)/.installed
 # What a run and its plots need: no torch. `make install` adds the tools of developers to the same environment.
 $(VENV)/.run: pyproject.toml
 	@$(CHECKED)
-	@echo 'Installing sfms-robot with its plots into $(VENV): about 450 MB, one to two minutes, once.'
+	@echo 'Installing sfms-robot with its plots into $(VENV): about 520 MB, one to two minutes, once.'
 	@$(INSTALL) -e '.[plots]'
 	touch $@
 
