@@ -19,8 +19,7 @@ from statistics import median
 
 from chromium import Page
 
-from sfms_robot.face.human import load_human
-from sfms_robot.face.human_mesh import packed_human
+from sfms_robot.face.human import load_human, packed_human
 
 HERE = Path(__file__).parent
 STATIC = HERE.parent / "sfms_robot" / "viewer" / "static"

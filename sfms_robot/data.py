@@ -1,4 +1,4 @@
-"""Paths of the files that ship with the package."""
+"""Paths of the files that ship with the package, and of the user's own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final, Literal
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, did_you_mean
 
 SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
 
@@ -25,6 +25,13 @@ def data_dir(name: Shipped) -> Path:
     if (checkout / "pyproject.toml").is_file() and (checkout / name).is_dir():
         return checkout / name
     raise FileNotFoundError(f"the package's own folder {name!r} is missing: reinstall sfms-robot")
+
+
+def user_dir() -> Path:
+    """Return the folder of this user's files: overlays of heads, firmware maps, the key of a fleet."""
+    from platformdirs import user_config_path
+
+    return user_config_path("sfms-robot", appauthor=False)
 
 
 def shipped_names(folder: Path, marker: str) -> list[str]:
@@ -53,7 +60,8 @@ def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
     for folder in (root / name, Path(name)):
         if (folder / marker).is_file():
             return folder
-    choices = ", ".join(shipped_names(root, marker))
-    raise ConfigError(
-        f"{kind.removesuffix('s')} {name!r} is neither a shipped name nor a folder with a {marker} ({choices})"
-    )
+    if Path(name).name == marker and Path(name).is_file():
+        return Path(name).parent
+    choices, one = shipped_names(root, marker), kind.removesuffix("s")
+    problem = f"{one} {name!r} is neither a shipped name nor a folder with a {marker} ({', '.join(choices)})"
+    raise ConfigError(problem + did_you_mean(name, choices))

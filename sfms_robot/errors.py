@@ -45,9 +45,18 @@ class ConfigError(RobotError):
         choices: Iterable[object] = (),
     ) -> ConfigError:
         """`file: key = value problem (valid choices)`, the form every configuration error takes."""
-        listed = ", ".join(str(choice) for choice in choices)
+        names = [str(choice) for choice in choices]
         place = f"{file}: {key} = {value!r}" if key else f"{file}:"
-        return cls(f"{place} {problem}" + (f" ({listed})" if listed else ""))
+        return cls(f"{place} {problem}" + (f" ({', '.join(names)})" if names else "") + did_you_mean(value, names))
+
+
+def did_you_mean(given: object, choices: Iterable[str]) -> str:
+    """Return `; did you mean 'NAME'?` with the choice that a misspelt name is closest to, or ''; case is ignored."""
+    from difflib import get_close_matches
+
+    known = {choice.lower(): choice for choice in choices}
+    near = get_close_matches(str(given).lower(), known, 1, 0.7)
+    return f"; did you mean {known[near[0]]!r}?" if near and known[near[0]] != given else ""
 
 
 class MissingExtra(ConfigError):

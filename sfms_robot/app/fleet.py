@@ -35,7 +35,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from sfms_robot.app.listen.knobs import KNOB_KINDS, LiveKnobs
 from sfms_robot.config import Calmness
 from sfms_robot.config.base import Finite, one_line, parse
-from sfms_robot.config.overlay import config_folder
+from sfms_robot.data import user_dir
 from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.network import AWAY_S, LOCAL, Connection, Router, check_name, session_config
@@ -76,7 +76,7 @@ def fleet_key(file: Path | None) -> bytes:
 
     Raises ConfigError for a file that others can read, or that holds no key.
     """
-    file = file or config_folder() / "fleet.key"
+    file = file or user_dir() / "fleet.key"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         with open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="ascii") as made:

@@ -301,3 +301,24 @@ def solve(
             rows.writerow([*angles, int(pose["reached"]), *(f"{pose[key]:.3e}" for key in missing)])
 
     show(solve_poses(name, poses), json, printed)
+
+
+@app.command("import")
+def import_file(
+    file: Path = Argument(..., help="LeRobot's calibration JSON, Reachy Mini's hardware_config.yaml, or pypot's JSON."),
+    to: Path | None = Option(None, "--to", metavar="DIR", help="New folder; by default one of the file's name, here."),
+    model: str | None = Option(None, "--model", help="Of the servos, where the file does not name it (LeRobot)."),
+    json: bool = JSON,
+) -> None:
+    """Make a head folder from the file of other software, and list what has no place in it."""
+    from sfms_robot.app.head.head_import import import_head
+
+    imported = import_head(file, to, model)
+
+    def printed(_: Mapping[str, Any]) -> None:
+        say(f"{imported.folder}/head.yaml: {len(imported.joints)} joints, from {imported.source}", "bold")
+        for remark in imported.remarks:
+            say(f"  {remark}")
+        say(f"next: sfms-robot head check {imported.folder}; sfms-robot doctor --head {imported.folder} --port DEVICE")
+
+    show({"version": 1, **imported.as_dict()}, json, printed)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, computed_field, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, Positive, load
-from sfms_robot.data import data_dir
+from sfms_robot.data import data_dir, user_dir
 from sfms_robot.errors import ConfigError
 
 Family = Literal["dynamixel", "feetech", "maestro", "ssc32"]
@@ -216,24 +216,31 @@ class FirmwareMap(Model):
             rates.setdefault(rate, code)
 
 
+def user_maps() -> Path:
+    """Return the folder of the user's own firmware maps."""
+    return user_dir() / "firmware_maps"
+
+
 def map_files() -> list[Path]:
-    """Return every shipped firmware map, sorted."""
-    return sorted(data_dir("firmware_maps").glob("*/*.yaml"))
+    """Return every shipped firmware map, sorted, and then those of the user."""
+    return [*sorted(data_dir("firmware_maps").glob("*/*.yaml")), *sorted(user_maps().glob("**/*.yaml"))]
 
 
 @lru_cache
 def load_firmware_map(model: str) -> FirmwareMap:
     """Return a servo's control table by model name, or by the path of a `.yaml` file.
 
-    Raises ConfigError listing the shipped models.
+    Raises ConfigError for a model that has none, listing those that have one, or that has two.
     """
     if model.endswith(".yaml"):
         return load(FirmwareMap, Path(model))
-    for file in sorted(data_dir("firmware_maps").glob("*")):
-        if (file / f"{model}.yaml").is_file():
-            return load(FirmwareMap, file / f"{model}.yaml")
-    shipped = [file.stem for file in map_files()]
-    raise ConfigError.at("firmware_maps", "model", model, "has no firmware map", shipped)
+    files = map_files()
+    named = [file for file in files if file.stem == model]
+    if len(named) > 1:
+        raise ConfigError(f"{named[1]}: expected another name, as {model} has a map already ({named[0]})")
+    if not named:
+        raise ConfigError.at("firmware_maps", "model", model, "has no firmware map", [file.stem for file in files])
+    return load(FirmwareMap, named[0])
 
 
 def variant(model: str | FirmwareMap, firmware: int) -> FirmwareMap:

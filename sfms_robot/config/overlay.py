@@ -1,4 +1,4 @@
-"""Measurements of one built head, laid over its shipped file: `$XDG_CONFIG_HOME/sfms-robot/heads/NAME.yaml`.
+"""Measurements of one built head, laid over its shipped file: `heads/NAME.yaml` in the user's folder.
 
 Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. These differences are
 kept apart from the shipped file, in layers that are applied in this order:
@@ -29,7 +29,7 @@ from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import NOT_SHARED, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
-from sfms_robot.data import data_dir, find
+from sfms_robot.data import data_dir, find, user_dir
 from sfms_robot.errors import ConfigError
 
 CALIBRATE: Final = "calibrate"
@@ -156,14 +156,9 @@ class Layered:
     notes: tuple[str, ...] = ()
 
 
-def config_folder() -> Path:
-    """Return the folder of this user's files: overlays of heads, the key of a fleet."""
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "sfms-robot"
-
-
 def overlay_file(head: str, practice: bool = False) -> Path:
     """Return the file of a head's overlay; `practice`: that of emulated servos, which no run uses."""
-    return config_folder() / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
+    return user_dir() / "heads" / (f"{head}.practice.yaml" if practice else f"{head}.yaml")
 
 
 def head_hash(name: str) -> str:

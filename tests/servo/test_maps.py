@@ -11,8 +11,10 @@ from published import rows
 from typer.testing import CliRunner
 
 from sfms_robot.app.servo.maps import check_maps, list_maps
+from sfms_robot.app.servo.serial_line import table_of
 from sfms_robot.cli import servo_command
 from sfms_robot.config import FirmwareMap, load, load_firmware_map, map_files, parse, variant
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.registers import Table
 
@@ -124,6 +126,21 @@ def test_a_servo_of_ones_own_is_a_file_and_no_python(tmp_path):
     assert Table.of(load_firmware_map(str(file))).role("goal_position").address == 30
     assert check_maps([file]) == check_maps([tmp_path]) == []
     assert list_maps([file])[-1]["model"] == "made-up"
+
+
+def test_a_map_in_the_users_folder_is_found_by_name_and_number(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    folder = tmp_path / "sfms-robot" / "firmware_maps"
+    folder.mkdir(parents=True)
+    text = (data_dir("firmware_maps") / "feetech" / "sts3215.yaml").read_text()
+    own = text.replace("sts3215", "sts9999").replace("model_number: 777", "model_number: 61999")
+    (folder / "sts9999.yaml").write_text(own)
+    assert load_firmware_map("sts9999").model_number == 61999 and list_maps()[-1]["model"] == "sts9999"
+    assert table_of("feetech", 61999, None).model == "sts9999"
+    (folder / "sts3032.yaml").write_text(text)
+    load_firmware_map.cache_clear()
+    with pytest.raises(ConfigError, match="sts3032.yaml: expected another name, as sts3032 has a map already"):
+        load_firmware_map("sts3032")
 
 
 def test_firmware_without_a_layout_lists_those_at_hand(tmp_path):

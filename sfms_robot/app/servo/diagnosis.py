@@ -14,6 +14,7 @@ from typing import Any, Final, Literal, cast
 from sfms_robot.app.servo.serial_line import SIM, FoundServo
 from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
+from sfms_robot.config.firmware import user_maps
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
 from sfms_robot.servo.policy import counts
@@ -229,7 +230,12 @@ def judge_servo(state: ServoState, want: Wanted | None, command: Command) -> Ite
     seen, table = state.seen, state.seen.table
     about = _name(seen.id, want)
     if table is None:
-        yield Finding("error" if want else "warning", about, f"model {seen.model} has no firmware map", servo=seen.id)
+        fix = (
+            f"copy the map of its nearest relative in firmware_maps/ to {user_maps()}, name file and model as the "
+            f"servo is called, and set model_number: {seen.model_number} and the registers of its manual"
+        )
+        problem = f"model {seen.model} has no firmware map"
+        yield Finding("error" if want else "warning", about, problem, fix, servo=seen.id)
         return
     for judged in (
         _firmware(seen, table),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
@@ -265,7 +266,7 @@ def check_device(device: str) -> None:
 
 def table_of(family: str, number: int | None, firmware: int | None, model: str | None = None) -> Table | None:
     """Return the control table of a model number, or None; `model` is preferred where several share the number."""
-    models = _models(family).get(number, ()) if number is not None else ()
+    models = _models(family, tuple(map_files())).get(number, ()) if number is not None else ()
     if not models:
         return None
     name = model if model is not None and model in models else models[0]
@@ -276,11 +277,11 @@ def table_of(family: str, number: int | None, firmware: int | None, model: str |
 
 
 @cache
-def _models(family: str) -> Mapping[int, Sequence[str]]:
+def _models(family: str, files: tuple[Path, ...]) -> Mapping[int, Sequence[str]]:
     """Return the models of each number. Reads only the heads of the files: loading all of them takes a second."""
     wanted, protocol = _family(family).maps
     found: dict[int, list[tuple[bool, str]]] = {}
-    for file in map_files():
+    for file in files:
         text = file.read_text(encoding="utf-8")
         keys = dict(re.findall(r"^(model_number|family|protocol|variant_of|same_number_as): *([^\s#]+)", text, re.M))
         if keys.get("family") == wanted and keys.get("protocol") == str(protocol) and "variant_of" not in keys:
