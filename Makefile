@@ -1,8 +1,14 @@
 # `make run`: an emulated head listens, shown on a page. `make test`: the tests. Both make .venv first if it is missing.
-PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# The first of these that is Python 3.11 to 3.14; `make PYTHON=...` names another.
+FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
+CHECKED = if [ -z '$(PYTHON)' ] || ! $(PYTHON) -c '$(FITS)'; then \
+	echo "sfms-robot needs Python 3.11 to 3.14, found: $$($(or $(PYTHON),python3) --version 2>&1)" >&2; exit 2; fi
+INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/python -m pytest
 # A file of tests to a process. One process more than there are cores: many tests wait for servos and for children.
 WORKERS = $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
@@ -19,11 +25,14 @@ install: $(VENV)/.installed
 
 # What a run and its plots need: no torch. `make install` adds the tools of developers to the same environment.
 $(VENV)/.run: pyproject.toml
-	$(INSTALL) -e '.[plots]'
+	@$(CHECKED)
+	@echo 'Installing sfms-robot with its plots into $(VENV): about 520 MB, one to two minutes, once.'
+	@$(INSTALL) -e '.[plots]'
 	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
-	$(INSTALL) -c constraints.txt -e '.[dev]'
+	@echo 'Installing sfms-robot with the tools of developers into $(VENV): about 3 GB, some minutes, once.'
+	@$(INSTALL) -c constraints.txt -e '.[dev]'
 	touch $@ $(VENV)/.run
 
 test: install
@@ -40,7 +49,7 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/sfms-robot bench --write docs/performance.md
+	$(BIN)/sfms-robot bench --write docs/science/performance.md
 
 clean:
 	rm -rf $(VENV) build dist

@@ -1,6 +1,6 @@
 """An assistant joined to a robot: it hears through the robot's ears, and the head moves with what it says.
 
-In one terminal `sfms-robot run --agent-audio tcp`, in another this; docs/protocol.md says what is sent.
+In one terminal `sfms-robot run --agent-audio tcp`, in another this; docs/reference/protocol.md says what is sent.
 """
 
 import json

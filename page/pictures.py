@@ -1,4 +1,4 @@
-"""Takes the pictures under docs/page/: the page in Chromium without a window, on runs of emulated heads.
+"""Takes the pictures under docs/guide/page/: the page in Chromium without a window, on runs of emulated heads.
 
     PYTHONPATH=.:tests/viewer .venv/bin/python page/pictures.py [NAME ...]
 

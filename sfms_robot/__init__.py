@@ -6,7 +6,8 @@
     with open_bus(head, "sim") as bus: ...                servos alone
     with Robot("face28", port="sim") as robot: ...        all of it, in its own thread
 
-Every name is loaded when it is first used, so that importing this package costs nothing. docs/api.md has them all.
+Every name is loaded when it is first used, so that importing this package costs nothing. docs/reference/api.md has
+them all.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Without a configuration everything stays on this machine: a server listens on 127.0.0.1:7447, a robot connects there,
 without multicast scouting. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
-replaces all that; docs/remote.md has one for TLS with certificates of both sides. An endpoint that is neither
+replaces all that; docs/guide/remote.md has one for TLS with certificates of both sides. An endpoint that is neither
 on loopback nor encrypted needs `--insecure`.
 """
 
@@ -119,7 +119,7 @@ def _check_secure(config: zenoh.Config, file: Path) -> None:
     if found:
         raise ConfigError(
             f"{file}: {found[0][0]}: expected loopback or TLS, got {found[0][1]}: "
-            "see TLS in docs/remote.md, or --insecure on a network that you trust"
+            "see TLS in docs/guide/remote.md, or --insecure on a network that you trust"
         )
 
 

@@ -4,7 +4,7 @@ const VOICE = 1, FACE = 2, VERSION = 1, HEADER = 24;
 const MOST_WAITING = 64_000; // bytes: a line that is slower than this gets no more until it has caught up
 const CAMERA_MS = 40;
 
-/** The 24 bytes before a piece of voice or a face (docs/protocol.md), and the piece. */
+/** The 24 bytes before a piece of voice or a face (docs/reference/protocol.md), and the piece. */
 export function framed(kind, rate_hz, at_s, body) {
   const message = new Uint8Array(HEADER + body.byteLength);
   const view = new DataView(message.buffer);

@@ -37,7 +37,9 @@ def bench(
     ),
     hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
     data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
-    write: Path | None = Option(None, metavar="FILE", help="Write the rows as a page too (docs/performance.md)."),
+    write: Path | None = Option(
+        None, metavar="FILE", help="Write the rows as a page too (docs/science/performance.md)."
+    ),
     json: bool = JSON,
 ) -> None:
     """Measure, each figure beside that of a peer in the same run. Exit code 1: a figure misses its limit."""

@@ -139,7 +139,7 @@ def run(
         None,
         metavar="NAME",
         rich_help_panel=OUTPUT,
-        help="Join a fleet as NAME, which sees the run and may halt it: docs/remote.md.",
+        help="Join a fleet as NAME, which sees the run and may halt it: docs/guide/remote.md.",
     ),
     zenoh: Path | None = Option(
         None,

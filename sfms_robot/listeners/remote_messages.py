@@ -1,6 +1,6 @@
 """Messages between a robot and a server of listeners: values in, bytes out, and back. Opens no socket.
 
-A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian; docs/remote.md says which goes
+A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian; docs/guide/remote.md says which goes
 where.
 
     frame      uint8    kind, 1

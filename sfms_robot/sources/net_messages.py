@@ -11,8 +11,8 @@ A message that begins with "{" is JSON (UTF-8), any other is binary, little-endi
              speech will be played; 0: as it arrives, speech behind what still waits
     rest     int16 mono PCM; of a face 58 float32 (pose 6, blendshapes 52) or 59 (attention), or nothing: it is lost
 
-A WebSocket carries one in each of its messages. Over TCP each follows its length, uint32. docs/protocol.md describes it
-for people who write the other side.
+A WebSocket carries one in each of its messages. Over TCP each follows its length, uint32. docs/reference/protocol.md
+describes it for people who write the other side.
 """
 
 from __future__ import annotations

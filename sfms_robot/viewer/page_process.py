@@ -48,7 +48,7 @@ class Address:
     def parsed(cls, wanted: str, certificate: Path | None = None, key: Path | None = None) -> Address:
         """Parse `wanted`: "auto", PORT or HOST:PORT. Raises ConfigError for another form, or missing files."""
         if (certificate is None) != (key is None):
-            raise ConfigError("--view-cert and --view-key: https needs both (docs/page.md says how to make them)")
+            raise ConfigError("--view-cert and --view-key: https needs both (docs/guide/page.md says how to make them)")
         for flag, file in (("--view-cert", certificate), ("--view-key", key)):
             if file is not None and not file.is_file():
                 raise ConfigError(f"{flag} {file}: no such file")
@@ -68,7 +68,9 @@ class Asked(Protocol):
         """Do what a visitor with the controls wants."""
 
     def person(self, visitor: int, message: bytes) -> None:
-        """Take a piece of the voice, or a face, of the visitor with the controls: a message of docs/protocol.md."""
+        """Take a piece of the voice, or a face, of the visitor with the controls: a message of
+        docs/reference/protocol.md.
+        """
 
     def left(self, visitor: int) -> None:
         """Note that the visitor with the controls has them no more."""

@@ -272,7 +272,7 @@ class PageServer:
         self._history.append((True, record))
 
     def tell(self, message: bytes, keep: bool = True) -> None:
-        """Send a message of docs/protocol.md to all visitors; `keep`: it belongs to the run."""
+        """Send a message of docs/reference/protocol.md to all visitors; `keep`: it belongs to the run."""
         if keep:
             self._history.append((False, message))
         for visitor in self._visitors:

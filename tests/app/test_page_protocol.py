@@ -1,4 +1,4 @@
-"""docs/protocol.md says of the page's WebSocket what the code does: every message, every key, every limit."""
+"""docs/reference/protocol.md says of the page's WebSocket what the code does: every message, every key, every limit."""
 
 import json
 import re

@@ -102,7 +102,7 @@ def test_a_router_beyond_loopback_without_tls_needs_to_be_asked_for(
     ended = command_line(*words, "--zenoh", file)
     wrong = list(endpoints.values())[0][-1] if isinstance(endpoints, dict) else endpoints[-1]
     assert ended.code == 2 and f"{file}: {key}.endpoints: expected loopback or TLS, got {wrong}" in ended.complaint
-    assert "TLS in docs/remote.md" in ended.complaint and "--insecure" in ended.complaint
+    assert "TLS in docs/guide/remote.md" in ended.complaint and "--insecure" in ended.complaint
     assert session_config("call", Router(file, insecure=True)) is not None
 
 

@@ -79,7 +79,7 @@ def test_the_tables_for_people_hold_what_json_holds(command_line, device):
 
 
 def test_every_command_on_the_page_for_makers_is_one_that_the_program_has():
-    page = (Path(sfms_robot.__file__).parents[1] / "docs" / "servos.md").read_text(encoding="utf-8")
+    page = (Path(sfms_robot.__file__).parents[1] / "docs" / "guide" / "servos.md").read_text(encoding="utf-8")
     typed = re.findall(r"^(?:\$ )?sfms-robot (.+?)(?: #.*)?$", page, re.MULTILINE)
     assert len(typed) >= 6
     for text in typed:

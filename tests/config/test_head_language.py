@@ -22,7 +22,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS
 
 CONFIGS = data_dir("configs")
-GUIDE = (Path(__file__).parents[2] / "docs" / "heads.md").read_text(encoding="utf-8")
+GUIDE = (Path(__file__).parents[2] / "docs" / "guide" / "heads.md").read_text(encoding="utf-8")
 
 
 def parsed(block: str):
@@ -61,7 +61,7 @@ def test_every_example_of_the_guide_is_a_head_or_part_of_one(example, tmp_path):
 @pytest.mark.parametrize("model", [Head, LimitClass, Expression, Joint, Coupling, Fold, Region, Gaze, Idle])
 def test_the_guide_has_every_key(model):
     for key in model.model_fields:
-        assert re.search(rf"\b{key}\b", GUIDE), f"{model.__name__}.{key} is not in docs/heads.md"
+        assert re.search(rf"\b{key}\b", GUIDE), f"{model.__name__}.{key} is not in docs/guide/heads.md"
 
 
 def test_the_first_head_of_the_guide_is_about_twenty_lines():

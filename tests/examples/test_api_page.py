@@ -1,4 +1,4 @@
-"""The code of docs/api.md and the README does what it says."""
+"""The code of docs/reference/api.md and the README does what it says."""
 
 import re
 from pathlib import Path
@@ -22,9 +22,9 @@ def _own_folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("number", range(5))
 def test_a_block_of_the_page_runs(number):
-    code = blocks("docs/api.md")
+    code = blocks("docs/reference/api.md")
     assert len(code) == 5
-    exec(compile(code[number], f"docs/api.md, block {number}", "exec"), {})
+    exec(compile(code[number], f"docs/reference/api.md, block {number}", "exec"), {})
 
 
 def test_the_readmes_program_runs():
@@ -33,5 +33,5 @@ def test_the_readmes_program_runs():
 
 
 def test_every_public_name_is_on_the_page():
-    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8")
     assert [name for name in sfms_robot.__all__ if not re.search(rf"\b{name}\b", page) and name != "PacketError"] == []

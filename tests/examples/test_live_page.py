@@ -1,4 +1,4 @@
-"""What docs/live.md says of voice agents works as typed, and nothing more is kept than it says."""
+"""What docs/guide/live.md says of voice agents works as typed, and nothing more is kept than it says."""
 
 import os
 import re
@@ -14,7 +14,7 @@ COMMAND = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; ma
 
 
 def section(title):
-    page = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "live.md").read_text(encoding="utf-8")
     return page.split(f"\n## {title}\n")[1].split("\n## ")[0]
 
 

@@ -48,7 +48,7 @@ def page_facts(
     feeds: Collection[str] = (),
     choices: bool = False,
 ) -> dict[str, Any]:
-    """Return the `hello` of docs/protocol.md, but for the entries that differ between visitors.
+    """Return the `hello` of docs/reference/protocol.md, but for the entries that differ between visitors.
 
     Args:
         speaker: name of the recorded person; None: a live person.

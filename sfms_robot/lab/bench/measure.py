@@ -1,4 +1,6 @@
-"""Tools that the benches share: durations, rows beside a peer, figures of processes, and docs/performance.md."""
+"""Tools that the benches share: durations, rows beside a peer, figures of processes, and
+docs/science/performance.md.
+"""
 
 from __future__ import annotations
 
@@ -245,7 +247,8 @@ def listen_to_silence() -> None:
     sys.stdout.write(json.dumps([memory_mb("VmRSS"), memory_mb("VmHWM")]) + "\n")
 
 
-# --- docs/performance.md --------------------------------------------------------------------------------------------
+# --- docs/science/performance.md
+# --------------------------------------------------------------------------------------------
 
 
 def write_page(file: Path, rows: Mapping[str, Any], minutes: float) -> None:

@@ -333,7 +333,7 @@ def test_folder_of_nothing_known_lists_what_is_known(tmp_path):
 
 
 def test_manual_and_help_name_every_layout_as_it_is():
-    manual = (Path(__file__).parents[3] / "docs" / "data.md").read_text(encoding="utf-8")
+    manual = (Path(__file__).parents[3] / "docs" / "guide" / "data.md").read_text(encoding="utf-8")
     rows = {line.split("|")[1].strip(" `"): line for line in manual.splitlines() if line.startswith("| `")}
     for name, layout in LAYOUTS.items():
         assert f"`{layout.space}`" in rows[name] and f"| {layout.fps:g} |" in rows[name]
