@@ -63,9 +63,9 @@ class Page {
   }
 
   async #drawRobot(hello) {
-    find('stage').classList.toggle('no-robot', !hello.urdf);
+    find('stage').classList.remove('no-robot');
+    find('robot-caption').textContent = hello.urdf_generic ? 'shown by the servos, on parts made from the joints; a URDF of this head goes under `urdf:` in its head.yaml' : 'shown by the servos';
     if (!this.stage) return;
-    if (!hello.urdf) { this.stage.setRobot(null); return; }
     const complain = (problem) => this.notice(`The robot is not shown whole: ${problem}`);
     try {
       const { loadRobot } = await import('./robot.js');

@@ -24,6 +24,7 @@ from sfms_robot.config import FollowingJoint, Head, RobotDescription
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
+from sfms_robot.face.generic_robot import generic_urdf
 from sfms_robot.face.urdf import MOVING, Urdf, read_urdf
 from sfms_robot.frames import POSE_CHANNELS, Doubles
 from sfms_robot.signals.rotations import rotation, seen_from
@@ -51,7 +52,7 @@ class RobotScene:
     """A head as a URDF.
 
     Attributes:
-        urdf: the file.
+        urdf: the file. text: its content, of a generic picture that is no file.
         robot: what it holds, without the visuals of `left_out`.
         meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
         left_out: one line for each mesh that may not be served or drawn.
@@ -60,10 +61,17 @@ class RobotScene:
         undriven: joints of the head that move nothing in the picture.
     """
 
-    def __init__(self, head: Head, urdf: Path, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        head: Head,
+        urdf: Path,
+        neck: ForwardNeck | None = None,
+        packages: Sequence[str] = (),
+        text: bytes | None = None,
+    ) -> None:
         """Read a URDF. Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it."""
         description = head.urdf or RobotDescription(file=URDF_FILE)
-        self.urdf, self.robot = urdf, read_urdf(urdf)
+        self.urdf, self.text, self.robot = urdf, text, read_urdf(urdf, text)
         self.meshes: dict[str, Path] = {}
         self.left_out: list[str] = []
         self._find_meshes(head.folder or Path(), description.packages, packages)
@@ -88,15 +96,17 @@ class RobotScene:
             )
 
     @classmethod
-    def of(cls, head: Head, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> RobotScene | None:
-        """Return the scene of a head; None for one that is not shipped and has no `urdf`. Raises ConfigError.
+    def of(cls, head: Head, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> RobotScene:
+        """Return the scene of a head, a generic one where it is not shipped and has no `urdf`. Raises ConfigError.
 
         Args:
             neck: the head's forward kinematics, for a platform or a differential.
             packages: folders outside the head's that meshes may come from.
         """
         file = urdf_file(head)
-        return None if file is None else cls(head, file, neck, packages)
+        if file is None:
+            return cls(head, Path("generic.urdf"), neck, packages, generic_urdf(head))
+        return cls(head, file, neck, packages)
 
     def _find_meshes(self, own: Path, named: Mapping[str, str], folders: Sequence[str]) -> None:
         """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, from there on."""

@@ -104,10 +104,13 @@ class Urdf:
         return joint.mimic.offset + joint.mimic.multiplier * self._value(self.joints[joint.mimic.joint], values)
 
 
-def read_urdf(file: Path) -> Urdf:
-    """Read a URDF. Raises ConfigError of one line that names the file and the link or joint that is wrong."""
+def read_urdf(file: Path, text: bytes | None = None) -> Urdf:
+    """Read a URDF, or `text` in place of the file's.
+
+    Raises ConfigError of one line that names the file and the link or joint that is wrong.
+    """
     try:
-        root = ElementTree.fromstring(file.read_bytes())
+        root = ElementTree.fromstring(file.read_bytes() if text is None else text)
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:

@@ -252,8 +252,10 @@ class PageServer:
         `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
         """
         self._new_scene, self._scene, self._over = new_scene, new_scene(), None
-        scene: dict[str, Any] = {} if self._scene is None else {"urdf": URDF, "urdf_joints": self._scene.joints}
-        self._hello = {**hello, **scene}
+        drawn: dict[str, Any] = {}
+        if (scene := self._scene) is not None:
+            drawn = {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.text is not None}
+        self._hello = {**hello, **drawn}
         self._history.clear()
         self._began.set()
         for visitor in self._visitors:
@@ -325,7 +327,9 @@ class PageServer:
     async def _robot(self, request: Request) -> Response:
         scene, file = self._scene, request.path_params["file"]
         if scene is None:
-            return PlainTextResponse("this head has no picture\n", 404)
+            return PlainTextResponse("no run has begun\n", 404)
+        if file == Path(URDF).name and scene.text is not None:
+            return Response(scene.text, media_type="application/xml")
         if file == Path(URDF).name:
             return FileResponse(scene.urdf, media_type="application/xml")
         meshes = {name.removeprefix("package://").removeprefix("./"): mesh for name, mesh in scene.meshes.items()}

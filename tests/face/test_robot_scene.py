@@ -11,8 +11,8 @@ from sfms_robot.app.head.head_scene import draw_scene, scene_of
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.drawing import render_robots
-from sfms_robot.face.robot_scene import MOST_MESH_BYTES
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.face.robot_scene import MOST_MESH_BYTES, RobotScene
+from sfms_robot.retarget.head_retargeter import HeadRetargeter, build_neck
 
 HEADS = [head["name"] for head in shipped_heads()]
 
@@ -122,7 +122,22 @@ def test_a_head_may_look_like_a_shipped_one_and_needs_no_picture(tmp_path):
     scene = scene_of(load_head(str(tmp_path)))
     assert scene.joints == ("body_rotation",) and scene.undriven == ("jaw",)
     (tmp_path / "head.yaml").write_text(OWL.format(urdf="null"))
-    assert scene_of(load_head(str(tmp_path))) is None
+    generic = scene_of(load_head(str(tmp_path)))
+    assert generic.text is not None and set(generic.follows) == {"neck", "jaw"}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_a_head_without_a_urdf_is_drawn_from_its_joints(name):
+    head = load_head(name)
+    unnamed = head.model_copy(update={"name": "unnamed", "urdf": None})
+    neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
+    scene = RobotScene.of(unnamed, neck)
+    assert scene.text is not None and not scene.undriven
+    at_rest = scene.robot.link_places(dict(zip(scene.joints, scene.rest(), strict=True)))
+    moved = scene.values(np.array([joint.rest_rad + 0.05 for joint in head.joints.values()]))
+    places = scene.robot.link_places(dict(zip(scene.joints, moved, strict=True)))
+    for joint in scene.robot.joints.values():
+        assert joint.kind == "fixed" or not np.allclose(places[joint.child], at_rest[joint.child]), joint.name
 
 
 @pytest.mark.parametrize(

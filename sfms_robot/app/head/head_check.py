@@ -89,7 +89,7 @@ def check(
         scene = scene_of(head, packages)
     except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
         return report | {"problems": [str(error)]}
-    if scene and scene.left_out:
+    if scene.left_out:
         return report | {"problems": scene.left_out}
     clips = [clip for _, clip in named_faces(data)]
     return report | {

@@ -8,15 +8,14 @@ from typing import Any, Final
 
 from sfms_robot.config import Head, load_head
 from sfms_robot.data import head_names
-from sfms_robot.errors import ConfigError
 from sfms_robot.face.robot_scene import RobotScene
 
 _CELL_PX: Final = (300, 290)
 _COLUMNS: Final = 3
 
 
-def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene | None:
-    """Return the scene of a head; None for one that is not shipped and names no URDF. Raises ConfigError.
+def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene:
+    """Return the scene of a head, a generic one where it is not shipped and names no URDF. Raises ConfigError.
 
     `packages`: folders outside the head's that meshes may come from.
     """
@@ -40,8 +39,6 @@ def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, 
     """
     head = load_head(name)
     scene = scene_of(head, packages)
-    if scene is None:
-        raise ConfigError(f"{head.folder or name}/head.yaml: urdf: expected a file that draws the head, got none")
     from sfms_robot.face.drawing import render_robots
 
     render_robots(png, [("", scene, scene.rest())])
@@ -62,6 +59,6 @@ def draw_shipped_heads(png: Path) -> None:
 
     robots = []
     for name in head_names():
-        if (scene := scene_of(load_head(name))) is not None:
-            robots.append((name, scene, scene.rest()))
+        scene = scene_of(load_head(name))
+        robots.append((name, scene, scene.rest()))
     render_robots(png, robots, _COLUMNS, _CELL_PX)
