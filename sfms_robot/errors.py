@@ -30,6 +30,9 @@ class RobotError(Exception):
     exit_code = 1
 
 
+_MOST_LISTED = 20  # choices beside the one that was meant
+
+
 class ConfigError(RobotError):
     """A configuration file, a data file or a flag holds something that cannot be used."""
 
@@ -47,7 +50,9 @@ class ConfigError(RobotError):
         """`file: key = value problem (valid choices)`, the form every configuration error takes."""
         names = [str(choice) for choice in choices]
         place = f"{file}: {key} = {value!r}" if key else f"{file}:"
-        return cls(f"{place} {problem}" + (f" ({', '.join(names)})" if names else "") + did_you_mean(value, names))
+        meant = did_you_mean(value, names) if len(names) > 1 else ""
+        listed = f" ({', '.join(names)})" if names and not (meant and len(names) > _MOST_LISTED) else ""
+        return cls(f"{place} {problem}{listed}{meant}")
 
 
 def did_you_mean(given: object, choices: Iterable[str]) -> str:

@@ -105,10 +105,15 @@ def check(
 
 
 def _print_check(checked: Mapping[str, Any]) -> None:
-    """Print the problems, one line each; without any, the table of the joints."""
-    for problem in checked["problems"]:
-        say(problem, "red")
-    if checked["problems"]:
+    """Print the verdict, the problems and remarks, one line each; without problems, the table of the joints."""
+    problems, remarks = checked["problems"], checked["remarks"]
+    found = ((problems, "problem"), (remarks, "remark"))
+    counted = [f"{len(each)} {name}{'s' * (len(each) > 1)}" for each, name in found if each]
+    verdict = "not fit to run" if problems else "fit to run"
+    say(f"{checked['name']}: {', '.join([verdict, *counted])}", "bold red" if problems else "bold")
+    for line in (*problems, *remarks):
+        say(line, "red" if problems else "")
+    if problems:
         return
     rows = [
         {

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, Va
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from sfms_robot.endpoint import whole_number
-from sfms_robot.errors import ConfigError, InputError
+from sfms_robot.errors import ConfigError, InputError, did_you_mean
 
 DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
 _LEADING_ZERO: Final = "!leading-zero"
@@ -43,8 +43,11 @@ class Model(BaseModel):
         """Report unknown keys with the known ones, and then the other problems of the section."""
         found = []
         for key, given in value.items() if isinstance(value, dict) else ():
-            if key not in cls.model_fields:
-                found.append(f"{key!r} is not a known key ({', '.join(cls.model_fields)})")
+            if isinstance(key, (int, float)) and given is None:  # of 25,5 in a list of keys
+                found.append(f"{key} stands alone, without a key: a decimal number is written with a point, as 25.5")
+            elif key not in cls.model_fields:
+                meant = did_you_mean(key, cls.model_fields)
+                found.append(f"{key!r} is not a known key ({', '.join(cls.model_fields)}){meant}")
             # Python takes true for 1: `id: true` would be servo 1.
             elif isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
                 found.append(f"{key} = {str(given).lower()} is neither a number nor a name")
@@ -93,9 +96,14 @@ def one_line(problem: ErrorDetails) -> str:
     """Return key, value and problem in one line."""
     key = ".".join(map(str, problem["loc"]))
     text = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] == "model_type":  # pydantic names the class
-        text = "is no mapping (key: value)"
     value = problem["input"]
+    if problem["type"] in ("model_type", "dict_type"):  # pydantic names the class
+        text = "expected keys with values, as key: value"
+        text += ", got a list: leave out the dashes" if isinstance(value, list) else ""
+    elif problem["type"] == "literal_error":
+        text += did_you_mean(value, re.findall(r"'([^']*)'", problem["ctx"]["expected"]))
+    elif isinstance(value, str) and re.fullmatch(r"-?\d+,\d+", value):
+        text = f"a decimal number is written with a point: {value.replace(',', '.')}"
     shown = f" = {value!r}" if isinstance(value, (str, int, float, bool)) or value is None else ""
     return f"{key}{shown}: {text}" if key else text
 
@@ -166,6 +174,7 @@ def read(file: Path) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark else ""
         problem = " ".join(str(getattr(error, "problem", None) or error).split())
+        problem += "; YAML is indented with spaces, not tabs" if "'\\t'" in problem or "tab" in problem else ""
         raise ConfigError(f"{file}{where}: {problem}") from error
 
 

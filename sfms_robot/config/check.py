@@ -15,11 +15,12 @@ from pydantic import ValidationError
 from sfms_robot.config.base import one_line
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map
 from sfms_robot.config.head import Head, load_head
-from sfms_robot.config.joint import Safety
+from sfms_robot.config.joint import BUS_FAMILIES, Safety
 from sfms_robot.config.overlay import load_overlay
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 
+_SMALL_DEG: Final = 6.3  # of a joint in radians: a whole turn would be 6.28
 _HARMLESS: Final = re.compile(r"(\w+_)?gain|profile_\w+|acceleration|punch|led|c?cw_compliance_(margin|slope)")
 
 
@@ -41,15 +42,35 @@ def check_head(name: str) -> list[str]:
 
 
 def _servos(head: Head) -> Iterator[str]:
-    """Yield the servos without a firmware map, and the registers that a run must not write."""
+    """Yield the servos without a firmware map or of another family than their bus, and what a run must not write."""
     for name, joint in head.joints.items():
         try:
             table = load_firmware_map(joint.model)
         except ConfigError as error:
-            yield f"joints.{name}.model: {error}"
+            alike = [other for other, one in head.joints.items() if one.model == joint.model]
+            if alike[0] == name:  # one line for all joints of the model
+                yield f"joints.{', '.join(alike)}: {str(error).removeprefix('firmware_maps: ')}"
             continue
+        family = f"{table.family}{table.protocol}" if table.family == "dynamixel" else table.family
+        if (wanted := head.buses[joint.bus].family) != family and wanted in BUS_FAMILIES:
+            problem = f"expected a servo of family {wanted}, as bus {joint.bus}, got {family}"
+            yield f"joints.{name}.model = {joint.model!r}: {problem}"
         for key, value, problem, choices in register_problems(head.safety_of(name), table):
             yield f"joints.{name}.safety.{key} = {value} {problem} ({', '.join(choices)})"
+
+
+def remarks(head: Head) -> list[str]:
+    """Return what is allowed in a head and probably not meant, one line each."""
+    found = []
+    for name, joint in head.joints.items():
+        low, high, fastest = joint.min_deg, joint.max_deg, load_firmware_map(joint.model).no_load_speed_deg_s
+        if high - low < _SMALL_DEG and joint.unit == "rad":
+            found.append(f"joints.{name}: {low:g}..{high:g} deg is a small range: is it in radians?")
+        speed = head.limit(name).speed_deg_s * joint.ratio
+        if fastest is not None and speed > fastest:
+            turns = f"{speed:g} deg/s is more than {joint.model} turns without a load ({fastest:g})"
+            found.append(f"limits.{joint.limits}.speed_deg_s: {turns}; {name} lags behind it")
+    return found
 
 
 def is_harmless(table: FirmwareMap, name: str) -> bool:

@@ -7,6 +7,7 @@ has one file per layout (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` p
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -214,6 +215,12 @@ def map_files() -> list[Path]:
     return [*sorted(data_dir("firmware_maps").glob("*/*.yaml")), *sorted(user_maps().glob("**/*.yaml"))]
 
 
+def model_name(text: str) -> str:
+    """Return a servo's model as its map is called: in lower case, without the -T or -R of its connector."""
+    name = text.lower()
+    return text if name.endswith(".yaml") else name if name.endswith("-1.0") else re.sub("-[tr]$", "", name)
+
+
 @lru_cache
 def load_firmware_map(model: str) -> FirmwareMap:
     """Return a servo's control table by model name, or by the path of a `.yaml` file.
@@ -222,7 +229,7 @@ def load_firmware_map(model: str) -> FirmwareMap:
     """
     if model.endswith(".yaml"):
         return load(FirmwareMap, Path(model))
-    files = map_files()
+    files, model = map_files(), model_name(model)
     named = [file for file in files if file.stem == model]
     if len(named) > 1:
         raise ConfigError(f"{named[1]}: expected another name, as {model} has a map already ({named[0]})")

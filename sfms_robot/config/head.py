@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, all_of, load
-from sfms_robot.config.consistency import problems
+from sfms_robot.config.consistency import not_a_joint, problems
 from sfms_robot.config.joint import (
     BusConfig,
     Coupling,
@@ -213,7 +213,8 @@ def expanded(raw: Any) -> Any:
     roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
     the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
 
-    A value of the wrong type stays unchanged, for the models to refuse. Raises ValueError for a newer version.
+    A value of the wrong type stays unchanged, for the models to refuse. Raises ValueError for a newer version, and for
+    a twin that is not there.
     """
     if not isinstance(raw, dict):
         return raw
@@ -228,7 +229,9 @@ def expanded(raw: Any) -> Any:
     joints = {name: {**shared, **joint} if isinstance(joint, dict) else joint for name, joint in written.items()}
     for name, joint in written.items():
         named = joint.get("mirror_of") if isinstance(joint, dict) else None
-        if isinstance(named, str) and isinstance(twin := written.get(named), dict):
+        if isinstance(named, str) and named not in written:
+            raise ValueError(f"joints.{name}.mirror_of = {not_a_joint(named, written)}")
+        if isinstance(named, str) and isinstance(twin := written[named], dict):
             joints[name] = {**_seen_in_mirror({**shared, **twin}, joint.get("mirror_sense")), **joint}
     return {**raw, "joints": joints}
 

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, Field, StrictInt, ValidationInfo, WithJsonSchema, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
+from sfms_robot.config.firmware import model_name
+from sfms_robot.errors import did_you_mean
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.plugins import plugins
 
@@ -29,11 +31,12 @@ BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other package
 
 def _channel(name: str) -> str:
     if name not in CHANNEL_INDEX:
-        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)})")
+        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)}){did_you_mean(name, CHANNEL_INDEX)}")
     return name
 
 
 Channel = Annotated[str, AfterValidator(_channel)]
+ModelName = Annotated[str, AfterValidator(model_name)]
 MeasuredFault = Annotated[str, Field(pattern="^(input voltage|overheating)$")]
 Parts = Annotated[tuple["Expression", ...], Field(min_length=1)]
 Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded: no drive can overflow
@@ -237,7 +240,7 @@ class Joint(Model):
 
     bus: Name
     id: Annotated[int, Field(ge=0, le=252)]
-    model: str
+    model: ModelName
     zero_ticks: int
     sign: Literal[1, -1] = 1
     ratio: Positive = 1.0
@@ -280,7 +283,7 @@ class JointDefaults(Model):
     """Values of every joint that gives none itself."""
 
     bus: Name | None = None
-    model: str | None = None
+    model: ModelName | None = None
     zero_ticks: int | None = None
     ratio: Positive | None = None
     min_deg: Finite | None = None
@@ -295,7 +298,7 @@ def _family(name: str) -> str:
         return name
     known = [*BUS_FAMILIES, *plugins(BUS_GROUP)]
     if name not in known:
-        raise ValueError(f"is not a family of buses ({', '.join(known)})")
+        raise ValueError(f"is not a family of buses ({', '.join(known)}){did_you_mean(name, known)}")
     return name
 
 

@@ -137,3 +137,60 @@ def test_an_overlay_of_another_head_is_told(tmp_path, monkeypatch):
     overlay.write_text("head: poppy_head\n")
     (problem,) = check("op3_head")["problems"]
     assert problem == f"{overlay}: head = 'poppy_head' is another head (op3_head)"
+
+
+OWL = """\
+version: 1
+name: owl
+description: a neck and a beak
+buses:
+  main: {family: dynamixel2, baud: 1000000}
+limits:
+  neck: {speed_deg_s: 150, acceleration_deg_s2: 1500, jerk_deg_s3: 90000}
+joint_defaults: {bus: main, model: xl330-m288, zero_ticks: 2048, lag_ms: 30, limits: neck}
+joints:
+  neck_yaw: {id: 1, min_deg: -60, max_deg: 60, unit: rad, drive: yaw}
+  beak: {id: 3, min_deg: 0, max_deg: 25, drive: jawOpen}
+  lid: {id: 4, mirror_of: beak}
+"""
+
+
+@pytest.mark.parametrize(
+    "old, new, lines",
+    [
+        ("max_deg: 25,", "max_deg: 25,5,", ["joints.beak: 5 stands alone, without a key: a decimal number is written"]),
+        ("max_deg: 25,", "max_deg: '25,5',", ["beak.max_deg = '25,5': a decimal number is written with a point: 25.5"]),
+        ("\n  ", "\n  - ", ["joints: expected keys with values, as key: value, got a list: leave out the dashes"]),
+        (
+            "mirror_of: beak",
+            "mirror_of: baek",
+            ["joints.lid.mirror_of = 'baek' is not a joint of this head (", "'beak'?"],
+        ),
+        ("xl330-m288", "xl330-m299", ["joints.neck_yaw, beak, lid: model = 'xl330-m299' has no firmware map; did you"]),
+        ("dynamixel2", "feetech", ["neck_yaw.model = 'xl330-m288': expected a servo of family feetech, as bus main"]),
+        ("unit: rad", "unit: rads", ["neck_yaw.unit = 'rads': Input should be 'range' or 'rad'; did you mean 'rad'?"]),
+        ("drive: jawOpen", "drive: jawopen", ["; did you mean 'jawOpen'?"]),
+        ("id: 3", "ids: 3", ["joints.beak: 'ids' is not a known key (", "; did you mean 'id'?"]),
+        ("name: owl", "\tname: owl", ["head.yaml:2: found", "YAML is indented with spaces, not tabs"]),
+    ],
+)
+def test_a_mistake_is_named_with_what_to_write(tmp_path, old, new, lines):
+    before, joints, after = OWL.partition("joints:")
+    if old == "\n  ":
+        text = before + joints + after.replace(old, new)
+    else:
+        text = OWL.replace(old, new)
+    assert text != OWL
+    (tmp_path / "head.yaml").write_text(text)
+    problem = check(str(tmp_path))["problems"][0]
+    assert all(line in problem for line in lines) and "\n" not in problem, problem
+
+
+def test_models_have_any_case_and_small_ranges_and_wild_speeds_are_remarks(tmp_path):
+    text = OWL.replace("xl330-m288", "XL330-M288-T").replace("-60, max_deg: 60", "-1.05, max_deg: 1.05")
+    (tmp_path / "head.yaml").write_text(text.replace("speed_deg_s: 150", "speed_deg_s: 3000"))
+    checked = check(str(tmp_path))
+    assert checked["problems"] == [] and checked["joints"][0]["servo"] == "xl330-m288"
+    small, *fast = checked["remarks"]
+    assert small == "joints.neck_yaw: -1.05..1.05 deg is a small range: is it in radians?"
+    assert "3000 deg/s is more than xl330-m288 turns without a load (618)" in fast[0]

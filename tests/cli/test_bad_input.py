@@ -58,7 +58,7 @@ CASES = [
     ("bench startup --write {tmp}/folder.png", 2, ["--write", "{tmp}/folder.png"]),  # before any work, as the next two
     ("export sfms-small --out {tmp}/file", 2, ["--out", "{tmp}/file"]),
     ("servo dump --port sim {tmp}/file", 2, ["{tmp}/file", "is there already"]),
-    ("servo restore {tmp}/file --port sim", 2, ["{tmp}/file: is no mapping"]),
+    ("servo restore {tmp}/file --port sim", 2, ["{tmp}/file: expected keys with values"]),
     ("data compose --data {tmp} --out {tmp}/file", 2, ["--out"]),
     ("servo maps --check {tmp}/folder.png", 2, ["no firmware map"]),
     ("servo scan --port /dev/null --baud 5", 2, ["--baud 5", "57600"]),
@@ -66,7 +66,7 @@ CASES = [
     ("servo scan --port sim --head face24_maestro", 2, ["--head face24_maestro", "Maestro"]),
     ("servo ping 1 --port {tmp}", 3, ["directory"]),
     ("servo ping 9-1 {line}", 2, ["list of ids"]),
-    ("servo read 1 goal_postion {line}", 2, ["present_position"]),
+    ("servo read 1 goal_postion {line}", 2, ["did you mean 'goal_position'?"]),
     ("servo read 254 led {line}", 2, ["0..252"]),
     ("servo read one led {line}", 2, ["list of ids"]),
     ("servo read 9 led {line}", 4, ["no answer from id 9"]),

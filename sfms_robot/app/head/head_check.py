@@ -26,7 +26,7 @@ from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
 from sfms_robot.config import Head, load_head
-from sfms_robot.config.check import check_head
+from sfms_robot.config.check import check_head, remarks
 from sfms_robot.config.head import drives
 from sfms_robot.data import data_dir, head_names
 from sfms_robot.errors import ConfigError
@@ -66,17 +66,19 @@ def check(
 ) -> dict[str, Any]:
     """Check a head by shipped name or folder, on the bundled faces or those in a folder; return the report.
 
-    A head with `problems` has no other values. For each of `joints` there are the `channels` that move it, by its drive
-    or by the neck; `used`: share of its range that the recorded faces move it through; `clipped`: share of the time
-    that it is at an end of its range that is not its rest; `speed`, `jerk`: 99th percentile of the demand, as a share
-    of its limit, over 1 the limiter lags. `neck`: reach along each axis from home [deg or mm], and the share of
-    recorded poses within it, None where no recorded face moves its head. `limitation`: channels that the named
+    A head with `problems` has no other values. `remarks`: what is allowed and probably not meant. For each of `joints`
+    there are the `channels` that move it, by its drive or by the neck; `used`: share of its range that the recorded
+    faces move it through; `clipped`: share of the time that it is at an end of its range that is not its rest;
+    `speed`, `jerk`: 99th percentile of the demand, as a share of its limit, over 1 the limiter lags. `neck`: reach
+    along each axis from home [deg or mm], and the share of recorded poses within it, None where no recorded face moves
+    its head. `limitation`: channels that the named
     listener shows on no head.
 
     `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for a
     listener that is not one.
     """
     report: dict[str, Any] = {"name": name, "problems": check_head(name), "joints": [], "blind_channels": []}
+    report["remarks"] = []
     report |= {"dead_joints": [], "neck": None, "calibrate_first": False, "seconds": 0.0, "limitation": None}
     limited = limitation(listener) if listener is not None else None
     if report["problems"]:
@@ -98,6 +100,7 @@ def check(
         "dead_joints": retargeter.dead_joints,
         "neck": _neck(retargeter.neck, clips) if retargeter.neck else None,
         "calibrate_first": head.calibrate_first,
+        "remarks": remarks(head),
         "seconds": round(sum(len(clip) for clip in clips) * FRAME_S, 1),
         "limitation": limited,
     }
