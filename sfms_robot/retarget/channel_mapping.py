@@ -26,10 +26,16 @@ from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
 
-# The first plus the sum of the others: the last digits of the motion depend on this order.
+
+def _sum(values: list[Doubles]) -> Doubles:
+    """Return the first plus the sum of the others, as `np.add.reduceat`: the last digits of the motion depend on it."""
+    first, *rest = values
+    return first + (sum(rest) if len(rest) < 8 else np.sum(rest, axis=0))
+
+
 _COMBINE: Mapping[str | None, Callable[[list[Doubles]], Doubles]] = {
-    "sum": lambda values: values[0] + sum(values[1:]),
-    "mean": lambda values: values[0] + sum(values[1:]),  # divided in `compiled`
+    "sum": _sum,
+    "mean": _sum,  # divided in `compiled`
     "max": partial(reduce, np.maximum),
     "min": partial(reduce, np.minimum),
     "product": partial(reduce, np.multiply),
@@ -101,7 +107,7 @@ class ChannelMapping:
         self._high_rad = np.array([joint.max_rad for joint in head.joints.values()])
 
         trees = drives(head)
-        self._drives = [compiled(tree, row) if tree else None for row, tree in enumerate(trees.values())]
+        self._drives = [compiled(merged(tree), row) if tree else None for row, tree in enumerate(trees.values())]
         # Couplings: C sums of joints that may not fall below a bound, and the joints that give way, the first first.
         self._keep = np.array([[each.keep.get(name, 0.0) for name in self.joints] for each in head.couplings])
         self._at_least = np.array([each.at_least for each in head.couplings])
@@ -176,6 +182,31 @@ class ChannelMapping:
         share = np.abs(values) / np.where(ends > 0, ends, 1.0)
         turned: Doubles = values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
         return turned
+
+
+def merged(node: Expression) -> Expression:
+    """Return the same function with sums of sums as one sum."""
+    if node.group is None:
+        return node
+    parts = [merged(part) for part in node.parts]
+    if node.sum is not None:
+        parts = [term for part in parts for term in _terms(part)]
+    return node.model_copy(update={node.group: tuple(parts)})
+
+
+def _terms(part: Expression) -> tuple[Expression, ...]:
+    """Return the terms of a sum, with its gain, where a sum around it can take them over; else the part itself."""
+    down, gain = part.gains
+    if part.sum is None or part.clamp or part.dead_band or part.curve or part.offset or down != gain:
+        return (part,)
+    if gain != 1 and any(term.clamp for term in part.sum):
+        return (part,)
+    return tuple(
+        term.model_copy(
+            update={"gain_up": gain * term.gains[1], "gain_down": gain * term.gains[0], "offset": gain * term.offset}
+        )
+        for term in part.sum
+    )
 
 
 def compiled(node: Expression, row: int) -> Callable[[Doubles], Doubles]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
-from sfms_robot.runtime.states import RunState
+from sfms_robot.runtime.states import RUNNING, RunState
 from sfms_robot.signals.audio import energy_db
 
 IDLE_S: Final = 1.0  # period of `ServiceManager.alive` where no watchdog asks for more
@@ -26,7 +26,6 @@ _NOTES: Final[Mapping[str, str]] = {
     "halted": "halted: nothing is followed until every cause is cleared",
     "stopping": "the head comes to rest",
 }
-_MOVING: Final = ("idle", "listening", "speaking", "degraded")
 
 log = logging.getLogger(__name__)
 
@@ -219,7 +218,7 @@ class NotifyingObserver(Observer):
         if (seen.state, seen.why) != self._shown:
             self._shown = seen.state, seen.why
             words = ": ".join([seen.state, *([", ".join(seen.why)] if seen.why else [])])
-            if not self._ready and seen.state in _MOVING:
+            if not self._ready and seen.state in RUNNING:
                 self._ready = True
                 self._manager.ready(words)
             elif seen.state == "stopping":

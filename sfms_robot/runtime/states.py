@@ -40,10 +40,10 @@ StateName = Literal[
     "starting", "idle", "listening", "speaking", "degraded", "halted", "stopping", "stopped", "fault"
 ]  # fmt: skip
 
-_RUNNING: Final[tuple[StateName, ...]] = ("idle", "listening", "speaking", "degraded")
-_MOVING: Final[tuple[StateName, ...]] = ("starting", *_RUNNING)
+RUNNING: Final[tuple[StateName, ...]] = ("idle", "listening", "speaking", "degraded")
+_MOVING: Final[tuple[StateName, ...]] = ("starting", *RUNNING)
 ARROWS: Final[frozenset[tuple[StateName, StateName]]] = frozenset(
-    [(a, b) for a in _MOVING for b in _RUNNING if a != b]
+    [(a, b) for a in _MOVING for b in RUNNING if a != b]
     + [(a, "halted") for a in _MOVING]
     + [("halted", "starting")]
     + [(a, "stopping") for a in (*_MOVING, "halted")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -96,11 +97,8 @@ class AudioFile:
 
 def read_audio(path: Path | str) -> Floats:
     """Return a whole sound file as (n,) mono 16 kHz, -1..1. Raises ConfigError as `AudioFile`."""
-    file = AudioFile(path)
-    try:
+    with closing(AudioFile(path)) as file:
         return file.read(file.length + _BLOCK)
-    finally:
-        file.close()
 
 
 def _open(path: Path) -> soundfile.SoundFile:
