@@ -338,13 +338,13 @@ def samplers(listener: ArigListener, speaker: Sequence[SpeakerFrame]) -> dict[st
 
     from sfms_robot.listeners.arig.networks import networks
     from sfms_robot.listeners.arig.sampler import Denoiser
-    from sfms_robot.listeners.torch_engine import Recorder
+    from sfms_robot.listeners.torch_engine import RecordingEngine
 
     head = listener.model.head
     if not isinstance(head, Denoiser):
         return {}
     listener = copy(listener)
-    listener.engine = recorder = Recorder(listener.model, networks(listener.model))
+    listener.engine = recorder = RecordingEngine(listener.model, networks(listener.model))
     memory, conditions = listener.start(0), []
     for index, frame in enumerate(speaker):
         _, memory = listener.step(frame, memory)
