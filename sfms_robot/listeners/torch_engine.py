@@ -149,7 +149,7 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
         listener = SfmsListener(model.settings, recorder, folder)
     control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
     speakers = [SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32)) for _ in range(EXAMPLE_STREAMS)]
-    memories = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
+    memories: list[Any] = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
     listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
     models: dict[str, SfmsModel | ArigModel] = {"": model}
     if int8 and isinstance(model, ArigModel) and large_layers(model):
