@@ -64,15 +64,10 @@ def load_folder(folder: Path, engine: EngineName = "auto", threads: int | None =
             runs = torch_engine(load_model(folder))
         if threads is not None:
             runs.set_threads(threads)
-    return model_of_motion(settings, runs, folder)
-
-
-def model_of_motion(settings: config.ListenerSettings, engine: Engine, folder: Path) -> SfmsListener | ArigListener:
-    """Return the stream of a configuration, whose networks an engine runs. Raises ConfigError or ModelError."""
     if isinstance(settings, config.Sfms):
-        return SfmsListener(settings, engine, folder)
+        return SfmsListener(settings, runs, folder)
     assert isinstance(settings, config.Arig)
-    return ArigListener(settings, engine, folder)
+    return ArigListener(settings, runs, folder)
 
 
 def engine_name(listener: Listener) -> str | None:

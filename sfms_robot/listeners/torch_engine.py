@@ -28,11 +28,12 @@ from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.arig.networks import networks as arig_networks
+from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
 from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, RunsOnEngine, digest
-from sfms_robot.listeners.registry import model_of_motion
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
+from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.signals.control import COLUMNS
 
 Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
@@ -68,7 +69,7 @@ class TorchEngine:
         torch.set_num_threads(threads)
 
 
-class Recorder(TorchEngine):
+class RecordingEngine(TorchEngine):
     """An engine that keeps the inputs of the last call of each network, by name, as examples."""
 
     def __init__(self, model: nn.Module, networks: Networks) -> None:
@@ -140,11 +141,15 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = new_model(settings).eval()
-    recorder = Recorder(model, networks_of(model))
-    listener: RunsOnEngine = model_of_motion(settings, recorder, folder)
+    recorder = RecordingEngine(model, networks_of(model))
+    listener: RunsOnEngine
+    if isinstance(model, ArigModel):
+        listener = ArigListener(model.settings, recorder, folder)
+    else:
+        listener = SfmsListener(model.settings, recorder, folder)
     control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
     speakers = [SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32)) for _ in range(EXAMPLE_STREAMS)]
-    memories = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
+    memories: list[Any] = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
     listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
     models: dict[str, SfmsModel | ArigModel] = {"": model}
     if int8 and isinstance(model, ArigModel) and large_layers(model):
