@@ -1,4 +1,4 @@
-"""Rows of the heads, listeners, recorded people and sound devices at hand."""
+"""Rows of the heads, listeners, recorded people, serial ports and sound devices at hand."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, Literal
 from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
+from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.registry import shipped_speaker
 
 
@@ -59,6 +60,11 @@ def shipped_speakers() -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def serial_ports() -> list[dict[str, Any]]:
+    """Return the rows of `port list`. `name` is the value for --port."""
+    return ports_data()
 
 
 def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, Any]]:

@@ -52,10 +52,9 @@ def list_speakers(json: bool = JSON) -> None:
 @port.command("list")
 def list_ports(json: bool = JSON) -> None:
     """Serial ports that servos may hang on, with what speaks against using them; devices that record, or play."""
-    from sfms_robot.app.catalogue import sound_devices
-    from sfms_robot.servo.discovery import ports_data
+    from sfms_robot.app.catalogue import serial_ports, sound_devices
 
-    found: dict[str, Any] = {"version": 1, "ports": ports_data(), "microphones": [], "loudspeakers": []}
+    found: dict[str, Any] = {"version": 1, "ports": serial_ports(), "microphones": [], "loudspeakers": []}
     found["microphone_problem"] = None
     try:
         found |= {"microphones": sound_devices("recording"), "loudspeakers": sound_devices("playing")}
