@@ -28,9 +28,9 @@ _ROOM: Final = 1.12  # of a picture, by what it shows
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
 # Each shape of a URDF: vtk's name of it and of its sizes, and its number of corners.
 _SHAPES: Final[Mapping[str, tuple[str, tuple[str, ...], Mapping[str, int]]]] = {
-    "box": ("Cube", ("XLength", "YLength", "ZLength"), {}),
-    "sphere": ("Sphere", ("Radius",), {"ThetaResolution": 48, "PhiResolution": 24}),
-    "cylinder": ("Cylinder", ("Radius", "Height"), {"Resolution": 48}),
+    "box": ("Cube", ("x_length", "y_length", "z_length"), {}),
+    "sphere": ("Sphere", ("radius",), {"theta_resolution": 48, "phi_resolution": 24}),
+    "cylinder": ("Cylinder", ("radius", "height"), {"resolution": 48}),
 }
 _READERS: Final = {".stl": "STLReader", ".obj": "OBJReader", ".ply": "PLYReader"}
 
@@ -61,17 +61,13 @@ def load_vtk() -> Any:
 
 
 def open_window(vtk: Any, size_px: tuple[int, int]) -> Any:
-    window = vtk.RenderWindow()
-    window.SetOffScreenRendering(True)
-    window.SetMultiSamples(8)
+    window = vtk.RenderWindow(off_screen_rendering=True, multi_samples=8)
     window.SetSize(*size_px)
     return window
 
 
 def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], color: Any) -> Any:
-    renderer = vtk.Renderer()
-    renderer.SetViewport(*box)
-    renderer.SetBackground(*color)
+    renderer = vtk.Renderer(viewport=box, background=color)
     window.AddRenderer(renderer)
     return renderer
 
@@ -79,10 +75,8 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
     """Add the head at one instant, and three lights."""
     skin = _mesh_actor(vtk, head.vertices(motion), head.triangles)
-    colors = vtk.arrays.numpy_to_vtk(head.colors, deep=True)
-    skin.GetMapper().GetInput().GetPointData().SetScalars(colors)
-    skin.GetProperty().SetSpecular(0.12)
-    skin.GetProperty().SetSpecularPower(18)
+    skin.mapper.input.point_data.SetScalars(vtk.arrays.numpy_to_vtk(head.colors, deep=True))
+    skin.property.specular, skin.property.specular_power = 0.12, 18
     renderer.AddActor(skin)
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
         add_light(vtk, renderer, place, (0, 0, 0), strength)
@@ -90,77 +84,57 @@ def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
 
 def add_light(vtk: Any, renderer: Any, place: Point, towards: Point, strength: float) -> None:
     """Light the scene from one place."""
-    light = vtk.Light()
+    light = vtk.Light(position=tuple(place), focal_point=tuple(towards), intensity=strength)
     light.SetLightTypeToSceneLight()
-    light.SetPosition(*place)
-    light.SetFocalPoint(*towards)
-    light.SetIntensity(strength)
     renderer.AddLight(light)
 
 
 def add_text(vtk: Any, renderer: Any, text: str, place_px: tuple[int, int], size_px: int, color: Any = INK) -> Any:
     """Write a line of text from `place_px` on, and return its style."""
-    actor = vtk.TextActor()
-    actor.SetInput(text)
-    actor.SetPosition(*place_px)
-    style = actor.GetTextProperty()
-    style.SetFontFamilyToArial()
-    style.SetFontSize(size_px)
-    style.SetColor(*color)
+    actor = vtk.TextActor(input=text, position=place_px)
+    style = actor.text_property
+    style.font_size, style.color = size_px, color
     renderer.AddViewProp(actor)
     return style
 
 
 def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
     """Place the camera, in the axes of the scene; `angle_deg` is what it sees across the height of the picture."""
-    camera = renderer.GetActiveCamera()
-    camera.SetViewAngle(angle_deg)
-    camera.SetFocalPoint(*to_m)
-    camera.SetPosition(*from_m)
-    camera.SetViewUp(0, 0, 1)
+    camera = renderer.active_camera
+    camera.view_angle, camera.view_up = angle_deg, (0, 0, 1)
+    camera.focal_point, camera.position = tuple(to_m), tuple(from_m)
     renderer.ResetCameraClippingRange()
 
 
 def _mesh_actor(vtk: Any, vertices: Floats | Doubles, triangles: NDArray[np.int64]) -> Any:
     """Return a smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
-    mesh, points, cells = vtk.PolyData(), vtk.Points(), vtk.CellArray()
+    points, cells = vtk.Points(), vtk.CellArray()
     points.SetData(vtk.arrays.numpy_to_vtk(np.ascontiguousarray(vertices, dtype=np.float32), deep=True))
     corners = np.ascontiguousarray(triangles, dtype=np.int64).ravel()
     starts = np.arange(0, len(corners) + 1, 3, dtype=np.int64)
     cells.SetData(
         vtk.arrays.numpy_to_vtkIdTypeArray(starts, deep=True), vtk.arrays.numpy_to_vtkIdTypeArray(corners, deep=True)
     )
-    mesh.SetPoints(points)
-    mesh.SetPolys(cells)
-    normals = vtk.PolyDataNormals()
-    normals.SetInputData(mesh)
-    normals.SplittingOff()
-    normals.ConsistencyOff()
+    mesh = vtk.PolyData(points=points, polys=cells)
+    normals = vtk.PolyDataNormals(input_data=mesh, splitting=False, consistency=False)
     normals.Update()
-    mesh.GetPointData().SetNormals(normals.GetOutput().GetPointData().GetNormals())
-    mapper, actor = vtk.PolyDataMapper(), vtk.Actor()
-    mapper.SetInputData(mesh)
-    actor.SetMapper(mapper)
-    actor.GetProperty().SetInterpolationToPhong()
+    mesh.point_data.SetNormals(normals.GetOutput().point_data.normals)
+    actor = vtk.Actor(mapper=vtk.PolyDataMapper(input_data=mesh))
+    actor.property.SetInterpolationToPhong()
     return actor
 
 
 def save(vtk: Any, window: Any, file: Path | str) -> None:
     if not Path(file).parent.is_dir():
         raise ConfigError(f"{file}: cannot be written: no folder {Path(file).parent}")
-    image, writer = _image(vtk, window), vtk.PNGWriter()  # an output port does not keep its filter alive
-    writer.SetFileName(str(file))
-    writer.SetInputConnection(image.GetOutputPort())
-    writer.Write()
+    image = _image(vtk, window)  # an output port does not keep its filter alive
+    vtk.PNGWriter(file_name=str(file), input_connection=image.GetOutputPort()).Write()
 
 
 def _image(vtk: Any, window: Any) -> Any:
     """Render, and return the filter that gives the picture."""
     window.Render()
-    image = vtk.WindowToImageFilter()
-    image.SetInput(window)
-    image.ReadFrontBufferOff()
-    return image
+    return vtk.WindowToImageFilter(input=window, read_front_buffer=False)
 
 
 class VirtualWebcam:
@@ -191,7 +165,7 @@ class VirtualWebcam:
         image.Update()
         self._window.RemoveRenderer(renderer)
         wide, high = self._window.GetSize()
-        flat = vtk.arrays.vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+        flat = vtk.arrays.vtk_to_numpy(image.GetOutput().point_data.scalars)
         return np.ascontiguousarray(flat.reshape(high, wide, 3)[::-1])
 
 
@@ -261,22 +235,15 @@ def _add_visuals(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) ->
 def _visual_actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str, Path]) -> Any:
     from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
-    matrix, mapper, actor = vtkMatrix4x4(), vtk.PolyDataMapper(), vtk.Actor()
+    matrix = vtkMatrix4x4()
     matrix.DeepCopy((place @ _upright(visual)).ravel().tolist())
     source = _source(visual, meshes)
     source.Update()
-    mapper.SetInputData(source.GetOutput())
-    mapper.ScalarVisibilityOff()
-    actor.SetMapper(mapper)
-    actor.SetUserMatrix(matrix)
-    style = actor.GetProperty()
-    style.SetColor(*visual.color[:3])
-    style.SetOpacity(visual.color[3])
+    mapper = vtk.PolyDataMapper(input_data=source.GetOutput(), scalar_visibility=False)
+    *color, opacity = visual.color
+    style = vtk.Property(color=tuple(color), opacity=opacity, ambient=0.12, specular=0.18, specular_power=24)
     style.SetInterpolationToPhong()
-    style.SetAmbient(0.12)
-    style.SetSpecular(0.18)
-    style.SetSpecularPower(24)
-    return actor
+    return vtk.Actor(mapper=mapper, user_matrix=matrix, property=style)
 
 
 def _upright(visual: Visual) -> Doubles:
@@ -295,10 +262,7 @@ def _source(visual: Visual, meshes: Mapping[str, Path]) -> Any:
     if visual.shape == "mesh":
         return _mesh(meshes[visual.mesh])
     name, sizes, more = _SHAPES[visual.shape]
-    source = getattr(sources, f"vtk{name}Source")()
-    for key, value in (*zip(sizes, visual.size, strict=True), *more.items()):
-        getattr(source, f"Set{key}")(value)
-    return source
+    return getattr(sources, f"vtk{name}Source")(**dict(zip(sizes, visual.size, strict=True)), **more)
 
 
 def _mesh(file: Path) -> Any:
@@ -307,8 +271,7 @@ def _mesh(file: Path) -> Any:
     name = _READERS.get(file.suffix.lower())
     if name is None:
         raise ConfigError(f"{file}: a picture needs one of {', '.join(_READERS)}")
-    reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")()
-    reader.SetFileName(str(file))
+    reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")(file_name=str(file))
     for part in (reader, reader.GetExecutive()):  # of a part with an observer vtk prints no error
         part.AddObserver("ErrorEvent", lambda *_: None)
     reader.Update()

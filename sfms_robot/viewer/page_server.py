@@ -1,4 +1,4 @@
-"""Server of the page, in the page's process: what a run sends goes to all visitors, encoded once.
+"""Server of the page, in the page's process: the messages of a run go to all visitors, encoded once.
 
     /                  the page              /static/...     its files
     /ws                the protocol          /human/head.bin the virtual human (`face.human`)

@@ -107,6 +107,9 @@ def test_a_tone_stays_a_tone(rate_hz):
     at = np.fft.rfftfreq(len(sound), 1 / 16000)
     near = np.abs(at - 1000.0) < 20.0  # a correction of a percent for a moment is 10 Hz
     assert spectrum[~near].sum() < 1e-6 * spectrum[near].sum()
+    if rate_hz > 16000:  # what 16 kHz cannot hold is filtered out
+        _, frames = played(Card(rate_hz, tone_hz=9500.0), pieces(rate_hz // 100), 2)
+        assert np.abs(np.concatenate(frames[30:])).max() < 0.002
 
 
 class FixedRate:
@@ -123,11 +126,6 @@ def test_with_soxr_1_0_a_frame_is_at_most_10_ms_off_and_none_is_lost(ppm, monkey
     assert not any(frame is None for frame in frames[3:])
     assert np.abs(offsets_s(frames, 100)).max() < 0.0105
     assert voice.statistics()["gaps"] == 0
-
-
-def test_what_16_khz_cannot_hold_is_filtered_out():
-    _, frames = played(Card(48000, tone_hz=9500.0), pieces(480), 4)
-    assert np.abs(np.concatenate(frames[30:])).max() < 0.002
 
 
 @pytest.mark.parametrize("ppm", [-150, 150])
@@ -190,15 +188,6 @@ def test_what_was_heard_before_the_start_is_dropped_and_has_taught_the_clock():
 def test_channels_are_averaged(channels):
     one, many = (played(Card(48000, channels=n), pieces(480), 1)[1] for n in (None, channels))
     np.testing.assert_allclose(np.concatenate(many), np.concatenate(one), atol=1e-6)
-
-
-def test_what_is_not_finite_is_silence():
-    voice = LiveVoice()
-    voice.start(0.0)
-    sound = np.full(16000, np.nan, dtype=np.float32)
-    sound[0] = np.inf
-    voice.push(sound, 16000, 1.0)
-    assert not voice.take(3).any() and voice.statistics()["not_finite"] == 16000
 
 
 def test_another_rate_begins_anew():

@@ -111,21 +111,15 @@ def test_what_is_not_finite_becomes_silence_and_is_counted():
     assert (told["agent_audio"]["not_finite"], told["voice"]["not_finite"]) == (2, 1600)
 
 
-def test_a_caller_who_is_faster_than_time_fills_no_memory():
+def test_a_caller_that_is_faster_than_time_fills_no_memory_and_delays_only_until_a_pause():
     person = Person()
     for _ in range(20):
         person.voice.hear(np.full(48000, 0.1), 16000)
         person.voice.hear(np.full(16000, 0.1), 16000)
+    assert person.voice.statistics()["delay_ms"] == 1000.0
     frames = person.read(5.0)
     assert 16000 - 1280 <= np.count_nonzero(heard(frames)) <= 16000 + 1280
     assert person.source.statistics()["voice"]["dropped"] == 20 * 32000
-
-
-def test_after_a_pause_pieces_are_no_longer_held_back():
-    person = Person()
-    person.voice.hear(np.zeros(16000), 16000)
-    assert person.voice.statistics()["delay_ms"] == 1000.0
-    person.read(5.0)
     person.voice.hear(np.zeros(320), 16000)
     assert person.voice.statistics()["delay_ms"] == 20.0
 
@@ -197,24 +191,18 @@ def test_a_piece_near_the_end_of_the_last_follows_it_and_one_further_off_is_wher
     assert sounds.tolist() == [1600, 6400, 8000, 9600]
 
 
-def test_an_earlier_time_replaces_what_was_to_be_played_from_then_on():
-    speech = PushedSpeech(lambda: 0.0)
-    speech.say(np.full(16000, 0.5), 16000, 0.1)
-    speech.say(np.full(800, -0.5), 16000, 0.3)
-    out = played(speech, 50)
-    assert (out[1600:4800] == 0.5).all() and (out[4800:5600] == -0.5).all() and not out[5600:].any()
-
-
-def test_a_robot_that_is_hushed_says_nothing_from_then_on_and_the_next_sentence_at_once():
+@pytest.mark.parametrize("hushed", [False, True])
+def test_an_earlier_time_and_a_hush_replace_the_rest(hushed):
     now_s = 0.0
     speech = PushedSpeech(lambda: now_s)
-    speech.say(np.full(32000, 0.5), 16000)
-    now_s = 0.2
-    speech.hush()
-    speech.say(np.full(640, -0.5), 16000)
-    out = played(speech, 100)
-    assert (out[640:3200] == 0.5).all() and not out[3200:3840].any() and (out[3840:4480] == -0.5).all()
-    assert not out[4480:].any()
+    speech.say(np.full(32000, 0.5), 16000)  # a frame after this call, and for 2 s
+    now_s = 0.26
+    if hushed:
+        speech.hush()
+    speech.say(np.full(800, -0.5), 16000, None if hushed else 0.3)
+    out = played(speech, 60)
+    assert (out[640:4160] == 0.5).all() and (out[4160:4800] == (0.0 if hushed else 0.5)).all()
+    assert (out[4800:5600] == -0.5).all() and not out[5600:].any()
 
 
 @given(st.lists(st.floats(0, 0.015), min_size=50, max_size=50), st.sampled_from([16000, 24000]))
@@ -233,15 +221,12 @@ def test_a_voice_that_is_streamed_as_it_is_played_has_no_gaps(lates_s, rate_hz):
     assert first <= 640 + 240 and (sound[first + 32 :] > 0.1).all()
 
 
-def test_what_is_to_be_played_later_than_in_two_minutes_is_left_out():
+def test_speech_too_far_ahead_and_speech_after_its_time_are_left_out_and_counted():
     speech = PushedSpeech(lambda: 0.0, longest_s=0.08)
     speech.say(np.r_[np.full(640, 0.1), np.full(1280, 0.2)], 16000)
     out = played(speech, 5)
     assert (out[640:1280] == np.float32(0.1)).all() and not out[1280:].any()
     assert speech.statistics() == {"dropped": 1280, "late": 0, "not_finite": 0}
-
-
-def test_what_is_said_after_its_time_is_left_out_and_counted():
     speech = PushedSpeech(lambda: 0.0)
     speech.say(np.full(640, 0.5), 16000, 0.0)
     assert speech.take(0).all()
@@ -253,22 +238,15 @@ def test_what_is_said_after_its_time_is_left_out_and_counted():
 
 def test_a_voice_with_times_is_placed_by_them():
     """A click that was heard at 1.0 s is at 1.0 s, whenever its piece came."""
-    person = Person()
-    click = np.zeros(1600, np.float32)
-    frames = []
+    person, frames = Person(), []
     for index in range(40):
-        sound = click.copy()
-        if index == 10:
-            sound[0] = 1.0
+        sound = np.zeros(1600, np.float32)
+        sound[0] = index == 10
         person.now_s = 100.0 + (index + 1) * 0.1 + 0.03 * (index % 3)
         person.voice.hear(sound, 16000, 100.0 + (index + 1) * 0.1)
         frames += person.read(person.now_s - 100.0)
-    assert (
-        abs(
-            int(np.argmax(np.abs(np.concatenate([f.audio if len(f.audio) else np.zeros(640) for f in frames])))) - 16000
-        )
-        <= 16
-    )
+    whole = np.concatenate([frame.audio if len(frame.audio) else np.zeros(640) for frame in frames])
+    assert abs(int(np.abs(whole).argmax()) - 16000) <= 16
 
 
 def test_calls_may_come_from_any_thread():

@@ -55,21 +55,18 @@ def test_a_face_belongs_to_the_end_of_its_frame_and_ends_with_its_track():
 
 
 def test_a_short_voice_starts_again_after_a_second_of_silence():
-    frames = recorded(voice(10), face(0.4), duration_s=2.0).read(9.0)
+    frames = recorded(voice(10), face(0.4), duration_s=2.0, agent_audio=voice(5)).read(9.0)
     heard = [float(frame.audio[0]) for frame in frames]
     assert len(frames) == 50
     assert heard[10:35] == [0.0] * 25 and heard[35:45] == heard[:10]
     assert frames[20].face is None and frames[35].face.pose[0] == frames[0].face.pose[0]
+    assert not any(frame.agent_audio.any() for frame in frames[5:])  # the robot's own voice does not
 
 
-def test_without_loop_silence_follows():
-    frames = recorded(voice(10), None, duration_s=2.0, loop=False).read(2.0)
-    assert not any(frame.audio.any() for frame in frames[10:])
-
-
-def test_the_last_frame_is_filled_with_silence():
-    (frame,) = recorded(voice(1)[:100], None).read(1.0)
-    assert frame.audio.shape == (FRAME_SAMPLES,) and not frame.audio[100:].any()
+def test_without_loop_silence_follows_and_fills_the_last_frame():
+    frames = recorded(voice(1)[:100], None, duration_s=2.0, loop=False).read(2.0)
+    assert frames[0].audio[:100].all() and not frames[0].audio[100:].any()
+    assert not any(frame.audio.any() for frame in frames[1:])
 
 
 def test_a_face_alone_and_nothing_at_all_are_normal():
@@ -97,6 +94,8 @@ def test_shipped_speakers_can_be_heard_and_seen():
     assert np.corrcoef(jaw, level)[0, 1] > 0.4
     assert all(frame.face is None for frame in open_source("katie").read(20.0))
     assert shipped_speaker("katie").face is None
+    source = open_source("none", "none", agent_audio=speaker_names()[0])
+    assert any(frame.agent_audio.any() for frame in source.read(5.0))
 
 
 def test_files_are_opened_by_path(tmp_path):
@@ -110,48 +109,34 @@ def test_files_are_opened_by_path(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("audio", "face", "message"),
+    ("audio", "face", "agent_audio", "message"),
     [
-        ("browser", "auto", "--audio browser: there is no page .sfms-robot run --view"),
-        ("none", "browser:8000", "--face browser:8000: takes nothing behind the colon"),
-        ("nobody.wav", "auto", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
-        ("none", "nobody.csv", "--face nobody.csv: no such file"),
+        ("browser", "auto", "none", "--audio browser: there is no page .sfms-robot run --view"),
+        ("none", "browser:8000", "none", "--face browser:8000: takes nothing behind the colon"),
+        ("nobody.wav", "auto", "none", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
+        ("none", "nobody.csv", "none", "--face nobody.csv: no such file"),
+        ("none", "none", "gone.wav", "--agent-audio gone.wav: no such file"),
+        ("none", "none", "browser:x", "--agent-audio browser:x: no such file"),
     ],
 )
-def test_what_cannot_be_opened_is_said_with_the_choices(audio, face, message):
+def test_what_cannot_be_opened_is_said_with_the_choices(audio, face, agent_audio, message):
     with pytest.raises(ConfigError, match=message):
-        open_source(audio, face)
+        open_source(audio, face, agent_audio=agent_audio)
 
 
-def test_what_the_robot_says_is_told_one_frame_early_and_silence_follows():
+def test_the_robots_voice_comes_one_frame_early_and_silence_follows():
     frames = recorded(voice(5), None, duration_s=0.4, agent_audio=voice(3)).read(1.0)
     assert [float(frame.agent_audio[0]) * 1000 for frame in frames] == pytest.approx([2, 3] + [0] * 8)
     assert all(len(frame.agent_audio) == FRAME_SAMPLES for frame in frames)
-
-
-def test_a_robot_that_says_nothing_has_no_track():
     assert all(frame.agent_audio is None for frame in recorded(voice(3), None).read(1.0))
 
 
-def test_the_robots_voice_does_not_start_again_with_the_persons():
-    frames = recorded(voice(5), None, duration_s=3.0, agent_audio=voice(5)).read(3.0)
-    assert frames[30].audio.any() and not any(frame.agent_audio.any() for frame in frames[5:])
-
-
-def test_a_robots_voice_alone_lasts_as_long_as_it_speaks():
+def test_a_run_lasts_until_the_robot_has_spoken_and_the_person_does_not_begin_again():
     assert recorded(None, None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
-    assert recorded(voice(3), None, agent_audio=voice(7)).duration_s == pytest.approx(0.28)
-
-
-@pytest.mark.parametrize(("name", "said"), [("gone.wav", "no such file"), ("browser:x", "no such file")])
-def test_a_robots_voice_that_is_not_there_is_named(name, said):
-    with pytest.raises(ConfigError, match=f"--agent-audio {name}: {said}"):
-        open_source("none", "none", agent_audio=name)
-
-
-def test_a_shipped_speaker_lends_the_robot_its_voice():
-    source = open_source("none", "none", agent_audio=speaker_names()[0])
-    assert any(frame.agent_audio.any() for frame in source.read(5.0))
+    source = recorded(voice(3), None, agent_audio=voice(40))
+    frames = source.read(60.0)
+    assert len(frames) == 40 and source.duration_s == pytest.approx(1.6)
+    assert frames[38].agent_audio.any() and not any(frame.audio.any() for frame in frames[3:])
 
 
 def test_a_recording_read_from_its_file_is_the_recording_held_in_memory(tmp_path):
@@ -179,10 +164,3 @@ def test_three_hours_are_not_loaded(tmp_path):
     assert tracemalloc.get_traced_memory()[1] < 8_000_000
     tracemalloc.stop()
     source.close()
-
-
-def test_a_robots_voice_that_is_longer_is_not_cut_and_the_person_does_not_begin_again():
-    source = recorded(voice(3), None, agent_audio=voice(40))
-    frames = source.read(60.0)
-    assert len(frames) == 40 and source.duration_s == pytest.approx(1.6)
-    assert frames[38].agent_audio.any() and not any(frame.audio.any() for frame in frames[3:])
