@@ -436,9 +436,8 @@ def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
     ].T
     spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
     masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
-    counts = phrase_end_counts(
-        onsets_s, phrase_ends(one.scene.speaks[:, 1:].any(axis=1), FRAME_HZ), one.listening, FRAME_HZ
-    )
+    others = np.asarray(one.scene.speaks[:, 1:].any(axis=1))
+    counts = phrase_end_counts(onsets_s, phrase_ends(others, FRAME_HZ), one.listening, FRAME_HZ)
     rates = {f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()}
     return {**rates, "phrase_end": np.array(counts)}, np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S))
 
