@@ -136,7 +136,7 @@ def test_licence_goes_along(tmp_path, caplog, command_line):
     assert command_line("data", "check", tmp_path / "out", "--json").told["licence"] == told["licence"]
     (tmp_path / "out" / "source.yaml").write_text("licence: [1]\n")
     report = command_line("data", "check", tmp_path / "out", "--json").told
-    assert "source.yaml: licence = [1] is no text" in report["splits"][0]["problems"][0]["first"]
+    assert "source.yaml: licence = [1] is not text" in report["splits"][0]["problems"][0]["first"]
 
 
 def test_table_tells_splits_licence_and_residual(tmp_path, command_line):

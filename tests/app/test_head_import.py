@@ -51,7 +51,7 @@ def imported(tmp_path, name, content, **options):
     file = tmp_path / name
     file.write_text(json.dumps(content) if name.endswith("json") else yaml.safe_dump(content))
     done = import_head(file, tmp_path / "made", **options)
-    assert check(str(done.folder), None, None, []).problems == ()
+    assert check(str(done.folder))["problems"] == []
     return load_head(str(done.folder)), done.remarks
 
 

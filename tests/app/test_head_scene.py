@@ -3,7 +3,6 @@
 import pytest
 
 from sfms_robot.app.head.head_scene import draw_scene, draw_shipped_heads
-from sfms_robot.errors import ConfigError
 
 pytest.importorskip("vtkmodules")
 
@@ -15,14 +14,14 @@ def test_a_platform_is_told_apart_from_what_follows_by_name(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
-def test_a_head_without_a_picture_says_what_is_missing(tmp_path):
+def test_a_head_without_a_urdf_is_drawn_from_its_joints(tmp_path):
     (tmp_path / "head.yaml").write_text(
         "name: owl\ndescription: ''\nbuses: {main: {family: dynamixel2, baud: 1000000}}\n"
         "limits: {any: {speed_deg_s: 1, acceleration_deg_s2: 1, jerk_deg_s3: 1}}\n"
         "joints: {jaw: {bus: main, id: 1, model: xl330-m288, zero_ticks: 0, min_deg: -1, max_deg: 1, limits: any}}\n"
     )
-    with pytest.raises(ConfigError, match="head.yaml: urdf: expected a file"):
-        draw_scene(str(tmp_path), tmp_path / "a.png")
+    drawn = draw_scene(str(tmp_path), tmp_path / "a.png")
+    assert drawn["follows"] == {"jaw": "jaw"} and (tmp_path / "a.png").stat().st_size > 1000
 
 
 @pytest.mark.slow

@@ -25,8 +25,8 @@ from sfms_robot.viewer.page_messages import (
 from sfms_robot.viewer.page_server import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
 
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
-PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
-TOLD, ASKED = PAGE.partition("### What a page is told\n")[2].split("### What a page asks for\n")
+PAGE = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
+TOLD, ASKED = PAGE.partition("### From the robot to the page\n")[2].split("### What a page asks for\n")
 OF_VISITORS = {
     "controls",
     "needs_token",

@@ -36,7 +36,7 @@ def test_later_words_go_over_earlier_ones():
     ("word", "message"),
     [
         ("grin", r"EXPRESSION = 'grin' is not an expression \(smile, .*CHANNEL=VALUE\)"),
-        ("mouth=1", r"CHANNEL = 'mouth' is not a channel \(roll, "),
+        ("mouth=1", r"CHANNEL = 'mouth' is not a channel; did you mean 'mouthLeft'"),
         ("jawOpen=1.5", r"jawOpen = '1.5' is not a number in its range \(0..1\)"),
         ("jawOpen=nan", "jawOpen = 'nan'"),
         ("yaw=wide", r"yaw = 'wide' .*\(-1.6..1.6\)"),

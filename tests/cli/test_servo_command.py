@@ -72,7 +72,8 @@ def test_release_says_of_every_joint_whether_its_torque_is_off(command_line):
     assert ended.code == 4 and len(ended.told["torque_unconfirmed"]) == 8 and "stewart_1" in ended.err
 
 
-def test_the_tables_for_people_hold_what_json_holds(command_line, device):
+def test_the_tables_for_people_hold_what_json_holds(command_line, device, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)  # pytest-xdist sets it
     for words in ("ping 1", "read 1 all", "monitor 1 --samples 1"):
         out = command_line("servo", *words.split(), "--port", device, "--baud", 1_000_000).out
         assert "xl330-m288" in out or "goal_position" in out

@@ -127,7 +127,7 @@ def test_what_is_not_seen_stays_unknown_after_resampling():
     ("text", "message"),
     [
         ("", "the file is empty"),
-        ("t_s,jawOpen\n", "a header and no rows"),
+        ("t_s,jawOpen\n", "holds no rows: only a header"),
         ("t_s,jawOpne\n0,1\n", "no column is a face channel .*jawOpen"),
         ("jawOpen\n1\n", "no column tells the time .*Timecode"),
         ("t_s,jawOpen\n0,0.5\n0.1,half\n", "row 3, column jawOpen = 'half' is not a number"),

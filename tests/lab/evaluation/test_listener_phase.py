@@ -109,7 +109,7 @@ def test_recall_and_precision_of_one_who_always_or_never_says_keyframe(bias: flo
     one = listener()
     corpus = corpus_of(one, dyad(120))
     with torch.no_grad():
-        for row in one.model.predictor.place.view(2, -1)[:, 0]:  # class 0 of both groups
+        for row in (0, one.model.predictor.classes[0]):  # class 0 of both groups
             one.model.predictor.classify.bias[row] = bias
     scores = keyframe_scores(one.model, corpus, one.settings)
     assert scores["keyframe_recall"] == recall
