@@ -104,3 +104,14 @@ def test_the_share_of_attention_is_of_the_frames_that_tell_it():
     for attention in (None, 0.9, 0.6, 0.2, None):
         log.heard(SpeakerFrame(0.04, np.zeros(0, np.float32), attention=attention))
     assert log.attention_report() == {"share": 0.6667, "frames": 3}
+
+
+def test_a_worker_that_has_ended_loses_no_event():
+    pitch, _, _ = talkative(60.0, 0)
+    with ThreadPoolExecutor(1) as ended:
+        counter = EventCounter(find_nods, RATE_HZ, ended)
+        for value in pitch[:3000]:
+            counter.add(float(value))
+    for value in pitch[3000:]:
+        counter.add(float(value))
+    assert counter.total() == len(find_nods(pitch, RATE_HZ))
