@@ -10,6 +10,9 @@ range, its speed and acceleration being within their limits all the way. A tick 
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
+Nearly always all joints pass, and bounds that are a little too strict but cost a few array operations for all of them
+show it. The joints that they do not settle are looked at one by one.
+
 A joint that is found outside its own range starts there, and the range in force (`sfms_robot.ranges`) reaches out to
 it. There the law also says that the stop of a joint never turns back: it moves in or stands still, and its braking
 curve inherits that. Where the reference does not bring it in, `Recovery` does, so that it is inside its own range
@@ -31,11 +34,12 @@ import numpy as np
 
 from sfms_robot.config import Head
 from sfms_robot.frames import Doubles
-from sfms_robot.motion.jerk_step import FASTEST, Bound, Chase, State, Stop, lawful, moves_in
+from sfms_robot.motion.jerk_step import FASTEST, SLACK, Bound, Chase, State, Stop, lawful, moves_in
 from sfms_robot.ranges import Bools, Range
 from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 _HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6
+_EDGE_SLACK_RAD: Final = 1e-12  # so that rounding does not make a joint at the end of its range a hard case
 
 GENTLE_S: Final = 2.0  # longer than the easing of a run, so that usually the requested face is ahead of the curve
 _SHARE: Final = 0.8
@@ -146,6 +150,24 @@ class LimiterState:
     refused: int = 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Bounds:
+    """A range in force, prepared for the array arithmetic.
+
+    Attributes:
+        range: (J,).
+        middle: (J,).
+        floor, ceiling: (3, J) just outside the limits: values farther out are moved here, because 1e300 overflows.
+        needed: (10, J) bounds of the sizes that `JerkLimiter._needed` returns.
+    """
+
+    range: Range
+    middle: Doubles
+    floor: Doubles
+    ceiling: Doubles
+    needed: Doubles
+
+
 class JerkLimiter:
     """Limiter of joints that share one tick of `dt_s`. `chase`: the fastest available by default."""
 
@@ -156,9 +178,9 @@ class JerkLimiter:
         self._jerk = limits.jerk * _HEADROOM
         self._dt_s = dt_s
         self._piece = _one_tick(dt_s)
-        # Bounds of the rows of `_one_tick`.
-        self._most = np.stack([*[self._jerk] * 3, *[self._acceleration] * 2, self._speed * dt_s])
+        self._stop_s, self._per_acceleration = self._acceleration / self._jerk, 0.5 / self._acceleration
         self._own = limits.range
+        self._own_bounds = self._within(self._own)
         each = zip(self._speed.tolist(), self._acceleration.tolist(), self._jerk.tolist(), strict=True)
         self._bounds = [Bound(*bound) for bound in each]
         self._ends = list(zip(limits.low.tolist(), limits.high.tolist(), strict=True))
@@ -187,17 +209,20 @@ class JerkLimiter:
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Return angles (J,) that may be sent for a reference (3, J) one tick ahead, and the state after the tick."""
-        recovery, guided, refused = state.recovery, reference_rad, 0
-        if recovery is not None:  # some joint is outside its own range: its curve leads where the reference does not
-            recovery = recovery._replace(elapsed_s=recovery.elapsed_s + self._dt_s)
-            outside = ~self._own.holds(state.motion[0])
-            guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
-            # Guided joints never show a reference that is not finite to `_tick`, so it is counted here.
-            refused = int(np.count_nonzero(outside & ~np.isfinite(reference_rad).all(axis=0)))
-        after, chased, braked = self._tick(guided, state.motion)
-        if self._own.holds(after[0]).all():
-            recovery = None  # all are in, for good: the range in force never reaches out again
-        return after[0].copy(), LimiterState(after, recovery, state.chased + chased, state.refused + refused + braked)
+        if state.recovery is None:
+            after, chased, refused = self._tick(reference_rad, state.motion, self._own_bounds)
+            return after[0].copy(), LimiterState(after, None, state.chased + chased, state.refused + refused)
+        # Some joint is outside its own range: its curve leads where the reference does not.
+        recovery = state.recovery._replace(elapsed_s=state.recovery.elapsed_s + self._dt_s)
+        outside = ~self._own.holds(state.motion[0])
+        guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
+        within = self._within(self._own.reaching(state.motion[0]))
+        after, chased, refused = self._tick(guided, state.motion, within, outside)
+        # Guided joints never show a reference that is not finite to `_tick`, so it is counted here.
+        refused += int(np.count_nonzero(outside & ~np.isfinite(reference_rad).all(axis=0)))
+        # Once all are in, they are in for good: the range in force never reaches out again.
+        still_out = recovery if not self._own.holds(after[0]).all() else None
+        return after[0].copy(), LimiterState(after, still_out, state.chased + chased, state.refused + refused)
 
     def brake(self, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Brake every joint for one tick, as fast as its limits allow; one that stands stays.
@@ -211,29 +236,36 @@ class JerkLimiter:
         np.clip(after[0], reach.low, reach.high, out=after[0])
         return after[0].copy(), replace(state, motion=after)
 
-    def _tick(self, reference_rad: Doubles, motion: Doubles) -> tuple[Doubles, int, int]:
-        """Return the state (3, J) one tick after `motion` (3, J), and how many joints were chased and refused."""
-        within = self._own.reaching(motion[0])
-        low, high = within.low, within.high
-        # Values far outside the limits are moved to just outside them, because 1e300 overflows.
-        rates = 2 * self._speed, 2 * self._acceleration
-        wanted = np.maximum(reference_rad, np.stack([low - 1, -rates[0], -rates[1]]))
-        wanted = np.minimum(wanted, np.stack([high + 1, *rates]))
-        # A joint is met if it can be brought to the reference in one tick; False for NaN.
-        met = np.logical_and.reduce(np.abs(self._piece @ np.concatenate([motion, wanted])) <= self._most, axis=0)
-        columns = np.concatenate([motion, reference_rad, wanted, [low, high]]).T.tolist()
-        settled, chased, refused = [], 0, 0
-        for j, (ok, column) in enumerate(zip(met.tolist(), columns, strict=True)):
-            before, reference, target, ends = column[:3], column[3:6], column[6:9], column[9:]
-            if not all(map(math.isfinite, reference)):  # refused, not clipped: clipping NaN gives NaN
-                settled.append(self._braked(j, before))
-                refused += 1
-            elif ok and self._lawful(j, target, *ends):  # step 1 of the law: the sample passes unchanged
-                settled.append(target)
-            else:  # steps 2 and 3
-                settled.append(self._chased(j, before, target, *ends))
-                chased += 1
-        after = np.array(settled).T
+    def _tick(
+        self, reference_rad: Doubles, motion: Doubles, within: _Bounds, outside: Bools | None = None
+    ) -> tuple[Doubles, int, int]:
+        """Return the state (3, J) one tick after `motion` (3, J), and how many joints were chased and refused.
+
+        `outside` (J,): joints outside their own ranges; None for none.
+        """
+        low, high = within.range.low, within.range.high
+        # 1. Joints that can meet the reference in one tick, and stop from there by the strict bounds, pass unchanged.
+        after = np.minimum(np.maximum(reference_rad, within.floor), within.ceiling)
+        fine = self._needed(motion, after, within.middle) <= within.needed  # False for NaN
+        if outside is not None:
+            fine[6:, outside] = False  # the bounds of a stop do not know that it must not turn back
+        chased = refused = 0
+        if np.count_nonzero(fine) < fine.size:
+            hard = np.flatnonzero(~np.logical_and.reduce(fine, axis=0))
+            met = np.logical_and.reduce(fine[:6, hard], axis=0)  # in one tick; only the stop is in doubt
+            each = [*motion[:, hard], *reference_rad[:, hard], *after[:, hard], low[hard], high[hard]]
+            settled = []
+            for j, ok, column in zip(hard.tolist(), met.tolist(), np.stack(each).T.tolist(), strict=True):
+                before, reference, wanted, ends = column[:3], column[3:6], column[6:9], column[9:]
+                if not all(map(math.isfinite, reference)):
+                    settled.append(self._braked(j, before))
+                    refused += 1
+                elif ok and self._lawful(j, wanted, *ends):
+                    settled.append(wanted)
+                else:
+                    settled.append(self._chased(j, before, wanted, *ends))
+                    chased += 1
+            after[:, hard] = np.array(settled).T
         # Rounding may have left the range by an ulp.
         np.maximum(after[0], low, out=after[0])
         np.minimum(after[0], high, out=after[0])
@@ -251,6 +283,44 @@ class JerkLimiter:
         # Still outside: the side on which the range in force reaches out tells the way in. Its stop must not turn back.
         way = 1.0 if low < first else -1.0
         return lawful(state, low, high, bound) and moves_in(state, way, bound)
+
+    def _within(self, limits: Range) -> _Bounds:
+        low, high = limits.low, limits.high
+        ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
+        half = (high - low) / 2 + _EDGE_SLACK_RAD
+        # Rows as in `_needed`: three jerks, two accelerations, the way of one tick;
+        one_tick = [self._jerk] * 3 + [self._acceleration] * 2 + [self._speed * self._dt_s]
+        # then speed and acceleration of the stop, and half the range, along its way and against it.
+        stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
+        floor = np.stack([low - 1, -ceiling[1], -ceiling[2]])
+        needed = np.stack([*one_tick, *stop])
+        return _Bounds(range=limits, middle=(low + high) / 2, floor=floor, ceiling=ceiling, needed=needed)
+
+    def _needed(self, motion: Doubles, wanted: Doubles, middle: Doubles) -> Doubles:
+        """Return the sizes (10, J) needed to go from `motion` to `wanted` (3, J) in one tick, and to stop from there.
+
+        Rows 0..5 are those of `_one_tick`; 6 and 7 the highest speed and acceleration of the stop; 8 and 9 its farthest
+        points from the middle of the range, along its way and against it. They are compared with `_Bounds.needed`.
+        """
+        out = np.empty((10, wanted.shape[1]))
+        met, top, size, along, against = out[:6], out[6], out[7], out[8], out[9]
+        np.matmul(self._piece, np.concatenate([motion, wanted]), out=met)
+        q, v, a = wanted
+        speed = np.abs(v)
+        np.abs(a, out=size)
+        # The acceleration is gone after |a| / J, and until then changes the speed by |a| / 2 on average.
+        lasts = size / self._jerk
+        gain = 0.5 * size * lasts
+        np.add(speed, gain, out=top)
+        # The way of the stop is that of the speed once the acceleration is gone.
+        onward = v + np.copysign(gain, a)
+        off = q - middle
+        # Along its way a stop is no longer than |a| / J at the highest speed, then a whole stop from it: the ramp of
+        # the acceleration, A / J, at that speed, and the way of constant deceleration, top^2 / 2A.
+        np.add(off, np.copysign(top * (lasts + self._stop_s + top * self._per_acceleration), onward), out=along)
+        # Against it the joint moves only until it has turned round, which takes no longer than |a| / J.
+        np.subtract(off, np.copysign(speed * lasts, onward), out=against)
+        return np.abs(out, out=out)
 
     def _chased(self, j: int, before: State, wanted: State, low: float, high: float) -> State:
         """Return joint j one tick on its way to the possible part of `wanted`; braked where that is not lawful."""

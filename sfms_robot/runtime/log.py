@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
@@ -54,6 +53,7 @@ class EventCounter:
         self._before = 0  # values of the block before, at the front
         self._counted = 0  # events of whole blocks; belongs to the worker
         self._search: Future[int] | None = None
+        self._whole: Future[int] | None = None  # the count of the block before
         self._wanted = False
         self._so_far = 0
 
@@ -70,7 +70,9 @@ class EventCounter:
             self._search = self._submit(len(self._values))
         last = self._before + self._block
         if len(self._values) >= last + self._margin:
-            self._submit(last, whole=True)
+            if self._whole is not None:
+                self._whole.result()  # in real time it has had twenty seconds
+            self._whole = self._submit(last, whole=True)
             self._values, self._before = self._values[last - self._margin :], self._margin
 
     def total(self) -> int:
@@ -133,8 +135,7 @@ class RunLog:
 
     def __post_init__(self) -> None:
         worker = ThreadPoolExecutor(1, "event counter")
-        # Its thread begins, and loads what it searches with, before the loop's takes real-time priority.
-        worker.submit(import_module, "scipy.signal").result()
+        worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
         rate_hz = 1.0 / self.period_s
         self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
