@@ -274,12 +274,10 @@ def _scores(values: Tensor, label: NDArray[np.intp], unseen: Tensor, seed: int) 
 
 def _network(channels: int) -> nn.Sequential:
     """Build three convolutions over time, the mean and maximum of their output, and one number."""
-    return nn.Sequential(
-        nn.Conv1d(channels, _WIDTH, 5, padding=2), nn.GELU(),
-        nn.Conv1d(_WIDTH, _WIDTH, 5, stride=2, padding=2), nn.GELU(),
-        nn.Conv1d(_WIDTH, _WIDTH, 5, stride=2, padding=2), nn.GELU(),
-        _MeanAndMost(), nn.Dropout(0.2), nn.Linear(2 * _WIDTH, 1),
-    )  # fmt: skip
+    layers: list[nn.Module] = [nn.Conv1d(channels, _WIDTH, 5, padding=2), nn.GELU()]
+    for _ in range(2):
+        layers += [nn.Conv1d(_WIDTH, _WIDTH, 5, stride=2, padding=2), nn.GELU()]
+    return nn.Sequential(*layers, _MeanAndMost(), nn.Dropout(0.2), nn.Linear(2 * _WIDTH, 1))
 
 
 class _MeanAndMost(nn.Module):

@@ -104,7 +104,9 @@ def listener_job(
         gain = None
         if listener.audio == "mel":  # microphones differ
             gain = ((torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB).to(device)
-        seen = context(model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, gain, held)
+        seen = context(
+            model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held
+        )
         seen = augment(seen, levels, neutral, phase, generator)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
@@ -115,10 +117,10 @@ def listener_job(
                 windows(dense, chosen, listener.window_frames),
                 windows(motion, chosen, listener.window_frames),
                 listener.past_frames + count[:, 0],
-                model.tokenizer.member,
-                torch.tensor(model.tokenizer.costs, device=device),
-                phase.missed_keyframes,
-                generator,
+                member=model.tokenizer.member,
+                costs=torch.tensor(model.tokenizer.costs, device=device),
+                share=phase.missed_keyframes,
+                generator=generator,
             )
         return _loss(model, seen, meant, count, settings)
 
