@@ -41,13 +41,10 @@ FAULTS = (
     Fault(LIMITS, "limits.speed * _HEADROOM", "limits.speed * 1.01", MOTION),
     Fault(LIMITS, "limits.acceleration * _HEADROOM", "limits.acceleration * 1.05", MOTION),
     Fault(LIMITS, "limits.jerk * _HEADROOM", "limits.jerk * 1.1", MOTION),
-    Fault(LIMITS, "*[self._acceleration] * 2", "*[self._acceleration * 2] * 2", MOTION),
     Fault(
-        "motion/jerk_step.py",
-        "position + above <= high + POSITION",
-        "position + above <= high + 0.01 + POSITION",
-        MOTION,
+        LIMITS, "[self._jerk] * 3 + [self._acceleration] * 2", "[self._jerk] * 3 + [self._acceleration * 2] * 2", MOTION
     ),
+    Fault(LIMITS, "half = (high - low) / 2 + _EDGE_SLACK_RAD", "half = (high - low) / 2 + 0.01", MOTION),
     Fault(LIMITS, "if not all(map(math.isfinite, reference)):", "if not math.isfinite(reference[0]):", MOTION),
     Fault(
         LIMITS,
