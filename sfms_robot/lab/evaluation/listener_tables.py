@@ -50,14 +50,7 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.ports import Listener
 
-PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
-    "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
-    "faceverse58": {"expression": slice(0, 52), "rotation": slice(52, 55)},
-    "deca56": {"expression": slice(0, 50), "rotation": slice(50, 53)},
-}
-CLUSTERS: Final = {"expression": 15, "rotation": 9}  # of the Shannon index (V-D1)
 FRAMES: Final = {1: 64, 2: 750}  # of a clip: Learning2Listen's and REACT's
-NEEDED_FRAMES: Final = {1: 2, 2: 51}  # FRSyn looks 49 frames either way
 _LEAST_SPREAD: Final = 1e-6  # smaller spreads would divide by nearly nothing
 _COLUMNS_1: Final = ("L2", "FD", "Var", "SI", "P-FD", "RPCC")
 _COLUMNS_2: Final = ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn")
@@ -116,7 +109,7 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
         over = jackknife(score, clips.people) if name in answers else {}
         rows.append({"name": name, "source": "here", **score(np.arange(len(clips.truth))), "interval": over})
     if number == 1:
-        keys = [f"{part} {column}" for part in CLUSTERS for column in _COLUMNS_1]
+        keys = [f"{part} {column}" for part in metrics.CLUSTERS for column in _COLUMNS_1]
         paper = {name: dict(zip(keys, [*first, *second], strict=True)) for name, (first, second) in _PAPER_1.items()}
     else:
         paper = {name: dict(zip(_COLUMNS_2, row, strict=True)) for name, row in _PAPER_2.items()}
@@ -166,11 +159,11 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
     """Return the score of table 1: means over the samples. FD, P-FD and SI pool all clips; Var and RPCC are DIM's."""
     scaled = _scale(clips)
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
-    centres = metrics.centres_of(truth, PARTS[clips.space], CLUSTERS)
+    centres = metrics.centres_of(truth, metrics.PARTS[clips.space], metrics.CLUSTERS)
 
     def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
         row: dict[str, Any] = {}
-        for part, where in PARTS[clips.space].items():
+        for part, where in metrics.PARTS[clips.space].items():
             own, person = truth[chosen][..., where], speaker[chosen][..., where]
             values = [
                 (
@@ -324,8 +317,10 @@ def collect(
     heard = [frames_of(dyad, space) for dyad in held_out]
     longest = max(len(one.motion) for one in heard)
     frames = min(FRAMES[number], longest, max(len(one) for one in learned))
-    if frames < NEEDED_FRAMES[number]:
-        raise ConfigError(f"table {number} needs clips of {NEEDED_FRAMES[number]} frames, the longest has {longest}")
+    if frames < metrics.NEEDED_FRAMES[number]:
+        raise ConfigError(
+            f"table {number} needs clips of {metrics.NEEDED_FRAMES[number]} frames, the longest has {longest}"
+        )
     rest = torch.tensor(space.neutral, dtype=torch.float32)
     faces = [np.asarray(torch.where(one.face_known[:, None], one.face, rest)) for one in heard]  # unknown: at rest
     clips = Clips(

@@ -29,6 +29,14 @@ from scipy.spatial.distance import cdist
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 
+# Of the tables of the SFMS paper: parts of a face by motion space, clusters of the Shannon index (V-D1).
+PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
+    "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
+    "faceverse58": {"expression": slice(0, 52), "rotation": slice(52, 55)},
+    "deca56": {"expression": slice(0, 50), "rotation": slice(50, 53)},
+}
+CLUSTERS: Final = {"expression": 15, "rotation": 9}
+NEEDED_FRAMES: Final = {1: 2, 2: 51}  # FRSyn looks 49 frames either way
 _ATTRIBUTE_GROUPS: Final = ((slice(0, 15), 15.0), (slice(15, 17), 1.0), (slice(17, 25), 8.0))  # DTW is divided by
 _SID_EPS: Final = 1e-6  # inside the logarithm, as in DIM
 _STS_DT: Final = 0.1

@@ -19,7 +19,7 @@ from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.lab.corpora.reading import npy
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.intervals import estimates, quotient
-from sfms_robot.lab.evaluation.listener_tables import CLUSTERS, NEEDED_FRAMES, PARTS
+from sfms_robot.lab.evaluation.metrics import CLUSTERS, NEEDED_FRAMES, PARTS
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.tracks import read_track, resample
 
