@@ -10,9 +10,12 @@ the mean.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+
+from sfms_robot.frames import Doubles
 
 NOD_DEG: Final = (2.2, 5.0, 12.0)  # least, habit, most
 NOD_SPREAD: Final = 0.35  # of the logarithm, from nod to nod
@@ -28,6 +31,16 @@ LAUGH: Final = (0.5, 0.9)
 LAUGH_LONGER_S: Final = (0.8, 1.8)  # than its sound is the smile of a laugh
 SMILE: Final = (0.3, 0.6)
 SMILE_S: Final = (2.0, 0.4, 1.0, 6.0)  # how long one is seen: median, deviation of its logarithm, least, most
+# Others' smiles, and smiles that return them. A rule, not data: shares and times are of the size that studies of people
+# who smile at one another report; a face that is seen to smile is answered, a person who smiles more is answered more.
+SMILES_A_MINUTE: Final = (0.2, 2.0)  # of others, from person to person, evenly over the logarithm
+THEIR_SMILE: Final = (0.4, 0.9)
+RETURNED: Final = 0.45  # share of others' smiles
+RETURN_S: Final = (0.7, 0.3, 0.4, 1.2)  # from their onset to ours: median, deviation of its logarithm, least, most
+RETURN_SIZE: Final = 0.6  # of theirs
+RETURN_ENDS_S: Final = 0.5  # after theirs
+# Shares followed by a smile: others' laughs, own "mm-hm" and nods.
+SMILES_AFTER: Final[Mapping[str, float]] = {"laugh": 0.6, "mm_hm": 0.2, "nod": 0.06}
 MM_HM: Final = (0.25, 0.45)
 BROW_RAISE: Final = (0.2, 0.5)
 BROW_STRETCH: Final = (0.7, 1.3)  # of the recorded length
@@ -36,6 +49,33 @@ BLINK: Final = ((0.55, 0.8), (0.85, 1.0))  # slight ones, others
 ASIDE_MEAN_S, ASIDE_LEAST_S = 0.86, 0.16
 ASIDE_DEG: Final = ((0.0, 0.25, 0.5, 0.75, 0.9, 1.0), (5.5, 6.9, 10.3, 13.9, 17.9, 20.0))  # quantiles
 SIDEWAYS, UP = 0.75, 0.75  # shares of looks away: rather sideways than not, rather up than down
+
+
+def smile_s(rng: np.random.Generator) -> float:
+    """Return for how long a smile is seen."""
+    return _log_normal(SMILE_S, rng)
+
+
+def others_smiles(duration_s: float, rng: np.random.Generator) -> Doubles:
+    """Return smiles (K, 3) of another person: start, end [s], size."""
+    least, most = np.log(SMILES_A_MINUTE)
+    count = rng.poisson(math.exp(rng.uniform(least, most)) * duration_s / 60)
+    start_s = np.sort(rng.uniform(0, duration_s, count))
+    smiles = [(start, start + smile_s(rng), rng.uniform(*THEIR_SMILE)) for start in start_s.tolist()]
+    apart = [one for one, before in zip(smiles, [(0.0, -1.0, 0.0), *smiles], strict=False) if one[0] > before[1] + 1.0]
+    return np.array(apart, np.float64).reshape(-1, 3)
+
+
+def returned(smiles: Doubles, rng: np.random.Generator) -> Doubles:
+    """Return the smiles (L, 3) that answer those of another person (K, 3): start, end [s], size."""
+    begins = smiles[:, 0] + [_log_normal(RETURN_S, rng) for _ in smiles]
+    answers = np.stack([begins, smiles[:, 1] + RETURN_ENDS_S, RETURN_SIZE * smiles[:, 2]], axis=1)
+    return np.asarray(answers[rng.random(len(smiles)) < RETURNED], np.float64)
+
+
+def _log_normal(shape: tuple[float, float, float, float], rng: np.random.Generator) -> float:
+    median_s, deviation, least_s, most_s = shape
+    return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
 
 
 def swings(length_s: float, pace_hz: float) -> tuple[int, float]:

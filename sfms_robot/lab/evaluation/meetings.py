@@ -39,10 +39,10 @@ from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, mos
 from sfms_robot.lab.learning.events.event_trainer import (
     FLOOR,
     GAZE,
-    NOD,
     OTHERS,
     OWN_NODS,
     PHASE,
+    STUDY,
     Logistic,
     inputs,
     meeting_scene,
@@ -384,7 +384,7 @@ class ReferenceHazard:
     def of(cls, people: Sequence[MeetingPerson]) -> Self:
         """Fit on these people; takes some seconds for a hundred meetings."""
         taught = [student(person, np.random.default_rng(0)) for person in people]
-        return cls(teach(taught, "nod", NOD), teach(map(muted, taught), "nod", _SILENT))
+        return cls(teach(taught, "nod", STUDY), teach(map(muted, taught), "nod", _SILENT))
 
     def scores(self, person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
         """Return (frames,) each: with the own speech, without it, and without it while the others are a minute off."""
@@ -393,7 +393,7 @@ class ReferenceHazard:
         other = alone.copy()
         other[:, : len(HEARD)] = np.roll(alone[:, : len(HEARD)], round(SHIFT_S / STEP_S), axis=0)
         by_step = (
-            self.speaking.log_odds(inputs(heard, NOD)),
+            self.speaking.log_odds(inputs(heard, STUDY)),
             self.silent.log_odds(inputs(alone, _SILENT)),
             self.silent.log_odds(inputs(other, _SILENT)),
         )

@@ -38,6 +38,7 @@ from sfms_robot.listeners.events.evidence import (
     NODS_APART,
     OPENING,
     PITCH,
+    SMILES_APART,
     STANDS_OUT,
     SWAY,
     WINDOW,
@@ -80,15 +81,16 @@ class Scene:
     Attributes:
         speaks: (N, P).
         looks: (N, P) each looks at oneself (1) or not (0); NaN: unknown. The first column means nothing.
-        laughs, smiles: (N,) one of the others does.
+        laughs: (N,) one of the others does.
         nods: (N,) one of the others begins to.
+        smiles: (N,) how large the smile of one of the others is; 0: none.
     """
 
     speaks: Bools
     looks: Doubles
     laughs: Bools
     nods: Bools
-    smiles: Bools
+    smiles: Doubles
 
 
 def heard_in(scene: Scene) -> Doubles:
@@ -115,13 +117,14 @@ def heard_in(scene: Scene) -> Doubles:
         "floor_s": np.where(another, (index - held) * FRAME_S, np.nan),
         "holder_silence_s": np.where(another, (index - spoke[index, np.maximum(holder, 0)]) * FRAME_S, np.nan),
         "own_voice_s": (index - spoke[:, MINE]) * FRAME_S,
+        "own_voice_known": np.isfinite(spoke[:, MINE]),
         "gaze_known": known,
         "looked_at": looked,
         "looked_at_s": np.where(looked, (index - began) * FRAME_S, np.nan),
         "looked_at_silence_s": np.where(looked, silence, np.nan),
         "laugh_s": _since(scene.laughs),
         "others_nod_s": _since(scene.nods),
-        "others_smile_s": _since(scene.smiles),
+        **_smiles_in(scene.smiles),
     }
     return np.stack([np.asarray(columns[name], np.float64) for name in HEARD], axis=1)
 
@@ -151,6 +154,17 @@ def _since(happens: Bools) -> Doubles:
     return np.asarray((index - newest) * FRAME_S, np.float64)
 
 
+def _smiles_in(smiles: Doubles) -> dict[str, Doubles]:
+    """Return (N,) seconds since the newest smile began, and its size so far; breaks of a second are none."""
+    index, at = np.arange(len(smiles)), np.flatnonzero(smiles > 0)
+    first = at[np.diff(at, prepend=-np.inf) > SMILES_APART]
+    newest = np.searchsorted(first, index, side="right") - 1
+    begun, size = np.r_[first, -np.inf][newest], np.zeros(len(smiles))
+    for start, end in zip(first.tolist(), [*first.tolist()[1:], len(smiles)], strict=True):
+        size[start:end] = np.maximum.accumulate(smiles[start:end])
+    return {"others_smile_s": (index - begun) * FRAME_S, "others_smile": size}
+
+
 def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
     """Return the holder of the floor (N,), -1 for none yet, and since which frame."""
     frames, people = speaks.shape
@@ -163,15 +177,15 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
     return holder, np.maximum.accumulate(np.where(changed, index, 0))
 
 
-def signs_in(faces: Sequence[FaceFrame | None]) -> Bools:
-    """Return nods, smiles, laughs and moving mouth (N, 4) of a recording: `read_signs` of all frames at once."""
+def signs_in(faces: Sequence[FaceFrame | None]) -> Doubles:
+    """Return nods, sizes of smiles, laughs, moving mouth (N, 4) of a recording: `read_signs` of all frames at once."""
     channels = np.full((len(faces), 4), np.nan)
     known = [index for index, face in enumerate(faces) if face is not None]
     motion = np.array([face.motion for face in faces if face is not None], np.float64).reshape(-1, MOTION_DIM)
     finite = np.isfinite(motion).all(axis=1)
     if len(known):
         channels[np.array(known)[finite]] = motion[finite][:, [PITCH, *CORNERS, JAW]]
-    pitch_rad, found = np.full(len(faces), np.nan), np.zeros((len(faces), 4), bool)
+    pitch_rad, found = np.full(len(faces), np.nan), np.zeros((len(faces), 4))
     smoothed, neutral, held, jaw, opening = None, None, 0, 0.0, 0.0
     for index, (pitch, left, right, open_) in enumerate(channels.tolist()):
         if pitch != pitch:  # NaN: no face
@@ -181,7 +195,7 @@ def signs_in(faces: Sequence[FaceFrame | None]) -> Bools:
         over, neutral, held = smile_over((left + right) / 2, neutral, held)
         jaw, opening = jaw_opening(open_, jaw, opening)
         smiles, moves = held >= HELD_FRAMES, opening > OPENING
-        found[index, 1:] = smiles, smiles and over > BEAM and moves, moves
+        found[index, 1:] = over if smiles else 0.0, smiles and over > BEAM and moves, moves
     nodded, sway = -NODS_APART, 0.0
     swings = np.maximum(_swings_in(pitch_rad), _swings_in(-pitch_rad)).tolist()
     for index in np.flatnonzero(~np.isnan(pitch_rad)).tolist():
@@ -208,6 +222,7 @@ def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") ->
     memory = SenseMemory(addressed=addressed)
     speaks, looks = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan)
     nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
+    nods, laughs = nods > 0, laughs > 0
     first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then
     speaks[first:, 1] = phase.hear(np.array([energy_db(frame.audio) for frame in speaker[first:]]))
     for index, frame in enumerate(speaker):
@@ -289,11 +304,9 @@ def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
     """
     nothing = np.full((len(heard), len(DONE)), np.nan)
     most = _chances(model, heard, nothing, calmness, _most_by_doing(model, calmness), _MARGIN)
-    listening = _listening(heard)
     for at, kind in enumerate(model.bank.kinds):
         most[:, at] *= calmness.per_minute(kind) != 0
-        if kind not in ALWAYS:
-            most[~listening, at] = 0.0
+        most[~_answers(kind, heard), at] = 0.0
     return most
 
 
@@ -340,6 +353,16 @@ def _listening(heard: Doubles) -> Bools:
     return np.asarray(spoken & (heard[:, AT["silence_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0))
 
 
+def _answers(kind: str, heard: Doubles) -> Bools:
+    """Return (M,) whether a kind may begin, by what the others do."""
+    if kind in ALWAYS:
+        return np.ones(len(heard), bool)
+    listening = _listening(heard)
+    if kind == "smile":
+        listening |= (heard[:, AT["others_smile_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0)
+    return listening
+
+
 def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now_s: Doubles) -> dict[str, Bools]:
     """Return (M,) by kind whether it may begin, by listening and by the events under way."""
     under_way = {}
@@ -347,8 +370,7 @@ def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now
         newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
         lasts_until_s = np.where(away, np.inf, 0.0) if kind == "gaze_shift" else np.maximum.accumulate(spans[:, 1])
         under_way[kind] = (newest >= 0) & (np.r_[lasts_until_s, 0.0][newest] > now_s)
-    listening = _listening(heard)
     return {
-        kind: ~np.any([under_way[other] for other in EXCLUDES[kind]], axis=0) & (listening | (kind in ALWAYS))
+        kind: ~np.any([under_way[other] for other in EXCLUDES[kind]], axis=0) & _answers(kind, heard)
         for kind in EVENT_KINDS
     }

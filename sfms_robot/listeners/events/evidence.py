@@ -46,9 +46,10 @@ HEARD: Final = (
     "phrase_s", "silence_s", "last_phrase_s",  # of all others together; the phrase only while it lasts
     "one_speaks", "several_speak",
     "floor_mine", "floor_s", "holder_silence_s",  # since the floor changed hands, if it is another's
-    "own_voice_s",  # since the newest own voice
+    "own_voice_s", "own_voice_known",  # since the newest own voice; whether there has been any
     "gaze_known", "looked_at", "looked_at_s", "looked_at_silence_s",  # the last two while looked at
-    "laugh_s", "others_nod_s", "others_smile_s",  # since the newest; of a nod since it began
+    "laugh_s", "others_nod_s", "others_smile_s",  # since the newest; of a nod and a smile since it began
+    "others_smile",  # size of that smile
 )  # fmt: skip
 # Of oneself: seconds since the newest one began or ended, but for the last three.
 DONE: Final = (
@@ -59,10 +60,21 @@ DONE: Final = (
 )  # fmt: skip
 EVIDENCE: Final = HEARD + DONE
 NUMBERS: Final = frozenset(
-    ("one_speaks", "several_speak", "floor_mine", "gaze_known", "looked_at", "root_nods_30s", "log_rate")
+    (
+        "one_speaks",
+        "several_speak",
+        "floor_mine",
+        "own_voice_known",
+        "gaze_known",
+        "looked_at",
+        "others_smile",
+        "root_nods_30s",
+        "log_rate",
+    )
 )
 AT: Final[Mapping[str, int]] = {name: index for index, name in enumerate(EVIDENCE)}
 FLOOR_FRAMES: Final = 25  # a phrase this long takes the floor
+SMILES_APART: Final = 25  # frames: a smile that is back before is the same one
 COUNTED_S: Final = 30.0
 REMEMBERED_S: Final = 64.0  # after it what was done is long ago
 EPS_S: Final = 1e-6
@@ -76,14 +88,15 @@ class Instant:
 
     Attributes:
         speaks, looks: (P,) each speaks; each looks at oneself, NaN: unknown.
-        laughs, nods, smiles: one of the others does, or begins to nod.
+        laughs, nods: one of the others does, or begins to nod.
+        smiles: how large the smile of one of the others is (0..1); 0: none smiles.
     """
 
     speaks: tuple[bool, ...]
     looks: tuple[float, ...]
     laughs: bool = False
     nods: bool = False
-    smiles: bool = False
+    smiles: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +110,7 @@ class Hearing:
         holder, held: of the floor, and since which frame.
         looked: since which frame one is looked at, None while not.
         laughed, nodded, smiled: newest frames.
+        smile, began: size and first frame of the newest smile.
     """
 
     frame: int
@@ -109,6 +123,8 @@ class Hearing:
     laughed: float = -math.inf
     nodded: float = -math.inf
     smiled: float = -math.inf
+    smile: float = 0.0
+    began: float = -math.inf
 
     @property
     def own_voice_s(self) -> float:
@@ -141,11 +157,16 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
     looked: int | None = None
     if any(look == 1 for look in counts):
         looked = now if before.looked is None else before.looked
+    smile, began = before.smile, before.began
+    if instant.smiles > 0:
+        new = now - before.smiled > SMILES_APART
+        smile, began = (instant.smiles, now) if new else (max(smile, instant.smiles), began)
     after = Hearing(
         frame=now + 1, voices=voices, each=each, spoke=spoke, holder=holder, held=held, looked=looked,
         laughed=now if instant.laughs else before.laughed,
         nodded=now if instant.nods else before.nodded,
-        smiled=now if instant.smiles else before.smiled,
+        smiled=now if instant.smiles > 0 else before.smiled,
+        smile=smile, began=began,
     )  # fmt: skip
     phrase_s, silence_s, last_s = voices.times_s
     another = holder > MINE
@@ -155,12 +176,13 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
         float(holder == MINE),
         (now - held) * FRAME_S if another else math.nan,
         (now - spoke[holder]) * FRAME_S if another else math.nan,
-        after.own_voice_s,
+        after.own_voice_s, float(after.own_voice_s < math.inf),
         float(any(look == look for look in counts)),
         float(looked is not None),
         math.nan if looked is None else (now - looked) * FRAME_S,
         math.nan if looked is None else silence_s,
-        (now - after.laughed) * FRAME_S, (now - after.nodded) * FRAME_S, (now - after.smiled) * FRAME_S,
+        (now - after.laughed) * FRAME_S, (now - after.nodded) * FRAME_S, (now - began) * FRAME_S,
+        smile,
     )  # fmt: skip
     return np.array(row), after
 
@@ -239,10 +261,12 @@ PITCH: Final = CHANNEL_INDEX["pitch"]
 
 @dataclass(frozen=True)
 class Signs:
-    """The signs of one frame: a nod has just been seen; the person smiles, laughs; the mouth moves as in speech."""
+    """The signs of one frame: a nod has just been seen; how large the person's smile is (0: none); they laugh; the
+    mouth moves as in speech.
+    """
 
     nods: bool = False
-    smiles: bool = False
+    smiles: float = 0.0
     laughs: bool = False
     mouth_moves: bool = False
 
@@ -280,7 +304,7 @@ def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceSta
     jaw, opening = jaw_opening(jaw, state.jaw, state.opening)
     smiles, moves = held >= HELD_FRAMES, opening > OPENING
     after = changed(state, frame=state.frame + 1, neutral=neutral, held=held, jaw=jaw, opening=opening)
-    return Signs(nods, smiles, smiles and over > BEAM and moves, moves), after
+    return Signs(nods, over if smiles else 0.0, smiles and over > BEAM and moves, moves), after
 
 
 def _within(value: float) -> float:

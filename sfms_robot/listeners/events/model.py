@@ -9,7 +9,8 @@ number that multiplies it or the values of a curve at its knots, between which i
 
 Hazards are drawn every 80 ms. An event begins `LEAD_FRAMES` after it is decided, so that a plan made every fourth frame
 still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or a tilt; a head does
-not nod, laugh or say "mm-hm" while it speaks, or when no other person has spoken for two seconds.
+not nod, laugh or say "mm-hm" while it speaks, or when no other person has spoken for two seconds. A smile that is
+returned takes its size from theirs.
 
 Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
 place; hazards are finite whatever the input; more of a `Calmness` rate is never less of its hazard.
@@ -43,7 +44,7 @@ from sfms_robot.listeners.events.evidence import (
     sense,
 )
 from sfms_robot.listeners.stream_rng import Use, uniforms
-from sfms_robot.signals.event_sizes import SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
+from sfms_robot.signals.event_sizes import RETURN_SIZE, SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 from sfms_robot.signals.phase import log_time
 
 STEP_FRAMES: Final = 2
@@ -184,7 +185,7 @@ class HazardBank:
 
 LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
 LISTENING_S: Final = 2.0  # since another person spoke
-_LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s")
+_LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s", "others_smile_s")
 AT_PERSON: Final = (0.0, 0.0)
 # While one event of a group is under way no other of it begins.
 GROUPS: Final = (
@@ -308,6 +309,9 @@ class EventModel:
             hazards[kind] = probability / STEP_S
             if draws[at] < probability and not any(event.kind in EXCLUDES[kind] for event in events):
                 event = self.shaped(kind, sensed.frame, memory.seed)
+                their_s, size = (sensed.heard.item(AT[name]) for name in ("others_smile_s", "others_smile"))
+                if kind == "smile" and their_s <= LISTENING_S:
+                    event = changed(event, size=max(RETURN_SIZE * size, self.tables.shapes[kind].size[0]))
                 events.append(
                     changed(
                         event, probability=probability, draw=float(draws[at]), evidence=self.bank.largest(terms, kind)
@@ -373,10 +377,13 @@ def _begin_s(frame: int) -> float:
 
 def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) -> frozenset[str]:
     """Return the kinds that may begin at this moment."""
-    silence_s, own_s, phrase_s, last_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
+    silence_s, own_s, phrase_s, last_s, smile_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
+    possible = ALWAYS if not listening else frozenset(EVENT_KINDS)
+    if smile_s <= LISTENING_S and own_s > 0:  # a smile is returned to a person who is silent too
+        possible |= {"smile"}
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
     shift = last_shift(history)
     if shift is not None and (shift.target_rad != AT_PERSON or shift.start_s > now_s):
         under_way.add("gaze_shift")
-    return frozenset(kind for kind in EVENT_KINDS if (listening or kind in ALWAYS) and not EXCLUDES[kind] & under_way)
+    return frozenset(kind for kind in possible if not EXCLUDES[kind] & under_way)

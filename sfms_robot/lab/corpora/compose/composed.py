@@ -51,6 +51,7 @@ from sfms_robot.lab.corpora.compose.voices import (
     split_voices,
 )
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)
@@ -313,9 +314,12 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
         active(person.others_backchannels, stretch),
         active(person.nods, stretch),
     )
-    audio, face = speaker_of(stretch, voice, material.motions, rng, material.laughter)
-    acted = act(score, material.motions, rng)
-    faced = np.isfinite(face).all(axis=1)
+    smiling = rng.spawn(1)[0]
+    smiles = sizes.others_smiles(frames * FRAME_S, smiling)
+    audio, face = speaker_of(stretch, voice, material.motions, rng, material.laughter, smiles)
+    faced = np.asarray(np.isfinite(face).all(axis=1))
+    seen_smiles = smiles[faced[(smiles[:, 0] * FRAME_HZ).astype(int)]]
+    acted = act(replace(score, smiles=sizes.returned(seen_smiles, smiling)), material.motions, rng)
     return Dyad(
         name=stretch.name,
         audio=audio,
@@ -347,8 +351,12 @@ def speaker_of(
     motions: Motions,
     rng: np.random.Generator,
     laughter: Sequence[Floats] = (),
+    smiles: Doubles | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen."""
+    """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen.
+
+    `smiles`: (K, 3) start, end [s] and size of theirs, besides those of laughs.
+    """
     person, frames = stretch.person, stretch.frames
     said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
     speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
@@ -357,7 +365,7 @@ def speaker_of(
     if rng.random() < _FACELESS:
         return audio, np.full((frames, MOTION_DIM), np.nan, np.float32)
     moving = mouth_over(speech, motions.talk, frames, rng) if mouth is None else mouth
-    return audio, seen(speaker_motion(moving, motions, rng, attention_of(stretch), laughs, nods), rng)
+    return audio, seen(speaker_motion(moving, motions, rng, attention_of(stretch), laughs, nods, smiles), rng)
 
 
 def attention_of(stretch: Stretch) -> Floats:

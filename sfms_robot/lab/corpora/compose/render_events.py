@@ -70,6 +70,7 @@ class Score:
         gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". How
             far and to which side follows `signals.event_sizes`: a robot does not sit at their table.
         shared_laughs: laughs of the others.
+        smiles: the listener's answers to others' smiles, (K, 3): start, end, size.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
         mouth: (frames, 52) that belongs to the listener's own recorded voice, or None.
     """
@@ -84,6 +85,7 @@ class Score:
     mm_hms: Doubles = field(default_factory=_spans)
     gaze: tuple[tuple[float, float, str], ...] = ()
     shared_laughs: Doubles = field(default_factory=_spans)
+    smiles: Doubles = field(default_factory=lambda: _nothing(0, 3))
     asked: Doubles = field(default_factory=lambda: _nothing(0))
     ends: Doubles = field(default_factory=lambda: _nothing(0))
     mouth: Floats | None = None
@@ -128,10 +130,12 @@ def speaker_motion(
     attention: Floats | None = None,
     laughs: Doubles | None = None,
     nods: Doubles | None = None,
+    smiles: Doubles | None = None,
 ) -> Floats:
     """Return motion (N, 58) of a person who speaks with this mouth (N, 52); head and the rest of the face are recorded.
 
     Args:
+        smiles: (K, 3) start, end [s], size.
         attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where anything may be.
         laughs, nods: (K, 2) seconds.
     """
@@ -142,6 +146,8 @@ def speaker_motion(
     shapes += np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
     for start, end in _spans() if laughs is None else laughs:
         _lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
+    for start, end, size in () if smiles is None else smiles.tolist():
+        _lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
     known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
     state = gaze_kinematics.start(int(rng.integers(2**31)))
@@ -339,8 +345,9 @@ def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
 
 
 def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """Lay smiles: own laughs always, laughs of others often, backchannels and nods seldom; only a laugh opens the jaw.
+    """Lay smiles: own laughs and returned smiles always, laughs of others often, backchannels and nods seldom.
 
+    Only a laugh opens the jaw.
     A smile that would begin during another one is left out.
     """
     wanted = [
@@ -348,14 +355,14 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         for a, b in score.laughs
     ]
     wanted += [
-        ("smile", a, max(b - a, smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
+        ("smile", a, max(b - a, sizes.smile_s(rng)), rng.uniform(0.35, 0.7), 0.2)
         for a, b in score.shared_laughs
-        if rng.random() < 0.6
+        if rng.random() < sizes.SMILES_AFTER["laugh"]
     ]
-    wanted += [
-        ("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.backchannels if rng.random() < 0.3
-    ]
-    wanted += [("smile", a, smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a, _ in score.nods if rng.random() < 0.12]
+    for kind, spans in (("mm_hm", score.backchannels), ("nod", score.nods)):
+        some = [a for a, _ in spans if rng.random() < sizes.SMILES_AFTER[kind]]
+        wanted += [("smile", a, sizes.smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a in some]
+    wanted += [("smile", a + 0.2, b - a, max(size, sizes.SMILE[0]), 0.1) for a, b, size in score.smiles]
     events: list[ListenerEvent] = []
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
         if any(event.start_s - seen_s < start < event.end_s for event in events):
@@ -363,12 +370,6 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
         curve = _lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
         events.append(laid_event(kind, start - 0.2, curve, curve[:, SMILE].mean(axis=1).max()))
     return events
-
-
-def smile_s(rng: np.random.Generator) -> float:
-    """Return for how long a smile that answers something is seen."""
-    median_s, deviation, least_s, most_s = sizes.SMILE_S
-    return float(np.clip(median_s * np.exp(rng.normal(0, deviation)), least_s, most_s))
 
 
 def _lay_smile(

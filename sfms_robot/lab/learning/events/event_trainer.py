@@ -1,7 +1,7 @@
 """Fits of hazards on meetings: evidence of every step, onsets against the steps in which nothing began.
 
     nod, shake, tilt, laugh, mm_hm     as annotated
-    smile, brow_raise                  not annotated: drawn as in composed dyads, from laughs of others, own
+    smile, brow_raise                  not annotated: drawn as in composed dyads, from smiles and laughs of others, own
                                        "mm-hm" and nods, and from questions asked; a reaction late
     gaze_shift                         a look away from a person who speaks or has the floor, where annotated
 
@@ -31,8 +31,9 @@ from sfms_robot.lab.evaluation.phrase_timing import (
     ratio_of,
 )
 from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in, done_at, heard_in, unspoken
-from sfms_robot.listeners.events.evidence import AT, HEARD, NUMBERS
-from sfms_robot.listeners.events.model import STEP_FRAMES, STEP_S, Hazard
+from sfms_robot.listeners.events.evidence import AT, HEARD, MINE, NUMBERS
+from sfms_robot.listeners.events.model import LEAD_FRAMES, LISTENING_S, STEP_FRAMES, STEP_S, Hazard
+from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.phase import piecewise_linear_basis
 
 Knots = tuple[float, ...]
@@ -64,7 +65,7 @@ FLOOR: Final[Groups] = {
     "floor_s": (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
     "holder_silence_s": _SILENCE,
 }
-OWN_VOICE: Final[Groups] = {"own_voice_s": _LONG}
+OWN_VOICE: Final[Groups] = {"own_voice_s": _LONG, "own_voice_known": ()}
 OWN_NODS: Final[Groups] = {"nod_end_s": _LONG, "root_nods_30s": (), "log_rate": ()}
 GAZE: Final[Groups] = {
     "gaze_known": (),
@@ -73,10 +74,11 @@ GAZE: Final[Groups] = {
     "looked_at_silence_s": (0.0, 0.24, 0.6, 1.3, 4.0),
 }
 OTHERS: Final[Groups] = {"laugh_s": _LAUGH, "others_nod_s": (0.0, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)}
-NOD: Final[Groups] = {**PHASE, **FLOOR, **OWN_VOICE, **OWN_NODS, **GAZE, **OTHERS}  # 89 inputs: the study's
+STUDY: Final[Groups] = {**PHASE, **FLOOR, "own_voice_s": _LONG, **OWN_NODS, **GAZE, **OTHERS}  # 89 inputs
 STUDY_RIDGE, RIDGE = 10.0, 3.0  # the second, and what is added below, did better on validation
+THEIR_SMILE: Final[Groups] = {"others_smile_s": (0.0, 0.12, 0.24, 0.4, 0.8, 1.6, 3.2)}
 GROUPS: Final[Mapping[str, Groups]] = {
-    "nod": {**NOD, "mm_hm_s": _WHILE, "laugh_end_s": _WHILE},
+    "nod": {**STUDY, **OWN_VOICE, "mm_hm_s": _WHILE, "laugh_end_s": _WHILE},
     "mm_hm": {**PHASE, **FLOOR, **OWN_VOICE, "nod_s": _SHORT, "mm_hm_s": _LONG, **GAZE, **OTHERS},
     "laugh": {
         **PHASE,
@@ -87,7 +89,7 @@ GROUPS: Final[Mapping[str, Groups]] = {
         "laugh_end_s": (*_LAUGH, 16.0, 32.0, 64.0),
         "nod_s": _WHILE,
     },
-    "smile": {**PHASE, **OWN_VOICE, "nod_s": _SHORT, "mm_hm_s": _SHORT, "laugh_s": _LAUGH},
+    "smile": {**PHASE, **OWN_VOICE, "nod_s": _SHORT, "mm_hm_s": _SHORT, "laugh_s": _LAUGH, **THEIR_SMILE},
     "brow_raise": {**PHASE, **OWN_VOICE, "nod_s": _SHORT},
     "shake": {"silence_s": _SILENCE, "one_speaks": (), "several_speak": (), **OWN_VOICE, "shake_end_s": _LONG, **GAZE},
     "tilt": {"silence_s": _SILENCE, "one_speaks": (), "several_speak": (), **OWN_VOICE, "tilt_end_s": _LONG, **GAZE},
@@ -97,7 +99,8 @@ GROUPS: Final[Mapping[str, Groups]] = {
 
 LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
 REACTION_S: Final = 0.3  # of a smile to a laugh, of brows to a question
-SMILES: Final = {"laugh": 0.6, "mm_hm": 0.3, "nod": 0.12}  # shares followed by a smile: others' laughs, own the rest
+SEEN_S: Final = 0.68  # from the onset of another's smile until `evidence` has it; before it none can be returned
+LEAD_S: Final = LEAD_FRAMES * FRAME_S  # from a decision until its event begins
 BROWS: Final = {"question": 0.5, "nod": 0.15}
 SMILE_S, BROW_S = 1.6, 0.8
 
@@ -123,15 +126,34 @@ class EventStudent:
 def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     scene, listening = meeting_scene(person)
-    spans = spans_of(person, rng)
+    smiles = sizes.others_smiles(len(listening) * FRAME_S, rng.spawn(1)[0])
+    scene = replace(scene, smiles=_seen_smiles(np.concatenate([smiles, _laughing(person)]), len(listening)))
+    spans = spans_of(person, rng, smiles)
     nods = begun_in(spans["nod"], listening)
-    lessons = {kind: lesson(each, listening) for kind, each in spans.items()}
+    smiled = (heard_in(scene)[:, AT["others_smile_s"]] <= LISTENING_S) & ~scene.speaks[:, MINE]
+    may = {"smile": listening | smiled}
+    lessons = {kind: lesson(each, may.get(kind, listening)) for kind, each in spans.items()}
     own, aside = {**spans, "nod": nods}, None
     if person.gaze is not None:
         own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
     ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
     rows = np.concatenate([heard_in(scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
     return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
+
+
+def _laughing(person: MeetingPerson) -> Doubles:
+    """Return the smiles (K, 3) of others' laughs, as `render_events.speaker_motion` lays them."""
+    laughs = person.others_laughs
+    return np.stack([laughs[:, 0] - 0.2, laughs[:, 1] + 1.1, np.full(len(laughs), np.mean(sizes.LAUGH))], axis=1)
+
+
+def _seen_smiles(smiles: Doubles, frames: int) -> Doubles:
+    """Return (frames,) the sizes of smiles (K, 3) from when they are seen until they end."""
+    out = np.zeros(frames)
+    for start, end, size in smiles.tolist():
+        first = max(0, round((start + SEEN_S) * FRAME_HZ))
+        out[first : max(first + 1, round(end * FRAME_HZ))] = size
+    return out
 
 
 def muted(one: EventStudent) -> EventStudent:
@@ -184,10 +206,17 @@ def steps_of(mask: Bools) -> Bools:
     return before[: len(mask) // STEP_FRAMES]
 
 
-def spans_of(person: MeetingPerson, rng: np.random.Generator) -> dict[str, Doubles]:
-    """Return spans (K, 2) of all events of the person; those that were not annotated are drawn."""
-    others, nods = person.others_laughs[:, 0], person.nods[:, 0]
-    smiles = _some(others, SMILES["laugh"], rng), _some(person.mm_hms[:, 0], SMILES["mm_hm"], rng)
+def spans_of(person: MeetingPerson, rng: np.random.Generator, others_smiles: Doubles) -> dict[str, Doubles]:
+    """Return spans (K, 2) of all events of the person; those that were not annotated are drawn.
+
+    `others_smiles`: (K, 3) start, end [s], size. One that is returned before it can be seen is returned then.
+    """
+    nods, after = person.nods[:, 0], sizes.SMILES_AFTER
+    smiles = [_some(person.others_laughs[:, 0], after["laugh"], rng) + REACTION_S]
+    smiles += [_some(person.mm_hms[:, 0], after["mm_hm"], rng), _some(nods, after["nod"], rng)]
+    for smile in others_smiles:
+        answers = sizes.returned(smile[None], rng)
+        smiles.append(np.maximum(answers[:, 0] - LEAD_S, smile[0] + SEEN_S + STEP_S))
     brows = _some(person.asked, BROWS["question"], rng)
     return {
         "nod": person.nods,
@@ -195,7 +224,7 @@ def spans_of(person: MeetingPerson, rng: np.random.Generator) -> dict[str, Doubl
         "tilt": person.tilts,
         "laugh": person.laughs,
         "mm_hm": person.mm_hms,
-        "smile": _spans(np.r_[smiles[0] + REACTION_S, smiles[1], _some(nods, SMILES["nod"], rng)], SMILE_S),
+        "smile": _spans(np.concatenate(smiles), SMILE_S),
         "brow_raise": _spans(np.r_[brows + REACTION_S, _some(nods, BROWS["nod"], rng)], BROW_S),
     }
 
@@ -277,7 +306,7 @@ def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
     at = np.floor(spans_by(person.others_nods)[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
     nods[at[(at >= 0) & (at < whole.frames)]] = True
     laughs = active(person.others_laughs, whole)
-    scene = Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros_like(laughs))
+    scene = Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros(whole.frames))
     return scene, listening_in(person, whole)
 
 

@@ -21,7 +21,6 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
-from sfms_robot.lab.corpora.compose.render_events import smile_s
 from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
 from sfms_robot.lab.evaluation.meetings import decisions, tables
 from sfms_robot.lab.evaluation.rollout import tracked
@@ -30,8 +29,8 @@ from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,
     LEARNED,
-    NOD,
     RIDGE,
+    STUDY,
     STUDY_RIDGE,
     EventStudent,
     Groups,
@@ -86,10 +85,12 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
     for kind in LEARNED:
         if not any(len(one.lessons[kind].onsets) for one in taught if kind in one.lessons):
             raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
-    groups, ridge = ({**GROUPS, "nod": NOD}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
+    groups, ridge = ({**GROUPS, "nod": STUDY}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
     hazards = {}
+    silent, judged_silent = ([event_trainer.muted(one) for one in some] for some in (taught, judged))
+    examples = taught if all_series else [*taught, *silent]  # each with and without the own voice
     for kind in tracked(LEARNED, "kinds of events"):
-        learned = event_trainer.teach(taught, kind, groups[kind], seed, ridge)
+        learned = event_trainer.teach(examples, kind, groups[kind], seed, ridge)
         hazards[kind] = hazard(learned, groups[kind], FROM[kind], event_trainer.rate_per_minute(taught, kind))
     motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
     hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
@@ -101,7 +102,7 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
         "out": None if out is None else str(out),
         "people": {name: len({person.participant for person in parts[name]}) for name in ("train", "validation")},
         "listening_minutes": round(sum(float(one.listening.sum()) for one in taught) / 25 / 60, 1),
-        "kinds": {kind: _judged(found.hazards[kind], kind, taught, judged) for kind in LEARNED},
+        "kinds": {kind: _judged(found.hazards[kind], kind, taught, judged, judged_silent) for kind in LEARNED},
         "nod": found.hazards["nod"].model_dump(mode="json"),
     }
     if judged:
@@ -124,8 +125,17 @@ def save(file: Path, found: EventTables) -> None:
         raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def _judged(given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Sequence[EventStudent]) -> dict[str, Any]:
-    """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval."""
+def _judged(
+    given: Hazard,
+    kind: str,
+    taught: Sequence[EventStudent],
+    judged: Sequence[EventStudent],
+    silent: Sequence[EventStudent],
+) -> dict[str, Any]:
+    """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval.
+
+    `silent`: those people without their own voice among the evidence, as a head hears that never speaks.
+    """
     lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
     found: dict[str, Any] = {
         "onsets": sum(len(one.onsets) for one in lessons),
@@ -135,15 +145,15 @@ def _judged(given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Se
     if not judged:
         return found
 
-    def ranked(*left_out: str) -> Doubles:
+    def ranked(people: Sequence[EventStudent], *left_out: str) -> Doubles:
         def score(evidence: Doubles) -> Doubles:
             rows = evidence.copy()
             rows[:, [AT[name] for name in left_out]] = np.nan
             return _log_odds(given, rows)
 
-        return event_trainer.ranked(judged, kind, score)
+        return event_trainer.ranked(people, kind, score)
 
-    auc = ranked()
+    auc = ranked(judged)
     interval = np.full(2, np.nan)
     if len(auc) > 1:
         interval = ends(auc[np.random.default_rng(0).integers(len(auc), size=(DRAWS, len(auc)))].mean(axis=1))
@@ -151,12 +161,20 @@ def _judged(given: Hazard, kind: str, taught: Sequence[EventStudent], judged: Se
         "auc": _mean(auc), "interval": [rounded(end) for end in interval.tolist()], "people": len(auc),
         "study_auc": STUDY_AUC.get(kind),
     }  # fmt: skip
+    found |= {
+        "auc_without_own_voice": _mean(ranked(silent)),
+        "expected_per_minute": _expected(given, kind, judged),
+        "expected_per_minute_without_own_voice": _expected(given, kind, silent),
+    }
     if kind == "nod":
-        found |= {
-            "auc_without_own_voice": _mean(ranked("own_voice_s", "floor_mine")),
-            "auc_without_own_nods": _mean(ranked("nod_end_s", "root_nods_30s", "log_rate")),
-        }
+        found["auc_without_own_nods"] = _mean(ranked(judged, "nod_end_s", "root_nods_30s", "log_rate"))
     return found
+
+
+def _expected(given: Hazard, kind: str, people: Sequence[EventStudent]) -> float | None:
+    """Return the events a minute that a hazard gives in the time of these people in which they may happen."""
+    rows = [one.evidence[one.lessons[kind].may] for one in people if kind in one.lessons]
+    return rounded(float(expit(_log_odds(given, np.concatenate(rows))).mean()) * 60 / STEP_S)
 
 
 def _mean(auc: Doubles) -> float | None:
@@ -196,6 +214,9 @@ def _rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             "a minute": found["per_minute"],
             "AUC on validation": found.get("auc")
             and "{:.3f} [{:.3f}, {:.3f}]".format(found["auc"], *found["interval"]),
+            "without own voice": found.get("auc_without_own_voice"),
+            "expected a minute": found.get("expected_per_minute"),
+            "silent head": found.get("expected_per_minute_without_own_voice"),
             "study": found.get("study_auc"),
         }
         for kind, found in figures["kinds"].items()
@@ -228,7 +249,7 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
     laughs_s += rng.uniform(*sizes.LAUGH_LONGER_S, len(laughs_s))
     laugh, smile = (
         Shape(duration_s=_quantiles(_smiles_s(seen_s, motions, rng)), size=size)
-        for seen_s, size in ((laughs_s, sizes.LAUGH), ((smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
+        for seen_s, size in ((laughs_s, sizes.LAUGH), ((sizes.smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
     )
     slight, whole = sizes.BLINK
     swings: dict[str, Any] = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
