@@ -33,14 +33,14 @@ SMILE: Final = (0.3, 0.6)
 SMILE_S: Final = (2.0, 0.4, 1.0, 6.0)  # how long one is seen: median, deviation of its logarithm, least, most
 # Others' smiles, and smiles that return them. A rule, not data: shares and times are of the size that studies of people
 # who smile at one another report; a face that is seen to smile is answered, a person who smiles more is answered more.
-SMILES_A_MINUTE: Final = (0.2, 2.0)  # of others, from person to person, evenly over the logarithm
+SMILES_A_MINUTE: Final = (0.2, 1.5)  # of others, from person to person, evenly over the logarithm
 THEIR_SMILE: Final = (0.4, 0.9)
 RETURNED: Final = 0.45  # share of others' smiles
 RETURN_S: Final = (0.7, 0.3, 0.4, 1.2)  # from their onset to ours: median, deviation of its logarithm, least, most
 RETURN_SIZE: Final = 0.6  # of theirs
 RETURN_ENDS_S: Final = 0.5  # after theirs
 # Shares followed by a smile: others' laughs, own "mm-hm" and nods.
-SMILES_AFTER: Final[Mapping[str, float]] = {"laugh": 0.6, "mm_hm": 0.2, "nod": 0.06}
+SMILES_AFTER: Final[Mapping[str, float]] = {"laugh": 0.6, "mm_hm": 0.18, "nod": 0.06}
 MM_HM: Final = (0.25, 0.45)
 BROW_RAISE: Final = (0.2, 0.5)
 BROW_STRETCH: Final = (0.7, 1.3)  # of the recorded length

@@ -7,7 +7,6 @@ so the figures do not depend on the number of processes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -19,7 +18,7 @@ import numpy as np
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Split
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
@@ -35,7 +34,13 @@ from sfms_robot.lab.evaluation.listener_meetings import (
 )
 from sfms_robot.lab.evaluation.robustness import voice_folders
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollout, run_in_processes, spread
-from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in, unspoken
+from sfms_robot.lab.evaluation.whole_recordings import (
+    decisions,
+    hazards_in,
+    heard_in,
+    scene_in,
+    unspoken,
+)
 from sfms_robot.lab.learning.events.event_trainer import (
     FLOOR,
     GAZE,
@@ -52,18 +57,13 @@ from sfms_robot.lab.learning.events.event_trainer import (
 )
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulListener
-from sfms_robot.listeners.events.evidence import HEARD, Sensed
+from sfms_robot.listeners.events.evidence import HEARD
 from sfms_robot.listeners.events.model import (
-    AT_PERSON,
-    LEAD_FRAMES,
     STEP_FRAMES,
     STEP_S,
-    EventMemory,
     EventModel,
-    last_shift,
 )
 from sfms_robot.listeners.registry import engine_name
-from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.ports import Listener
 from sfms_robot.signals import phase
 from sfms_robot.signals.motion_primitives import Motions, read_motions
@@ -338,39 +338,6 @@ def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Dou
 def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
     """Return hazards one frame late. A head gets its voice a frame early, which would reveal its own "mm-hm"."""
     return {kind: np.concatenate([values[:1], values[:-1]]) for kind, values in hazards_hz.items()}
-
-
-def decisions(
-    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness
-) -> list[tuple[ListenerEvent, ...]]:
-    """Return the decisions for each seed without a given history, skipping steps at which no event can begin."""
-    steps = steps_in(len(heard))
-    most = most_in(model, heard[steps], calmness)
-    found = []
-    for seed in seeds:
-        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
-        frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
-        found.append(_decided(model, heard, frames, model.start(seed, calmness)))
-    return found
-
-
-def _decided(
-    model: EventModel, heard: Doubles, frames: Sequence[int], memory: EventMemory
-) -> tuple[ListenerEvent, ...]:
-    """Decide at the end of each of `frames`, the last of which is beyond the end."""
-    found = list[ListenerEvent]()
-    at, look_back = 0, math.inf  # the frame from which on a look aside is over
-    while (frame := min(frames[at], look_back)) < len(heard):
-        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
-        found += decision.events
-        at += frame == frames[at]
-        look = last_shift(memory.done)
-        over = math.inf  # the step at which the newest look is over, if it goes aside
-        if look is not None and look.target_rad != AT_PERSON:
-            step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
-            over = step * STEP_FRAMES + STEP_FRAMES - 1
-        look_back = max(frame + STEP_FRAMES, over)
-    return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,15 @@ one way at a time; the streams of a listener differ by their seeds alone. Counte
 and its decisions, which have to stay as frequent as people's. For events that only answer a speaker, a minute is one in
 which the speaker talks or stopped less than two seconds ago. Without evidence of speech (no microphone, a mouth that
 does not move) no answer is expected.
+
+Smiles are returned (`returned_smiles`): all speakers kept from training smile four times a minute, or never, and what
+is decided for them is counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from statistics import median
@@ -21,7 +24,7 @@ import soxr
 from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
-from sfms_robot.config import find
+from sfms_robot.config import Calmness, find
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
@@ -32,19 +35,25 @@ from sfms_robot.frames import (
     FRAME_SAMPLES,
     POSE,
     SHAPES,
+    Doubles,
+    FaceFrame,
     Floats,
     SpeakerFrame,
 )
 from sfms_robot.lab.corpora.clips import Split, split_of_voice
-from sfms_robot.lab.corpora.compose.render_events import speaker_motion
+from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
 from sfms_robot.lab.corpora.compose.voices import find_voices, mouth_over
 from sfms_robot.lab.evaluation.detection import seen
+from sfms_robot.lab.evaluation.intervals import DRAWS, ends, rounded
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames
-from sfms_robot.listeners.events.model import ALWAYS
+from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in, scene_in
+from sfms_robot.listeners.events.evidence import AT
+from sfms_robot.listeners.events.model import ALWAYS, EventModel
 from sfms_robot.listeners.registry import load_listener
+from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.events import MOTION_EVENTS
-from sfms_robot.signals.motion_primitives import read_motions
+from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 Inputs = Literal["voice", "face", "both"]
 Degrade = Callable[[Floats, np.random.Generator], Floats]
@@ -81,7 +90,7 @@ def evaluate_robustness(
     tasks = [(place, inputs, number) for place in range(len(everybody)) for inputs, number in cases()]
     work = partial(_play, folder, voices, split, minutes, range(seed, seed + seeds))
     rows = run_in_processes(work, tasks, jobs, "speakers heard")
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"returned_smiles": returned_smiles(voices, speakers, minutes, range(seed, seed + seeds))}
     for kind in RANGES:
         rate_key, scatter_key = f"{kind}s_per_minute", f"{kind}s_variance_over_mean"
         values = [row[rate_key] for row in rows]
@@ -299,6 +308,86 @@ def heard_and_seen(
         face = condition.face(face, rng) if condition.face else face
     attention = condition.attention(frames) if condition.attention else np.ones(frames, np.float32)
     return speaker_frames(None if inputs == "face" else voice, face, attention=attention)
+
+
+# --- smiles that are returned ---------------------------------------------------------------------------------------
+
+THEIR_SMILES_A_MINUTE: Final = 4
+ANSWER_S: Final = 1.5  # from the onset of their smile
+SHIFT_S: Final = 60.0
+LEAST_MINUTES: Final = 3.0
+
+
+def returned_smiles(
+    voices: tuple[Path, ...], speakers: int | None, minutes: float, seeds: Sequence[int]
+) -> dict[str, Any]:
+    """Return what is decided for speakers who smile four times a minute, and for the same ones who never smile.
+
+    `answered`: share of their smiles with one of the head's within 1.5 s; `shifted`: the same with theirs moved by a
+    minute; `difference` of both, with its interval over speakers and seeds. `never_smiles_per_minute`: the head's
+    smiles with speakers who never smile; `false_per_minute`: those that follow a smile seen in their talking mouths.
+    """
+    people = [speaker for split in ("validation", "test") for speaker in _kept(voices, split)][:speakers]
+    model, motions = EventModel.load(), read_motions(data_dir("sim") / "listeners" / "motions.npz")["test"]
+    length_s, calm = 60 * max(minutes, LEAST_MINUTES), Calmness()
+    answered, rates_a_minute, false = [], [], []
+    for place, speaker in enumerate(people):
+        rng = np.random.default_rng([seeds[0], place])
+        plain = heard_and_seen(speaker, "both", CONDITIONS[0], length_s / 60, rng)
+        onsets_s, smiling = _smiling(plain, motions, rng)
+        for own in decisions(model, heard_in(scene_in(smiling)), seeds, calm):
+            begun_s = event_spans(own, "smile")[:, 0]
+            moved_s = (onsets_s + SHIFT_S) % length_s
+            answered.append([_share_followed(at_s, begun_s) for at_s in (onsets_s, moved_s)])
+        heard = heard_in(scene_in(plain))
+        seen_s = np.asarray(np.flatnonzero(heard[:, AT["others_smile_s"]] == 0) * FRAME_S, np.float64)
+        for own in decisions(model, heard, seeds, calm):
+            begun_s = event_spans(own, "smile")[:, 0]
+            rates_a_minute.append(len(begun_s) / length_s * 60)
+            false.append(_share_followed(seen_s, begun_s) * len(seen_s) / length_s * 60)
+    shares = np.array(answered)
+    drawn = shares[np.random.default_rng(0).integers(len(shares), size=(DRAWS, len(shares)))].mean(axis=1)
+    return {
+        "speakers": [speaker.name for speaker in people],
+        "minutes": length_s / 60,
+        "answered": rounded(shares[:, 0].mean()),
+        "shifted": rounded(shares[:, 1].mean()),
+        "difference": rounded((shares[:, 0] - shares[:, 1]).mean()),
+        "interval": [rounded(end) for end in ends(drawn[:, 0] - drawn[:, 1]).tolist()],
+        "never_smiles_per_minute": rounded(float(np.mean(rates_a_minute))),
+        "false_per_minute": rounded(float(np.mean(false))),
+    }
+
+
+def _kept(voices: tuple[Path, ...], split: Split) -> tuple[UnseenSpeaker, ...]:
+    """Return the speakers of a split; none where no voice is kept for it."""
+    names = {voice.name for voice in find_voices(voices)}
+    return unseen(voices, split) if any(split_of_voice(name) == split for name in names) else ()
+
+
+def _smiling(
+    frames: Sequence[SpeakerFrame], motions: Motions, rng: np.random.Generator
+) -> tuple[Doubles, list[SpeakerFrame]]:
+    """Return the onsets [s] of smiles that are laid over the faces, four a minute, and the frames with them."""
+    face = np.array([frame.face.motion for frame in frames if frame.face is not None], np.float32)
+    every_s = 60 / THEIR_SMILES_A_MINUTE
+    onsets_s: Doubles = np.arange(every_s / 2, len(face) * FRAME_S - every_s / 2, every_s)
+    onsets_s += rng.uniform(-every_s / 4, every_s / 4, len(onsets_s))
+    for start_s in onsets_s.tolist():
+        lay_smile(face[:, SHAPES], start_s, sizes.smile_s(rng), rng.uniform(*sizes.THEIR_SMILE), 0.1, motions, rng)
+    face[:, SHAPES] = face[:, SHAPES].clip(0, 1)
+    return onsets_s, [
+        replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in zip(frames, face, strict=True)
+    ]
+
+
+def _share_followed(at_s: Doubles, begun_s: Doubles) -> float:
+    """Return the share of instants within `ANSWER_S` after which something begins; 0 of none."""
+    if not len(at_s):
+        return 0.0
+    first = np.searchsorted(begun_s, at_s)
+    gaps_s = np.r_[begun_s, np.inf][first] - at_s
+    return float((gaps_s <= ANSWER_S).mean())
 
 
 # --- counts ---------------------------------------------------------------------------------------------------------

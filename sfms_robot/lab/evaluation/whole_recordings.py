@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -43,6 +44,7 @@ from sfms_robot.listeners.events.evidence import (
     SWAY,
     WINDOW,
     Addressed,
+    Sensed,
     SenseMemory,
     jaw_opening,
     looks_at_head,
@@ -54,11 +56,15 @@ from sfms_robot.listeners.events.model import (
     ALWAYS,
     AT_PERSON,
     EXCLUDES,
+    LEAD_FRAMES,
     LISTENING_S,
     STEP_FRAMES,
     STEP_S,
+    EventMemory,
     EventModel,
+    last_shift,
 )
+from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals import phase
 from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.event_sizes import SWING_S
@@ -160,7 +166,7 @@ def _smiles_in(smiles: Doubles) -> dict[str, Doubles]:
     first = at[np.diff(at, prepend=-np.inf) > SMILES_APART]
     newest = np.searchsorted(first, index, side="right") - 1
     begun, size = np.r_[first, -np.inf][newest], np.zeros(len(smiles))
-    for start, end in zip(first.tolist(), [*first.tolist()[1:], len(smiles)], strict=True):
+    for start, end in pairwise([*first.tolist(), len(smiles)]):
         size[start:end] = np.maximum.accumulate(smiles[start:end])
     return {"others_smile_s": (index - begun) * FRAME_S, "others_smile": size}
 
@@ -374,3 +380,39 @@ def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now
         kind: ~np.any([under_way[other] for other in EXCLUDES[kind]], axis=0) & _answers(kind, heard)
         for kind in EVENT_KINDS
     }
+
+
+# --- Decisions -------------------------------------------------------------------------------------------------------
+
+
+def decisions(
+    model: EventModel, heard: Doubles, seeds: Sequence[int], calmness: Calmness
+) -> list[tuple[ListenerEvent, ...]]:
+    """Return the decisions for each seed without a given history, skipping steps at which no event can begin."""
+    steps = steps_in(len(heard))
+    most = most_in(model, heard[steps], calmness)
+    found = []
+    for seed in seeds:
+        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
+        frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
+        found.append(_decided(model, heard, frames, model.start(seed, calmness)))
+    return found
+
+
+def _decided(
+    model: EventModel, heard: Doubles, frames: Sequence[int], memory: EventMemory
+) -> tuple[ListenerEvent, ...]:
+    """Decide at the end of each of `frames`, the last of which is beyond the end."""
+    found = list[ListenerEvent]()
+    at, look_back = 0, math.inf  # the frame from which on a look aside is over
+    while (frame := min(frames[at], look_back)) < len(heard):
+        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
+        found += decision.events
+        at += frame == frames[at]
+        look = last_shift(memory.done)
+        over = math.inf  # the step at which the newest look is over, if it goes aside
+        if look is not None and look.target_rad != AT_PERSON:
+            step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
+            over = step * STEP_FRAMES + STEP_FRAMES - 1
+        look_back = max(frame + STEP_FRAMES, over)
+    return tuple(found)

@@ -9,9 +9,9 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.lab.corpora.compose.ami import read_people
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
-from sfms_robot.lab.evaluation.meetings import annotated, decisions, delayed, sensed
+from sfms_robot.lab.evaluation.meetings import annotated, delayed, sensed
 from sfms_robot.lab.evaluation.rollout import speaker_frames
-from sfms_robot.lab.evaluation.whole_recordings import event_spans, hazards_in
+from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, hazards_in
 from sfms_robot.lab.learning.events.event_trainer import muted, student
 from sfms_robot.listeners.events.evidence import HEARD, Sensed
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables

@@ -40,8 +40,8 @@ def scene(seed, people=3, frames=FRAMES):
     looks = np.stack([runs(rng, frames, 40) for _ in range(people)], axis=1).astype(float)
     looks[:, rng.integers(people)] = np.nan
     looks[runs(rng, frames, 100)] = np.nan
-    flags = [rng.random(frames) < 0.01 for _ in range(3)]
-    return Scene(speaks, looks, *flags)
+    laughs, nods = (rng.random(frames) < 0.01 for _ in range(2))
+    return Scene(speaks, looks, laughs, nods, rng.random(frames) * runs(rng, frames, 30))
 
 
 def streamed(one):
@@ -49,7 +49,7 @@ def streamed(one):
     for index in range(len(one.speaks)):
         instant = Instant(
             speaks=tuple(one.speaks[index].tolist()), looks=tuple(one.looks[index].tolist()),
-            laughs=bool(one.laughs[index]), nods=bool(one.nods[index]), smiles=bool(one.smiles[index]),
+            laughs=bool(one.laughs[index]), nods=bool(one.nods[index]), smiles=float(one.smiles[index]),
         )  # fmt: skip
         row, state = hear(instant, state)
         rows.append(row)

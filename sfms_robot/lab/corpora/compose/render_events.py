@@ -145,9 +145,9 @@ def speaker_motion(
     _nod(pose, _spans() if nods is None else nods, motions, rng)
     shapes += np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
     for start, end in _spans() if laughs is None else laughs:
-        _lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
+        lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
     for start, end, size in () if smiles is None else smiles.tolist():
-        _lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
+        lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
     known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
     state = gaze_kinematics.start(int(rng.integers(2**31)))
@@ -367,12 +367,12 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
         if any(event.start_s - seen_s < start < event.end_s for event in events):
             continue
-        curve = _lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
+        curve = lay_smile(shapes, start - 0.2, seen_s, size, jaw, motions, rng)
         events.append(laid_event(kind, start - 0.2, curve, curve[:, SMILE].mean(axis=1).max()))
     return events
 
 
-def _lay_smile(
+def lay_smile(
     shapes: Floats,
     start_s: float,
     seen_s: float,

@@ -22,9 +22,9 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
-from sfms_robot.lab.evaluation.meetings import decisions, tables
+from sfms_robot.lab.evaluation.meetings import tables
 from sfms_robot.lab.evaluation.rollout import tracked
-from sfms_robot.lab.evaluation.whole_recordings import event_spans, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,
