@@ -150,6 +150,8 @@ def test_what_annotators_saw_is_what_hazards_were_taught_on(tmp_path):
     one = student(person, np.random.default_rng(0))
     for given, told in ((one, own), (muted(one), alone)):
         taught = given.evidence[1:, : len(HEARD)]  # as steps begin
-        assert np.array_equal(told[STEP_FRAMES - 1 :: STEP_FRAMES][: len(taught)], taught, equal_nan=True)
+        seen = told[STEP_FRAMES - 1 :: STEP_FRAMES][: len(taught)]
+        same = [name not in ("others_smile_s", "others_smile") for name in HEARD]  # those are drawn for the student
+        assert np.array_equal(seen[:, same], taught[:, same], equal_nan=True)
     assert not np.array_equal(own, alone, equal_nan=True)
     assert np.array_equal(elsewhere[SHIFT_FRAMES:], alone[:-SHIFT_FRAMES], equal_nan=True)

@@ -20,8 +20,9 @@ from sfms_robot.frames import (
     ListenerEvent,
     SpeakerFrame,
 )
-from sfms_robot.listeners.events.evidence import sense
+from sfms_robot.listeners.events.evidence import CORNERS, sense
 from sfms_robot.listeners.events.model import AT_PERSON, EventModel
+from sfms_robot.signals.event_sizes import RETURN_SIZE
 
 MODEL = EventModel.load()
 MINUTES = 2
@@ -85,8 +86,9 @@ def usual():
 
 
 def test_everything_that_people_do_happens(usual):
-    more = listen(conversation(), calmness=Calmness(shake=6, tilt=6, laugh=6, smile=6, mm_hm=6, brow_raise=6))[0]
-    assert {event.kind for event in more} == set(EVENT_KINDS)
+    lively = Calmness(shake=6, tilt=6, laugh=6, smile=6, mm_hm=6, brow_raise=6)
+    more = [listen(conversation(), seed, lively)[0] for seed in (1, 2)]
+    assert {event.kind for events in more for event in events} == set(EVENT_KINDS)
     assert 1 * MINUTES <= len(of("nod", usual)) <= MOST_NODS * MINUTES
     assert 8 * MINUTES <= len(of("blink", usual)) <= 30 * MINUTES
 
@@ -262,3 +264,41 @@ def test_own_history_replaces_what_was_decided():
     before = round(10.0 / FRAME_S)
     np.testing.assert_array_equal(hazards[:before], none[:before])
     assert (hazards[before:] != none[before:]).any()
+
+
+# --- smiles that are returned ---------------------------------------------------------------------------------------
+
+
+def smiling(onsets_s, frames=FRAMES, size=0.7):
+    """(N, 58) a face that smiles for two seconds from each onset on."""
+    face = np.zeros((frames, MOTION_DIM), np.float32)
+    for onset_s in onsets_s:
+        first = round(onset_s / FRAME_S)
+        rise = np.minimum(1.0, np.r_[np.arange(50), np.arange(10)[::-1]] / 10)
+        face[first : first + 60, CORNERS] = size * rise[:, None]
+    return face
+
+
+def test_a_smile_is_returned_in_time_and_size_and_more_smiles_more_often():
+    onsets_s = np.arange(5.0, 115.0, 10.04)  # of either parity of steps
+    face = smiling(onsets_s)
+    found = [of("smile", listen(conversation(face=face), seed)[0]) for seed in range(8)]
+    begun_s = np.array([event.start_s for events in found for event in events])
+    after_s = begun_s[:, None] - onsets_s
+    returned = ((after_s > 0.4) & (after_s <= 1.5)).any(axis=1)
+    share = returned.sum() / (8 * len(onsets_s))
+    others = ((after_s > 4.0) & (after_s <= 5.1)).any(axis=1).sum() / (8 * len(onsets_s))
+    assert 0.1 + others <= share <= 0.6
+    sizes = [event.size for events in found for event in events]
+    assert np.array(sizes)[returned] == pytest.approx(RETURN_SIZE * 0.7, abs=0.03)
+    few = [of("smile", listen(conversation(face=smiling(onsets_s[::5])), seed)[0]) for seed in range(8)]
+    assert sum(map(len, few)) < 0.6 * len(begun_s)
+
+
+def test_a_silent_person_who_smiles_is_smiled_at_and_one_who_always_smiles_is_not_all_the_time():
+    silence = sound(np.zeros(FRAMES, bool))
+    face = smiling(np.arange(5.0, 115.0, 10.0))
+    assert sum(len(of("smile", listen(conversation(silence, face=face), seed)[0])) for seed in range(8)) >= 8
+    always = np.tile(smiling([0.0])[20], (FRAMES, 1))
+    found = [of("smile", listen(conversation(face=always), seed)[0]) for seed in range(8)]
+    assert sum(map(len, found)) <= 2 * MINUTES * 8

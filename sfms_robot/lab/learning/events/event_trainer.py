@@ -76,7 +76,7 @@ GAZE: Final[Groups] = {
 OTHERS: Final[Groups] = {"laugh_s": _LAUGH, "others_nod_s": (0.0, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)}
 STUDY: Final[Groups] = {**PHASE, **FLOOR, "own_voice_s": _LONG, **OWN_NODS, **GAZE, **OTHERS}  # 89 inputs
 STUDY_RIDGE, RIDGE = 10.0, 3.0  # the second, and what is added below, did better on validation
-THEIR_SMILE: Final[Groups] = {"others_smile_s": (0.0, 0.12, 0.24, 0.4, 0.8, 1.6, 3.2)}
+THEIR_SMILE: Final[Groups] = {"others_smile_s": (0.0, 0.06, 0.12, 0.24, 0.4, 0.8, 1.6, 3.2)}
 GROUPS: Final[Mapping[str, Groups]] = {
     "nod": {**STUDY, **OWN_VOICE, "mm_hm_s": _WHILE, "laugh_end_s": _WHILE},
     "mm_hm": {**PHASE, **FLOOR, **OWN_VOICE, "nod_s": _SHORT, "mm_hm_s": _LONG, **GAZE, **OTHERS},
@@ -141,6 +141,11 @@ def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
 
 
+def _seen(start_s: float) -> int:
+    """Return the frame in which a smile from `start_s` on is first seen."""
+    return round((start_s + SEEN_S) * FRAME_HZ)
+
+
 def _laughing(person: MeetingPerson) -> Doubles:
     """Return the smiles (K, 3) of others' laughs, as `render_events.speaker_motion` lays them."""
     laughs = person.others_laughs
@@ -151,7 +156,7 @@ def _seen_smiles(smiles: Doubles, frames: int) -> Doubles:
     """Return (frames,) the sizes of smiles (K, 3) from when they are seen until they end."""
     out = np.zeros(frames)
     for start, end, size in smiles.tolist():
-        first = max(0, round((start + SEEN_S) * FRAME_HZ))
+        first = max(0, _seen(start))
         out[first : max(first + 1, round(end * FRAME_HZ))] = size
     return out
 
@@ -216,7 +221,8 @@ def spans_of(person: MeetingPerson, rng: np.random.Generator, others_smiles: Dou
     smiles += [_some(person.mm_hms[:, 0], after["mm_hm"], rng), _some(nods, after["nod"], rng)]
     for smile in others_smiles:
         answers = sizes.returned(smile[None], rng)
-        smiles.append(np.maximum(answers[:, 0] - LEAD_S, smile[0] + SEEN_S + STEP_S))
+        first = np.ceil((_seen(smile[0]) + 1) / STEP_FRAMES) * STEP_S  # the first step that knows of it
+        smiles.append(np.maximum(answers[:, 0] - LEAD_S, first))
     brows = _some(person.asked, BROWS["question"], rng)
     return {
         "nod": person.nods,
