@@ -256,7 +256,9 @@ class PipeWriter:
             self._wake.wait()
             self._wake.clear()
             while self._full:
-                select.select([], [self._pipe], [], _FULL_S)
+                room = select.poll()  # takes pipes, and descriptors of any number
+                room.register(self._pipe, select.POLLOUT)
+                room.poll(1e3 * _FULL_S)
                 self._full = False
                 self._write_all()
             if not _NON_BLOCKING:
@@ -340,7 +342,7 @@ class Supervised:
     def enter(self, phase: str) -> None:
         """Note that the child has reached a phase."""
         if phase == "running" and self._failed:
-            log.warning("%s: running again", self._name)
+            log.info("%s: running again", self._name)
         self.phase, self.phase_s, self._silent_s = phase, 0.0, 0.0
 
     def check(self, now_s: float, alive: bool, failure: str | None = None) -> None:
