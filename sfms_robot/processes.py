@@ -179,10 +179,9 @@ def _messages(pipe: IO[bytes]) -> Iterator[Any]:
 class PipeWriter:
     """The writing end of a pipe, for threads that must not wait. All methods may be called from any thread.
 
-    A message is written by the thread that hands it over where the pipe has room: some microseconds, and no switch to
-    another thread in the middle of a tick. Of several threads one writes, and finds what the others have added; none
-    waits for another. When the pipe is full, another thread waits until it has room. Messages that cannot be
-    written since the other process has ended are dropped.
+    A message is written by the thread that hands it over where the pipe has room: some microseconds, without a switch
+    to another thread. Of several threads one writes, and finds what the others have added; none waits for another. When
+    the pipe is full, another thread waits until it has room. Messages to a process that has ended are dropped.
 
     Args:
         pipe: closed when all that was sent is written, after `close`.
@@ -256,8 +255,7 @@ class PipeWriter:
             self._wake.wait()
             self._wake.clear()
             while self._full:
-                room = select.poll()  # takes pipes, and descriptors of any number
-                room.register(self._pipe, select.POLLOUT)
+                (room := select.poll()).register(self._pipe, select.POLLOUT)  # a descriptor of any number
                 room.poll(1e3 * _FULL_S)
                 self._full = False
                 self._write_all()

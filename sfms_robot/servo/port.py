@@ -169,6 +169,8 @@ class SerialPort:
         self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
+        if _is_socket(self.name) and baud != self._serial.baudrate:
+            raise PortError(f"{self.name}: cannot change to {baud} baud: a socket:// port has the rate of its server")
         try:
             self._serial.baudrate = baud
         except (OSError, OverflowError, ValueError) as error:
@@ -290,7 +292,7 @@ def _open(device: str, baud: int) -> serial.Serial:
     except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
     try:
-        if scheme == "socket":  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
+        if _is_socket(device):  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
             with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         elif not scheme:
@@ -300,6 +302,11 @@ def _open(device: str, baud: int) -> serial.Serial:
         _shut(port)
         raise
     return port
+
+
+def _is_socket(device: str) -> bool:
+    """Return whether it is plain TCP, which carries bytes and no settings."""
+    return device.startswith("socket://")
 
 
 def _shut(port: serial.Serial) -> None:
@@ -451,7 +458,7 @@ def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> Des
         except (OSError, ValueError, NotImplementedError, AttributeError) as error:
             problem = "the driver of this device does not switch the direction (rts: this program does, by RTS)"
             raise PortError(f"{name}: rs485 = 'kernel': {problem}") from error
-    connection = port._socket if name.startswith("socket://") else None
+    connection = port._socket if _is_socket(name) else None
     try:
         has_descriptor = connection is not None or (_termios is not None and port.fileno() >= 0)
     except OSError:  # io.UnsupportedOperation
