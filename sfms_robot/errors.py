@@ -174,5 +174,5 @@ def install_command(extra: str) -> str:
 
 
 def _within(folder: Path, path: Path) -> str:
-    """Return `path` as it is typed in `folder`."""
+    """Return `path`, relative to `folder` where it lies in it."""
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
