@@ -78,7 +78,13 @@ class EventCounter:
         return self._submit(len(self._values)).result()
 
     def _submit(self, last: int, whole: bool = False) -> Future[int]:
-        return self._worker.submit(self._count, np.array(self._values), self._before, last, whole)
+        block = np.array(self._values), self._before, last, whole
+        try:
+            return self._worker.submit(self._count, *block)
+        except RuntimeError:  # at the end of the program: all earlier blocks are counted, and no thread begins any more
+            counted: Future[int] = Future()
+            counted.set_result(self._count(*block))
+            return counted
 
     def _count(self, values: Doubles, first: int, last: int, whole: bool) -> int:
         """Search a block, in the worker, which has counted the blocks before; return the events so far."""
