@@ -28,12 +28,12 @@ $(VENV)/.run: pyproject.toml
 	@$(CHECKED)
 	@echo 'Installing sfms-robot with its plots into $(VENV): about 520 MB, one to two minutes, once.'
 	@$(INSTALL) -e '.[plots]'
-	touch $@
+	@touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo 'Installing sfms-robot with the tools of developers into $(VENV): about 3 GB, some minutes, once.'
 	@$(INSTALL) -c constraints.txt -e '.[dev]'
-	touch $@ $(VENV)/.run
+	@touch $@ $(VENV)/.run
 
 test: install
 	$(PYTEST) $(PARALLEL) -m "not realtime and not slow and $(TESTS)"
