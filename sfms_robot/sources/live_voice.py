@@ -17,10 +17,12 @@ placed again where it is `UNSETTLED_S` off.
 from __future__ import annotations
 
 import math
+import statistics
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -167,6 +169,69 @@ def _edge_below_middle(points: list[_Point]) -> tuple[_Point, _Point]:
 
 def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
     return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
+
+
+# --- the pace at which sound is handed over --------------------------------------------------------------------------
+
+PAUSE_S: Final = 0.25  # a longer wait than its piece by so much: nothing was said meanwhile
+OFF_PACE: Final = 0.015  # a sound card is off by a third of it at most
+PACE_SECONDS: Final = 6
+BURSTS: Final = 5  # within `BURSTS_S`
+BURSTS_S: Final = 10.0
+
+
+class Pace:
+    """The pace at which a source hands over sound, against time: too slow, too fast, or in bursts.
+
+    A source is behind by the time that has passed, less the sound that came. That goes up and down with its pieces; but
+    the least of each second stays where it is for a source that keeps pace. The median of its changes is the pace.
+
+    Attributes:
+        rate: seconds of sound a second, over the last seconds; None: not known yet.
+    """
+
+    def __init__(self) -> None:
+        self.rate: float | None = None
+        self._last_s = -math.inf
+        self._behind_s = self._most_s = 0.0
+        self._least: deque[_Point] = deque(maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
+        self._wait_s = self._widest_s = 0.0  # longest since the last burst, and before any
+        self._bursts_s: deque[float] = deque(maxlen=BURSTS)
+
+    def observe(self, piece_s: float, now_s: float) -> None:
+        """Take in a piece that is handed over at `now_s`."""
+        wait_s, self._last_s = now_s - self._last_s, now_s
+        if math.isinf(wait_s):
+            wait_s = piece_s
+        self._behind_s += wait_s - piece_s
+        if wait_s > piece_s + PAUSE_S:
+            self._least.clear()
+        self._observe_burst(wait_s if wait_s > piece_s + GAP_S else 0.0, now_s)
+        if self._least and now_s < self._least[-1][0] + 1.0:
+            begin_s, least_s = self._least.pop()
+            self._least.append((begin_s, min(least_s, self._behind_s)))
+            return
+        self._least.append((now_s, self._behind_s))
+        if len(self._least) == self._least.maxlen:
+            whole = list(self._least)[:-1]
+            self.rate = 1.0 - statistics.median((d - b) / (c - a) for (a, b), (c, d) in pairwise(whole))
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with the pace, in one line, or None."""
+        if self.rate is not None and abs(self.rate - 1.0) > OFF_PACE:
+            way = "falls behind" if self.rate < 1.0 else "is ahead"
+            return f"sound comes at {self.rate:.2f} of real time: its sender {way}; pace it by the clock"
+        if len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S:
+            return f"sound comes in bursts, up to {self._widest_s * 1e3:.0f} ms apart: send it as it is recorded"
+        return None
+
+    def _observe_burst(self, wait_s: float, now_s: float) -> None:
+        self._wait_s, self._most_s = max(self._wait_s, wait_s), max(self._most_s, self._behind_s)
+        if self._most_s - self._behind_s > GAP_S and self._wait_s:
+            self._bursts_s.append(now_s)
+            self._widest_s = max(self._widest_s, self._wait_s)
+            self._wait_s, self._most_s = 0.0, self._behind_s
 
 
 class LiveVoice(SourcePart):

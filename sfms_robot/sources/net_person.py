@@ -113,7 +113,7 @@ class Intake:
         if not self._in_time(piece_s, now_s):
             return f"voice left out: {piece_s:.2g} s came faster than time passes; send it as it is recorded"
         voice.hear(message.samples, message.rate_hz, at_s)
-        return None
+        return voice.pace.problem
 
     def see(self, sight: PushedSight | BrowserSight, message: SeenMessage, clock: SenderClock) -> str | None:
         """Hand on their face now, or that it is lost; return why it was left out. Never blocks."""
@@ -327,6 +327,7 @@ class NetVoice(_NetPart, PushedVoice):
     """`ports.Voice` of a person whose sound another program has: `--audio push[:[HOST:]PORT]`."""
 
     feed = "voice"
+    _way = FLAGS["voice"]
 
 
 class NetSight(_NetPart, PushedSight):
@@ -419,6 +420,8 @@ class PageVisitor:
 
 class BrowserVoice(PushedVoice):
     """`ports.Voice` of a visitor."""
+
+    _way = "--audio browser"
 
     def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
         super().__init__(now)

@@ -29,6 +29,7 @@ from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Fac
 from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
+from sfms_robot.sources.live_voice import Pace
 
 logger = logging.getLogger(__name__)
 
@@ -176,6 +177,7 @@ class JudgedSource:
         self._inner = inner
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
+        self._pace, self._said = Pace(), False
         self._given = 0
 
     def start(self, origin_s: float) -> None:
@@ -188,6 +190,10 @@ class JudgedSource:
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
             frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
             self._given += 1
+            self._pace.observe(FRAME_S, now_s)
+        if not self._said and (problem := self._pace.problem) is not None:
+            self._said = True
+            logger.warning("%s: %s (said once)", type(self._inner).__name__, problem)
         self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 

@@ -6,12 +6,13 @@ the next ones follow it. Where pieces are long, or arrive unevenly, that leaves 
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
 from sfms_robot.ports import Voice
 from sfms_robot.signals.audio import Resampler
-from sfms_robot.sources.live_voice import LiveVoice, SourcePart, check_rate, window
+from sfms_robot.sources.live_voice import LiveVoice, Pace, SourcePart, check_rate, window
+
+logger = logging.getLogger(__name__)
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
@@ -58,7 +61,13 @@ class Spoken(Voice, Protocol):
 
 
 class PushedVoice(LiveVoice):
-    """`ports.Voice` of what a program hears."""
+    """`ports.Voice` of what a program hears.
+
+    Attributes:
+        pace: at which it comes. What is wrong with it is logged once.
+    """
+
+    _way: ClassVar[str] = "hear()"  # in logs
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__(now)
@@ -66,6 +75,8 @@ class PushedVoice(LiveVoice):
         self._longest_s = 0.0  # piece
         self._last_s = 0.0
         self._dropped = 0
+        self.pace = Pace()
+        self._said = False
 
     def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
         """Take the next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
@@ -88,9 +99,19 @@ class PushedVoice(LiveVoice):
                 self._last_s = now_s
                 captured_s = now_s + self._longest_s
             self.push(kept, rate_hz, captured_s, now_s)
+            if len(samples):
+                self.pace.observe(len(samples) / rate_hz, now_s)
+        if not self._said and (problem := self.pace.problem) is not None:
+            self._said = True
+            logger.warning("%s: %s (said once)", self._way, problem)
 
     def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "dropped": self._dropped, "delay_ms": round(self._longest_s * 1e3, 1)}
+        return {
+            **super().statistics(),
+            "dropped": self._dropped,
+            "delay_ms": round(self._longest_s * 1e3, 1),
+            "pace": None if self.pace.rate is None else round(self.pace.rate, 3),
+        }
 
 
 class PushedSight(SourcePart):

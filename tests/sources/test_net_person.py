@@ -276,6 +276,17 @@ def test_each_wrong_message_is_answered_by_an_error_to_its_sender(run, Program):
     assert (run.told["malformed"], run.told["too_fast"]) == (3, 3)
 
 
+def test_a_program_whose_sound_comes_in_bursts_is_told_so_once(run):
+    program = joined(Tcp(run, feeds=["voice"]))
+    for number in range(40):
+        run.now_s += 0.4
+        for _ in range(4):
+            program.send(sound_message(VOICE, 16000, 0, 0, SECOND[:1600]))
+        looked_at(run, 4 * number + 5)
+    assert json.loads(program.receive())["error"].startswith("sound comes in bursts, up to 400 ms apart")
+    all_looked_at(program)
+
+
 def test_a_sentence_in_one_message_is_said_and_one_that_is_too_long_is_sent_back(run):
     program = joined(WebSocket(run, feeds=["speech"]))
     program.send(sound_message(SPEECH, 24000, 0, 0, np.full(24000 * 20, 8000, np.int16)))

@@ -124,6 +124,17 @@ def test_a_caller_that_is_faster_than_time_fills_no_memory_and_delays_only_until
     assert person.voice.statistics()["delay_ms"] == 20.0
 
 
+def test_a_program_that_falls_behind_is_named_once(caplog):
+    person = Person()
+    for index in range(600):
+        person.read(index * 0.023)
+        person.voice.hear(np.zeros(320), 16000)
+    assert [record.getMessage() for record in caplog.records] == [
+        "hear(): sound comes at 0.87 of real time: its sender falls behind; pace it by the clock (said once)"
+    ]
+    assert person.source.statistics()["voice"]["pace"] == pytest.approx(0.87, abs=0.001)
+
+
 def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     person = Person()
     person.sight.see(FaceFrame(123.0, np.ones(6, dtype=np.float32), np.full(52, 0.5, dtype=np.float32)))
