@@ -65,10 +65,7 @@ _REASONS_SAID: Final = 6
 # Packets of other programs, and what to do about them.
 _FOREIGN: Final = (
     (rb"/(W|HT|HRQ?|ELR|ERR)\0", "Face Cap in live mode, which has no VMC: use Live Link Face and --face live-link"),
-    (
-        rb"/avatar/parameters/",
-        "parameters of VRChat, as VRCFaceTracking sends them: turn them into VMC with VRCFTtoVMCP, and send that here",
-    ),
+    (rb"/avatar/parameters/", "VRCFaceTracking for VRChat, which is not VMC: let VRCFTtoVMCP turn it into VMC"),
     (rb"[A-Za-z_]+[-&]\d+\|", "iFacialMocap's own format: in its desktop app, switch on sending of VMC Protocol"),
     (rb"(#bundle\0.{12})?/VMC/", "VMC: --face vmc takes it"),
     (rb"\x06\0\0\0.\$?[\w-]{4}", "Live Link Face: --face live-link takes it"),
@@ -359,7 +356,7 @@ class UdpSight(LiveFace):
         if self._sender is not None and (motion := self._decoder.due(now_s)) is not None:
             self._show(motion, self._heard_s)
         self.lost = self._sender is not None and now_s - self._result_s > LOST_S
-        if self._hint is not None and time_s > UNHEARD_S:
+        if self._hint is not None and time_s > UNHEARD_S and not self._counts["packets"]:
             logger.warning("%s: no packets yet: %s", self._kind, self._hint)
             self._hint = None
         return super().at(time_s)
@@ -438,6 +435,7 @@ class UdpSight(LiveFace):
 
     def _show(self, motion: Floats, time_s: float) -> None:
         """Show a face (58,) in the sender's units, once these are known."""
+        ours: Floats | None = motion
         if self._units is not None:
             ours, units = self._units.take(motion, time_s), self._units.units
             if ours is None and (wrong := beyond(units.ours(motion))) is not None:
@@ -445,8 +443,6 @@ class UdpSight(LiveFace):
                 return
             if units.line:
                 self._say("%s: in packets of %s %s (said once)", units.line)
-        else:
-            ours = motion
         self._result_s = time_s
         if ours is not None:
             self._counts["faces"] += 1
@@ -457,15 +453,13 @@ class UdpSight(LiveFace):
         """Log what is not used of this sender, some seconds after its first packet."""
         if time_s < self._remark_s:
             return
-        remark = self._decoder.remark()
-        if remark is not None:
+        self._remark_s = math.inf
+        if (remark := self._decoder.remark()) is not None:
             self._say("%s: of packets of %s: %s (said once)", remark)
         elif time_s - self._result_s > UNHEARD_S:
             self._say("%s: packets come from %s, but no face: %s (said once)", "they repeat one frame")
         else:
             self._remark_s = time_s + UNHEARD_S
-            return
-        self._remark_s = math.inf
 
     def _refuse(self, sender: Address) -> None:
         self._counts["refused"] += 1
@@ -486,27 +480,6 @@ class UdpSight(LiveFace):
             at = address_text(*(sender or self._sender or ("?", 0))[:2])
             logger.warning(text, self._kind, at, reason)
             self._said.add(key)
-
-
-def addresses_of_this_machine() -> list[str]:
-    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
-    if sys.platform != "linux":
-        try:
-            found = socket.gethostbyname_ex(socket.gethostname())[2]
-        except OSError:
-            return []
-        return [address for address in found if not address.startswith("127.")]
-    import fcntl
-
-    addresses = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            try:
-                answer = fcntl.ioctl(asked, 0x8915, struct.pack("256s", name.encode()[:15]))  # SIOCGIFADDR
-            except OSError:  # an interface without an address
-                continue
-            addresses.append(socket.inet_ntoa(answer[20:24]))
-    return [address for address in addresses if not address.startswith("127.")]
 
 
 def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:

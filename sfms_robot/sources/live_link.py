@@ -22,10 +22,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, Floats
 from sfms_robot.signals.spaces import LiveUnits
-from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, addresses_of_this_machine, foreign
+from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 PORT: Final = 11111  # what the app suggests
 VERSION: Final = 6

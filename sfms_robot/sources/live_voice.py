@@ -222,9 +222,15 @@ class Pace:
         if self.rate is not None and abs(self.rate - 1.0) > OFF_PACE:
             way = "falls behind" if self.rate < 1.0 else "is ahead"
             return f"sound comes at {self.rate:.2f} of real time: its sender {way}; pace it by the clock"
-        if len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S:
-            return f"sound comes in bursts, up to {self._widest_s * 1e3:.0f} ms apart: send it as it is recorded"
+        if self.apart_s:
+            return f"sound comes in bursts, up to {self.apart_s * 1e3:.0f} ms apart: send it as it is recorded"
         return None
+
+    @property
+    def apart_s(self) -> float:
+        """How far bursts are apart, where sound comes in bursts, else 0."""
+        bursts = len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S
+        return self._widest_s if bursts else 0.0
 
     def _observe_burst(self, wait_s: float, now_s: float) -> None:
         self._wait_s, self._most_s = max(self._wait_s, wait_s), max(self._most_s, self._behind_s)
@@ -256,6 +262,7 @@ class LiveVoice(SourcePart):
         self._frames: dict[int, Floats] = {}
         self._wanted = 0  # frame
         self._counts = {"gaps": 0, "late_samples": 0, "not_finite": 0}
+        self._uneven_s = 0.0  # by which pieces come late without being missing
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped, but taught the clock."""
@@ -311,7 +318,9 @@ class LiveVoice(SourcePart):
         """Learn from a piece; it begins a stretch when it cannot follow the last one."""
         if rate_hz != self._rate_hz:
             self._end_stretch()
-        elif self._clock is not None and self._clock.lateness_s(self._received + n, captured_s) > GAP_S:
+        elif (
+            self._clock is not None and self._clock.lateness_s(self._received + n, captured_s) > GAP_S + self._uneven_s
+        ):
             self._counts["gaps"] += 1
             self._end_stretch()
         if self._clock is None:

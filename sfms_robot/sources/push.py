@@ -1,7 +1,8 @@
 """A person handed over by calls, from any thread: sound, faces, and the robot's own speech.
 
 A call brings no time of its own, so sound counts from the moment it arrives: a piece is played out from then on, and
-the next ones follow it. Where pieces are long, or arrive unevenly, that leaves room for the longest of them.
+the next ones follow it. Where pieces are long, that leaves room for the longest of them; where they come in bursts,
+for the longest wait between two.
 """
 
 from __future__ import annotations
@@ -90,17 +91,18 @@ class PushedVoice(LiveVoice):
         with self._pushing:
             self._dropped += len(samples) - len(kept)
             now_s, piece_s = self._now(), len(kept) / rate_hz
+            if len(samples):
+                self.pace.observe(len(samples) / rate_hz, now_s)
+            self._uneven_s = min(self.pace.apart_s, HEARD_S)
             if captured_s is None:
                 if now_s - self._last_s > self._longest_s + HEARD_S:
                     self._longest_s = 0.0
-                if piece_s > self._longest_s:
-                    self._longest_s = piece_s
+                if (needed_s := max(piece_s, self._uneven_s)) > self._longest_s:
+                    self._longest_s = needed_s
                     self.interrupt()
                 self._last_s = now_s
                 captured_s = now_s + self._longest_s
             self.push(kept, rate_hz, captured_s, now_s)
-            if len(samples):
-                self.pace.observe(len(samples) / rate_hz, now_s)
         if not self._said and (problem := self.pace.problem) is not None:
             self._said = True
             logger.warning("%s: %s (said once)", self._way, problem)

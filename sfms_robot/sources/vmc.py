@@ -30,11 +30,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.rotations import angles_of
 from sfms_robot.signals.spaces import LiveUnits, channel_of, used_line
-from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, addresses_of_this_machine, foreign
+from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 PORT: Final = 39539  # what the protocol gives those who receive
 

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
+from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
-from sfms_robot.sources.live_face import Datagram, addresses_of_this_machine
+from sfms_robot.sources.live_face import Datagram
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
 
 PACKETS = recorded_packets()
