@@ -218,7 +218,7 @@ class Pace:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with the pace, in one line, or None."""
+        """A fault of the pace, in one line, or None."""
         if self.rate is not None and abs(self.rate - 1.0) > OFF_PACE:
             way = "falls behind" if self.rate < 1.0 else "is ahead"
             return f"sound comes at {self.rate:.2f} of real time: its sender {way}; pace it by the clock"
@@ -228,7 +228,7 @@ class Pace:
 
     @property
     def apart_s(self) -> float:
-        """How far bursts are apart, where sound comes in bursts, else 0."""
+        """Longest wait between two bursts, where sound comes in bursts, else 0."""
         bursts = len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S
         return self._widest_s if bursts else 0.0
 
