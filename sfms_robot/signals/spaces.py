@@ -368,13 +368,13 @@ def pose_of(name: str) -> tuple[str, str, bool] | None:
     return (match[2].lower(), (match[3] or "").lower(), bool(match[1])) if match else None
 
 
-def motion_of(channels: Mapping[str, float]) -> Floats:
+def motion_of(channels: Mapping[str, float], what: str = "face") -> Floats:
     """Return motion (58,) of some channels by any of their names, 0 elsewhere. Raises InputError for unknown names."""
     motion = np.zeros(MOTION_DIM, dtype=np.float32)
     for name, value in channels.items():
         if (channel := channel_of(name)) is None:
             raise InputError(
-                f"face: {name!r} is not a channel{did_you_mean(name, CHANNELS)} (valid: {', '.join(CHANNELS)})"
+                f"{what}: {name!r} is not a channel{did_you_mean(name, CHANNELS)} (valid: {', '.join(CHANNELS)})"
             )
         motion[CHANNEL_INDEX[channel]] = value
     return motion
