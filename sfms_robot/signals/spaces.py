@@ -24,9 +24,10 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, InputError, did_you_mean
 from sfms_robot.frames import (
     BLENDSHAPES,
+    CHANNEL_INDEX,
     CHANNELS,
     JAW_FULL_OPEN_RAD,
     MOTION_DIM,
@@ -365,6 +366,18 @@ def pose_of(name: str) -> tuple[str, str, bool] | None:
     """Return channel, unit ("" where the name has none) and whether a camera is the origin, of a head pose's name."""
     match = _POSE_NAME.fullmatch(name.strip())
     return (match[2].lower(), (match[3] or "").lower(), bool(match[1])) if match else None
+
+
+def motion_of(channels: Mapping[str, float], what: str = "face") -> Floats:
+    """Return motion (58,) of some channels by any of their names, 0 elsewhere. Raises InputError for unknown names."""
+    motion = np.zeros(MOTION_DIM, dtype=np.float32)
+    for name, value in channels.items():
+        if (channel := channel_of(name)) is None:
+            raise InputError(
+                f"{what}: {name!r} is not a channel{did_you_mean(name, CHANNELS)} (valid: {', '.join(CHANNELS)})"
+            )
+        motion[CHANNEL_INDEX[channel]] = value
+    return motion
 
 
 def used_line(used: Collection[str], unknown: Collection[str]) -> str:

@@ -23,6 +23,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import pairwise
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
-from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix
 
 GAP_S: Final = 0.15
 SETTLE_S: Final = 1.0
@@ -249,6 +250,7 @@ class LiveVoice(SourcePart):
         super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s: float | None = None
+        self._mix = Downmix()
         self._rate_hz = 0.0
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
         self._skew = 0.0  # of the card, kept over its gaps
@@ -282,10 +284,11 @@ class LiveVoice(SourcePart):
         What is not finite counts as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
         """
         check_rate(rate_hz)
-        mono, not_finite = _mono(samples)
-        if not len(mono):
+        finite, not_finite = _finite(samples)
+        if not len(finite):
             return
         with self._lock:
+            mono = np.ascontiguousarray(np.clip(self._mix(finite), -1.0, 1.0))
             self._counts["not_finite"] += not_finite
             self._observe(len(mono), rate_hz, captured_s)
             if self._origin_s is not None:
@@ -402,16 +405,13 @@ class LiveVoice(SourcePart):
 
 
 def check_rate(rate_hz: float) -> None:
-    """Raise ConfigError for a rate that speech does not have."""
-    if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
+    """Raise ConfigError for a rate that speech does not have, and for one that is not a number."""
+    if not isinstance(rate_hz, Real) or not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
         raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
-def _mono(samples: NDArray[np.float32]) -> tuple[Floats, int]:
-    """Return the mean of the channels, and how many of the samples are not finite."""
+def _finite(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+    """Return the samples, 0 for those that are not finite, and how many these are."""
     finite = np.isfinite(samples)
     not_finite = samples.size - int(np.count_nonzero(finite))
-    if not_finite:
-        samples = np.where(finite, samples, np.float32(0))
-    mixed = samples.mean(axis=1, dtype=np.float64) if samples.ndim > 1 else samples
-    return np.ascontiguousarray(np.clip(mixed, -1.0, 1.0), dtype=np.float32), not_finite
+    return np.where(finite, samples, np.float32(0)) if not_finite else samples, not_finite
