@@ -12,6 +12,8 @@ import errno
 import hmac
 import ipaddress
 import socket
+import struct
+import sys
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -148,3 +150,24 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(host)
     except ValueError:
         return None
+
+
+def addresses_of_this_machine() -> list[str]:
+    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
+    if sys.platform != "linux":
+        try:
+            found = socket.gethostbyname_ex(socket.gethostname())[2]
+        except OSError:
+            return []
+        return [address for address in found if not address.startswith("127.")]
+    import fcntl
+
+    addresses = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asked, 0x8915, struct.pack("256s", name.encode()[:15]))  # SIOCGIFADDR
+            except OSError:  # an interface without an address
+                continue
+            addresses.append(socket.inet_ntoa(answer[20:24]))
+    return [address for address in addresses if not address.startswith("127.")]

@@ -274,6 +274,8 @@ class Tick:
         readings: freshest reading per joint.
         state, why: of the run, see docs/safety.md; `why` names lost parts, or the causes of a halt.
         written_s: loop time at which the goals were on the wire; None where it was not measured.
+        origin_s: loop time 0 in seconds of `time.monotonic`, in virtual time of the virtual clock; None on the way to
+            rest.
     """
 
     time_s: float
@@ -283,6 +285,7 @@ class Tick:
     state: str = "starting"
     why: tuple[str, ...] = ()
     written_s: float | None = None
+    origin_s: float | None = None
 
 
 class Clock(Protocol):

@@ -53,8 +53,8 @@ def run(
         "auto",
         rich_help_panel=PERSON,
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
-        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, "
-        "the visitor of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
+        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, the "
+        "visitor of the page, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the shipped speaker's, else none.",
     ),
     agent_audio: str = Option(
         "none",

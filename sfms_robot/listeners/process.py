@@ -140,6 +140,7 @@ class ListenerProcess:
             return
         self._pushed += 1
         self._send_hop()
+        self._lateness.gave(frame, now_s)
         dropped = self._supervised.child.offer(frame)
         self._skipped += dropped
         self._unanswered += 1 - dropped

@@ -77,7 +77,10 @@ class EventCounter:
 
     def total(self) -> int:
         """Return the events so far, with the unfinished block. Blocks while it is searched."""
-        return self._submit(len(self._values)).result()
+        try:
+            return self._submit(len(self._values)).result()
+        except RuntimeError:  # the interpreter ends: its workers have done all they had, and take no more
+            return self._count(np.array(self._values), self._before, len(self._values), False)
 
     def _submit(self, last: int, whole: bool = False) -> Future[int]:
         block = (np.array(self._values), self._before, last, whole)

@@ -33,7 +33,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
@@ -253,7 +253,11 @@ class Recorder(Observer):
         if 0 <= now_s - self._searched_s < EVENTS_S:
             return []
         self._searched_s = now_s
-        return [("/event", event.start_s, asdict(event)) for event in self._events.news()]
+        return [("/event", event.start_s, _event_body(event)) for event in self._events.news()]
+
+
+def _event_body(event: ListenerEvent) -> dict[str, Any]:
+    return {key: value for key, value in asdict(event).items() if key != "origin_s"}
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:

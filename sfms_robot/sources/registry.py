@@ -119,7 +119,8 @@ def check_source(
     ):
         kinds = source_kinds(flag, others)
         if split_kind(value)[0] not in kinds and value not in files and file is None:
-            raise ConfigError(f"{flag} {value}: no such file ({', '.join([*kinds, *files])})")
+            problem = "sound is not read from a pipe: write it to a file" if value == "-" else "no such file"
+            raise ConfigError(f"{flag} {value}: {problem} ({', '.join([*kinds, *files])})")
     if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
         choices = ", ".join(["FILE.wav", "tcp", *speakers])
         raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")

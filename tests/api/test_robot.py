@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from itertools import groupby
 
 import numpy as np
@@ -60,7 +61,7 @@ class Still(Nodder):
 
 
 def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end():
-    told = []
+    told, began_s = [], time.monotonic()
     with sr.Robot(HEAD, listener=(nodder := Nodder())) as robot:
         assert robot.state == "starting"
         nodded = threading.Event()
@@ -72,6 +73,7 @@ def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end()
     assert report["listener"] == "Nodder" and report["joints"]
     assert nodder.threads == {"listener"}
     assert len(told) == len({event.start_s for event in told})
+    assert all(began_s < event.starts_monotonic_s < time.monotonic() + 1.0 for event in told)
 
 
 def test_what_is_pushed_is_what_the_listener_hears_from_any_thread():

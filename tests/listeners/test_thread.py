@@ -91,6 +91,18 @@ def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_t
     ]
 
 
+def test_plans_that_are_late_by_their_source_are_not_the_listeners_fault(caplog):
+    lateness = Lateness()
+    for number in range(100):
+        frame = SpeakerFrame(number * FRAME_S, np.zeros(0, np.float32), None)
+        lateness.gave(frame, frame.time_s + 0.25)
+        lateness.came(plan(frame.time_s), frame.time_s + 0.25 + 0.2)
+        assert not lateness.lasting
+    assert [record.getMessage() for record in caplog.records] == [
+        "plans come too late: sound reaches the listener 250 ms late, by its source (said once)"
+    ]
+
+
 def test_late_ones_between_others_are_no_matter():
     lateness = Lateness()
     for _ in range(10):

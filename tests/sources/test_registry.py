@@ -137,3 +137,5 @@ def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
         said = f"--{flag.replace('_', '-')} nothing-so: no such file .{choices}"
         with pytest.raises(ConfigError, match=said):
             check_source(**{flag: "nothing-so"})
+    with pytest.raises(ConfigError, match="--audio -: sound is not read from a pipe: write it to a file .mic, push"):
+        check_source("-")

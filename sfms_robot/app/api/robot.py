@@ -177,16 +177,17 @@ class Robot(Driven):
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
         """Hand over the person's voice: the next piece of sound, of any length. Never blocks.
 
-        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
-        this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
-        kept. Raises ConfigError for another type, shape or rate.
+        (n,), (n, channels) or (channels, n), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It
+        counts from this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the
+        newest is kept. Raises ConfigError for another type, shape, scale or rate.
         """
         self._pushed("hear")[0].hear(pcm, rate_hz)
 
-    def see(self, face: FaceFrame | Floats | None) -> None:
-        """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
+    def see(self, face: FaceFrame | Floats | Mapping[str, float] | None) -> None:
+        """Hand over the person's face now: a FaceFrame, motion (58,) or channels by name; None when it is lost.
 
-        Never blocks. Raises ConfigError for another shape.
+        It holds for 250 ms. Never blocks. Raises ConfigError for another shape, an unknown channel, and values that are
+        not radians or 0 to 1.
         """
         self._pushed("see")[1].see(face)
 
