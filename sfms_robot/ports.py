@@ -274,6 +274,7 @@ class Tick:
         readings: freshest reading per joint.
         state, why: of the run, see docs/safety.md; `why` names lost parts, or the causes of a halt.
         written_s: loop time at which the goals were on the wire; None where it was not measured.
+        busy: this computer is late, and by how much, in words; None: it is not.
     """
 
     time_s: float
@@ -283,6 +284,7 @@ class Tick:
     state: str = "starting"
     why: tuple[str, ...] = ()
     written_s: float | None = None
+    busy: str | None = None
 
 
 class Clock(Protocol):

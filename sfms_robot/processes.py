@@ -340,7 +340,7 @@ class Supervised:
     def enter(self, phase: str) -> None:
         """Note that the child has reached a phase."""
         if phase == "running" and self._failed:
-            log.warning("%s: running again", self._name)
+            log.info("%s: running again", self._name)
         self.phase, self.phase_s, self._silent_s = phase, 0.0, 0.0
 
     def check(self, now_s: float, alive: bool, failure: str | None = None) -> None:

@@ -18,7 +18,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port import EmulatedPort, Port, SerialPort, VirtualTimePort
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
@@ -51,7 +51,7 @@ def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Po
         return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
     if where.virtual:
         return partial(VirtualTimePort, where.device, where.control, bus.baud, clock)
-    return partial(SerialPort, where.device, bus.baud, clock)
+    return partial(EmulatedPort, where.device, where.control, bus.baud, clock)
 
 
 def firmware_maps(joints: Mapping[str, Joint]) -> dict[str, FirmwareMap]:

@@ -117,7 +117,7 @@ class Lateness:
         """Judge a plan that arrived at `now_s`, by the clock of its frames."""
         if now_s <= plan.times_s[-1]:
             if self.lasting:
-                log.warning("the listener's plans are in time again")
+                log.info("the listener's plans are in time again")
             self.lasting, self._since_s = False, None
             return
         self._since_s = now_s if self._since_s is None else self._since_s
@@ -180,7 +180,7 @@ class ListenerThread:
             log.warning("the listener has not answered for %.1f s; the run continues", silent_s)
             self._state = "hung"
         elif not hung and self._state == "hung":
-            log.warning("the listener answers again")
+            log.info("the listener answers again")
             self._state = "listening"
         return plans
 

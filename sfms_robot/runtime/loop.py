@@ -160,6 +160,7 @@ def drive(
                         state=state.run.name,
                         why=state.run.why,
                         written_s=written_s,
+                        busy=log.pace.busy,
                     )
                 )
         finally:

@@ -7,6 +7,8 @@ adapter can do is allowed. If the driver offers it, bytes are handed over withou
 What differs between operating systems about an open device (waiting, exclusive use, rates, RS-485 direction) is at the
 end of this file. `fcntl` and `termios` are imported if the system has them, so that the package imports everywhere.
 
+`EmulatedPort` is a port to emulated servos, which asks the emulator before it lets a silence count.
+
 `VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same pseudo terminal, but
 before a read the port sends the emulator, on a control socket, the number of bytes written so far and the time. The
 emulator takes exactly those bytes, moves its servos to that time, sends the length of its reply and writes it. So the
@@ -41,6 +43,8 @@ Rs485 = Literal["rts", "kernel"]
 
 WRITE_TIMEOUT_S: Final = 0.5  # a device that takes no bytes for so long counts as gone, and stopping must not wait
 _REPLY_TIMEOUT_S: Final = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
+_PATIENCE_S: Final = 1.0  # the longest that a port waits for an emulator in real time
+_CHUNK: Final = 4096
 _TERMINALS: Final = "/dev/pts/"
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 _POLL_S: Final = 0.0005
@@ -150,7 +154,7 @@ class SerialPort:
 
     def read(self, n: int, deadline_s: float) -> bytes:
         try:
-            return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
+            return self._io.read(n, max(0.0, deadline_s - self.now_s()))
         except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 
@@ -178,6 +182,86 @@ class SerialPort:
         self._serial.close()
 
 
+class EmulatedPort(SerialPort):
+    """A port to emulated servos in real time. A silence is one only if the emulator confirms it.
+
+    The emulator shares the computer's processors, so an answer may be late although its servo is there. When no byte
+    came by a deadline, the port asks the emulator, on its control socket, for the number of bytes that it has sent, and
+    waits for those that are missing. Meanwhile the port's clock stands still: what is late is this computer.
+    """
+
+    def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
+        self._late_s = 0.0
+        self._written = self._got = 0
+        self._settled = True  # the emulator has confirmed that nothing is to come
+        self._owed = 0  # answers of the emulator that have not come
+        self._control = _control(control_path, _PATIENCE_S)
+        self._ask()  # it counts bytes from here on
+        try:
+            super().__init__(device, baud, clock)
+        except BaseException:
+            self._control.close()
+            raise
+
+    def write(self, data: bytes) -> None:
+        self._settled = False
+        super().write(data)
+        self._written += len(data)
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        data = super().read(n, deadline_s)
+        if not data and not self._settled:
+            began_s = self.now_s()
+            data = self._late_bytes(n)
+            self._late_s += self.now_s() - began_s
+        self._got += len(data)
+        return data
+
+    def discard_input(self) -> None:
+        while data := SerialPort.read(self, _CHUNK, 0.0):  # counted, as a reset of the driver would not
+            self._got += len(data)
+
+    def now_s(self) -> float:
+        return self._clock.now_s() - self._late_s
+
+    def wait_until(self, time_s: float) -> None:
+        self._clock.wait_until(time_s + self._late_s)
+
+    def close(self) -> None:
+        super().close()
+        self._control.close()
+
+    def _late_bytes(self, n: int) -> bytes:
+        """Return bytes that the emulator has sent and that were not read; empty if there are none."""
+        sent = self._ask()
+        self._settled = sent is not None and sent <= self._got
+        if sent is None or self._settled:
+            return b""
+        data = SerialPort.read(self, n, self.now_s() + _PATIENCE_S)
+        if not data:  # lost: a terminal that is full takes no more
+            self._got, self._settled = sent, True
+        return data
+
+    def _ask(self) -> int | None:
+        """Return the bytes that the emulator has sent so far; None if it does not answer in time."""
+        answers = b""
+        try:
+            self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
+            while self._owed:
+                self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
+            self._control.settimeout(_PATIENCE_S)
+            self._control.sendall(b"quiet %d\n" % self._written)
+            self._owed = 1
+            while not answers.endswith(b"\n"):
+                if not (part := self._control.recv(_CHUNK)):
+                    return None  # it is gone, which the device shows
+                answers += part
+            self._owed = 0
+            return int(answers.removeprefix(b"quiet "))
+        except (OSError, ValueError):
+            return None
+
+
 class VirtualTimePort:
     """The pseudo terminal of an emulated chain, in virtual time."""
 
@@ -191,13 +275,7 @@ class VirtualTimePort:
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
-        self._control = socket.socket(socket.AF_UNIX)
-        self._control.settimeout(_REPLY_TIMEOUT_S)
-        try:
-            self._control.connect(control_path)
-        except OSError as error:
-            self._control.close()
-            raise PortError(f"{control_path}: no emulator answers there: {error}") from error
+        self._control = _control(control_path, _REPLY_TIMEOUT_S)
         try:
             self._serial = _open(device, baud)
         except BaseException:
@@ -275,6 +353,18 @@ class VirtualTimePort:
         except (OSError, ValueError) as error:
             raise BusError(f"{self.name}: the emulator is gone: {error}") from error
         self._announced = self._written
+
+
+def _control(path: str, patience_s: float) -> socket.socket:
+    """Return a connection to the control socket of an emulated chain. Raises PortError."""
+    control = socket.socket(socket.AF_UNIX)
+    control.settimeout(patience_s)
+    try:
+        control.connect(path)
+    except OSError as error:
+        control.close()
+        raise PortError(f"{path}: no emulator answers there: {error}") from error
+    return control
 
 
 # --- opening --------------------------------------------------------------------------------------------------------

@@ -461,7 +461,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.sent = None  # what the board does now is not what was sent
         if was_silent:
             self._counts["reconnects"] += 1
-            log.warning("bus %r: the %s answers again", self.name, self.model)
+            log.info("bus %r: the %s answers again", self.name, self.model)
             # Channels that the board switched off during the silence, if it reports them, come on again in turn.
             if self._read_pulses(wire) and not self._latched:
                 for output in self._outputs:
