@@ -79,6 +79,22 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
     raise AssertionError("no port was tried")
 
 
+def connect(address: str) -> socket.socket:
+    """Return a connection to HOST:PORT, without Nagle's delay, or to a socket in the file system. Raises OSError."""
+    place = host_and_port(address)
+    if place is None:
+        connection = socket.socket(socket.AF_UNIX)
+        try:
+            connection.connect(address)
+        except OSError:
+            connection.close()
+            raise
+        return connection
+    connection = socket.create_connection(place)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
 def origin_problem(origin: str | None, host: str) -> str | None:
     """Return why a page may not connect; None where it may, and for clients that are not browsers (`origin` None).
 

@@ -16,9 +16,11 @@ RobotError                      base; `exit_code` is what the command line retur
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
@@ -151,5 +153,27 @@ def optional(feature: str) -> Iterator[None]:
         package = (error.name or "").split(".")[0]
         if package not in EXTRA_OF:
             raise
-        install = f"pip install 'sfms-robot[{EXTRA_OF[package]}]'"
+        install = install_command(EXTRA_OF[package])
         raise MissingExtra(f"{feature} needs {package}, which is not installed: {install}") from error
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to this installation, to be typed in the present folder.
+
+    It names the pip of this Python: where `.venv` is not activated, plain `pip` is another one. In a checkout it
+    installs that, in place; else pip finds sfms-robot installed, and adds only what the extra needs.
+    """
+    from shutil import which
+
+    here, pip = Path.cwd(), "pip"
+    if Path(which("pip") or "").parent != Path(sys.executable).parent:
+        pip = f"{quote(_within(here, Path(sys.executable)))} -m pip"
+    checkout = Path(__file__).resolve().parent.parent
+    if (checkout / "pyproject.toml").is_file():
+        return f"{pip} install -e {quote(f'{_within(here, checkout)}[{extra}]')}"
+    return f"{pip} install {quote(f'sfms-robot[{extra}]')}"
+
+
+def _within(folder: Path, path: Path) -> str:
+    """Return `path` as it is typed in `folder`."""
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)

@@ -256,7 +256,9 @@ class PipeWriter:
             self._wake.wait()
             self._wake.clear()
             while self._full:
-                select.select([], [self._pipe], [], _FULL_S)
+                room = select.poll()  # takes pipes, and descriptors of any number
+                room.register(self._pipe, select.POLLOUT)
+                room.poll(1e3 * _FULL_S)
                 self._full = False
                 self._write_all()
             if not _NON_BLOCKING:

@@ -281,7 +281,7 @@ def demo(
     duration: float | None = Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
     fast: bool = Option(False, "--fast", help="Virtual time: as fast as it goes."),
     out: Path | None = Option(
-        None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
+        None, metavar="DIR", help="Where recording and pictures go; default: runs/demo, runs/demo-2, ..."
     ),
     overwrite: bool = Option(False, "--overwrite", help="Replace the recording that --out holds."),
     seeds: int | None = Option(
@@ -295,7 +295,7 @@ def demo(
     no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
     json: bool = JSON,
 ) -> None:
-    """A recorded person talks, an emulated head listens; a page shows it, or two pictures without a visitor."""
+    """A recorded person talks, an emulated head listens: on a page while it has visitors, else in two pictures."""
     from sfms_robot.app.options import RunOptions, begin_page, check_names
 
     options = RunOptions(

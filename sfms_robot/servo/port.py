@@ -7,9 +7,7 @@ adapter can do is allowed. If the driver offers it, bytes are handed over withou
 What differs between operating systems about an open device (waiting, exclusive use, rates, RS-485 direction) is at the
 end of this file. `fcntl` and `termios` are imported if the system has them, so that the package imports everywhere.
 
-`EmulatedPort` is a port to emulated servos, which asks the emulator before it lets a silence count.
-
-`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same pseudo terminal, but
+`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same device, but
 before a read the port sends the emulator, on a control socket, the number of bytes written so far and the time. The
 emulator takes exactly those bytes, moves its servos to that time, sends the length of its reply and writes it. So the
 result does not depend on scheduling, and a silence takes no real time.
@@ -27,9 +25,11 @@ import time
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
+from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import Holder, access_problem, holders, is_address
@@ -43,8 +43,6 @@ Rs485 = Literal["rts", "kernel"]
 
 WRITE_TIMEOUT_S: Final = 0.5  # a device that takes no bytes for so long counts as gone, and stopping must not wait
 _REPLY_TIMEOUT_S: Final = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
-_PATIENCE_S: Final = 1.0  # the longest that a port waits for an emulator in real time
-_CHUNK: Final = 4096
 _TERMINALS: Final = "/dev/pts/"
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 _POLL_S: Final = 0.0005
@@ -143,7 +141,7 @@ class SerialPort:
             _low_latency(self._serial)
             self.discard_input()
         except BaseException:
-            self._serial.close()
+            _shut(self._serial)
             raise
 
     def write(self, data: bytes) -> None:
@@ -179,95 +177,15 @@ class SerialPort:
             _check_baud(self._serial, self.name)
 
     def close(self) -> None:
-        self._serial.close()
-
-
-class EmulatedPort(SerialPort):
-    """A port to emulated servos in real time. A silence is one only if the emulator confirms it.
-
-    The emulator shares the computer's processors, so an answer may be late although its servo is there. When no byte
-    came by a deadline, the port asks the emulator, on its control socket, for the number of bytes that it has sent, and
-    waits for those that are missing. Meanwhile the port's clock stands still: what is late is this computer.
-    """
-
-    def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
-        self._late_s = 0.0
-        self._written = self._got = 0
-        self._settled = True  # the emulator has confirmed that nothing is to come
-        self._owed = 0  # answers of the emulator that have not come
-        self._control = _control(control_path, _PATIENCE_S)
-        self._ask()  # it counts bytes from here on
-        try:
-            super().__init__(device, baud, clock)
-        except BaseException:
-            self._control.close()
-            raise
-
-    def write(self, data: bytes) -> None:
-        self._settled = False
-        super().write(data)
-        self._written += len(data)
-
-    def read(self, n: int, deadline_s: float) -> bytes:
-        data = super().read(n, deadline_s)
-        if not data and not self._settled:
-            began_s = self.now_s()
-            data = self._late_bytes(n)
-            self._late_s += self.now_s() - began_s
-        self._got += len(data)
-        return data
-
-    def discard_input(self) -> None:
-        while data := SerialPort.read(self, _CHUNK, 0.0):  # counted, as a reset of the driver would not
-            self._got += len(data)
-
-    def now_s(self) -> float:
-        return self._clock.now_s() - self._late_s
-
-    def wait_until(self, time_s: float) -> None:
-        self._clock.wait_until(time_s + self._late_s)
-
-    def close(self) -> None:
-        super().close()
-        self._control.close()
-
-    def _late_bytes(self, n: int) -> bytes:
-        """Return bytes that the emulator has sent and that were not read; empty if there are none."""
-        sent = self._ask()
-        self._settled = sent is not None and sent <= self._got
-        if sent is None or self._settled:
-            return b""
-        data = SerialPort.read(self, n, self.now_s() + _PATIENCE_S)
-        if not data:  # lost: a terminal that is full takes no more
-            self._got, self._settled = sent, True
-        return data
-
-    def _ask(self) -> int | None:
-        """Return the bytes that the emulator has sent so far; None if it does not answer in time."""
-        answers = b""
-        try:
-            self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
-            while self._owed:
-                self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
-            self._control.settimeout(_PATIENCE_S)
-            self._control.sendall(b"quiet %d\n" % self._written)
-            self._owed = 1
-            while not answers.endswith(b"\n"):
-                if not (part := self._control.recv(_CHUNK)):
-                    return None  # it is gone, which the device shows
-                answers += part
-            self._owed = 0
-            return int(answers.removeprefix(b"quiet "))
-        except (OSError, ValueError):
-            return None
+        _shut(self._serial)
 
 
 class VirtualTimePort:
-    """The pseudo terminal of an emulated chain, in virtual time."""
+    """The device of an emulated chain, in virtual time; `control`: address of its control socket."""
 
-    _WINDOW = 2048  # bytes under way at most: more than the terminal holds would block for ever
+    _WINDOW = 2048  # bytes under way at most: more than a terminal holds would block for ever
 
-    def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
+    def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
         self.name = device
         self._clock = clock
         self._written = 0
@@ -275,12 +193,17 @@ class VirtualTimePort:
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
-        self._control = _control(control_path, _REPLY_TIMEOUT_S)
+        try:
+            self._control = connect(control)
+        except OSError as error:
+            raise PortError(f"{control}: no emulator answers there: {error}") from error
+        self._control.settimeout(_REPLY_TIMEOUT_S)
         try:
             self._serial = _open(device, baud)
         except BaseException:
             self._control.close()
             raise
+        self._io = serial_io(self._serial, device)
         self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
 
     def write(self, data: bytes) -> None:
@@ -326,7 +249,7 @@ class VirtualTimePort:
                 self._exchange(self._written_at_s)
             except BusError:
                 self._inbox.clear()  # the emulator is gone
-        self._serial.close()
+        _shut(self._serial)
         self._control.close()
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
@@ -341,30 +264,15 @@ class VirtualTimePort:
                     raise OSError("it closed its control socket")
                 line += part
             missing = int(line.removeprefix(b"ack "))
-            fd = self._serial.fileno()
             while missing > 0:
-                if not select.select([fd], [], [], _REPLY_TIMEOUT_S)[0]:
-                    raise OSError("the reply it announced does not come")
-                data = os.read(fd, missing)
+                data = self._io.read(missing, _REPLY_TIMEOUT_S)
                 if not data:
-                    raise OSError("end of file")
+                    raise OSError("the reply it announced does not come")
                 self._inbox += data
                 missing -= len(data)
         except (OSError, ValueError) as error:
             raise BusError(f"{self.name}: the emulator is gone: {error}") from error
         self._announced = self._written
-
-
-def _control(path: str, patience_s: float) -> socket.socket:
-    """Return a connection to the control socket of an emulated chain. Raises PortError."""
-    control = socket.socket(socket.AF_UNIX)
-    control.settimeout(patience_s)
-    try:
-        control.connect(path)
-    except OSError as error:
-        control.close()
-        raise PortError(f"{path}: no emulator answers there: {error}") from error
-    return control
 
 
 # --- opening --------------------------------------------------------------------------------------------------------
@@ -389,9 +297,17 @@ def _open(device: str, baud: int) -> serial.Serial:
             _claim(port, device)
             _check_baud(port, device)
     except BaseException:
-        port.close()
+        _shut(port)
         raise
     return port
+
+
+def _shut(port: serial.Serial) -> None:
+    """Close a device. pyserial leaves the connection open where the other end has closed it first."""
+    connection = getattr(port, "_socket", None)
+    port.close()
+    if connection is not None:
+        connection.close()
 
 
 def _claim(port: serial.Serial, device: str) -> None:
@@ -450,17 +366,22 @@ class DescriptorIO:
     """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop.
 
     Like the two classes below it raises one of `DEVICE_ERRORS` if the device is gone.
+
+    Args:
+        connection: of a network port, which Windows waits for and reads in the same way.
     """
 
-    def __init__(self, port: serial.Serial) -> None:
+    def __init__(self, port: serial.Serial, connection: socket.socket | None = None) -> None:
         self._fd = port.fileno()
+        self._take = partial(os.read, self._fd) if connection is None else connection.recv
+        self._give = partial(os.write, self._fd) if connection is None else connection.send
 
     def write(self, data: bytes) -> None:
         """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
         rest = memoryview(data)
         while rest:
             try:
-                rest = rest[os.write(self._fd, rest) :]
+                rest = rest[self._give(rest) :]
             except BlockingIOError:
                 if not select.select([], [self._fd], [], WRITE_TIMEOUT_S)[1]:
                     raise OSError("it takes no more bytes") from None
@@ -468,7 +389,7 @@ class DescriptorIO:
     def read(self, n: int, timeout_s: float) -> bytes:
         """Return 1 to `n` bytes as soon as there are any; empty if none came in `timeout_s`."""
         ready, _, _ = select.select([self._fd], [], [], timeout_s)
-        data = os.read(self._fd, n) if ready else b""
+        data = self._take(n) if ready else b""
         if ready and not data:
             raise OSError("the device is gone")
         return data
@@ -530,9 +451,10 @@ def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> Des
         except (OSError, ValueError, NotImplementedError, AttributeError) as error:
             problem = "the driver of this device does not switch the direction (rts: this program does, by RTS)"
             raise PortError(f"{name}: rs485 = 'kernel': {problem}") from error
+    connection = port._socket if name.startswith("socket://") else None
     try:
-        has_descriptor = _termios is not None and port.fileno() >= 0
+        has_descriptor = connection is not None or (_termios is not None and port.fileno() >= 0)
     except OSError:  # io.UnsupportedOperation
         has_descriptor = False
-    io = DescriptorIO(port) if has_descriptor else PolledIO(port)
+    io = DescriptorIO(port, connection) if has_descriptor else PolledIO(port)
     return RtsDirection(io, port, name) if rs485 == "rts" else io
