@@ -427,10 +427,10 @@ def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> It
     yield Finding("warning", "bus", f"reaches {reached} with {done} ({slow} takes most)", fix)
 
 
-def judge_board(family: str, channels: int, answers: bool, device: SerialDevice) -> Iterator[Finding]:
-    """Yield what can be said of a bus of hobby servos. `answers`: whether the board did."""
-    if not answers:
-        yield Finding("error", "bus", f"no {family} board answers", _BOARD_HELP[family])
+def judge_board(family: str, channels: int, problem: str | None, device: SerialDevice) -> Iterator[Finding]:
+    """Yield what can be said of a bus of hobby servos. `problem`: of what answers on its port (`board_problem`)."""
+    if problem is not None:
+        yield Finding("error", "bus", problem, _BOARD_HELP[family])
     elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
         yield Finding("note", "bus", "a Maestro on USB has two ports: the first takes commands, the second is its TTL")
     unknown = f"which of its {channels} servos are there, nor where they stand"

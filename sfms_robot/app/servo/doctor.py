@@ -32,18 +32,18 @@ from sfms_robot.app.servo.diagnosis import (
 )
 from sfms_robot.app.servo.serial_line import SIM, Confirm, FoundServo, Wire, check_baud, only_port, protocol_hint
 from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
-from sfms_robot.config import Head, load_head
+from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.boards import RateLimitedPort
+from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
-from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
+from sfms_robot.servo.registers import Table
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
@@ -329,19 +329,10 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
     """Return what can be said of a board, whose port could be opened."""
     channels = max(1, len(line.wanted))
     budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)
-    answers = _board_answers(line, port)
-    found = judge_board(line.family, len(line.wanted), answers, adapter)
+    table = Table.of(load_firmware_map(next(iter(line.wanted.values())).model))
+    wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
+    problem = board_problem(table, board_for(table, line.crc), wire)
+    found = judge_board(line.family, len(line.wanted), problem, adapter)
     findings = [*found, *judge_rate(budget, line)]
     facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
     return findings, facts
-
-
-def _board_answers(line: Line, port: Port) -> bool:
-    """Return whether the board answers the one question that it has, and not before its CRC where the head has one."""
-    wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
-    question, size = ssc32.query_moving(), 1
-    if line.family == "maestro":
-        question, size = maestro.addressed(maestro.get_errors()), 2
-    parts = [question, bytes([maestro.crc7(question)])] if line.crc else [question]
-    answers = [wire.exchange(part, size) for part in parts]
-    return answers.pop() is not None and not any(answers)
