@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire, protocol_hint
+from sfms_robot.app.servo.serial_line import Wire, open_wire, protocol_hint
 from sfms_robot.app.servo.single_servo import (
     Dump,
     checked_ids,
@@ -299,7 +299,8 @@ def test_a_path_that_is_no_port_and_a_family_that_is_not_known_say_why(tmp_path)
         with open_wire("sim", "dynamixel3", None, "face28"):
             pass
     with pytest.raises(PortError, match="directory"):
-        check_device(str(tmp_path))
+        with open_wire(str(tmp_path), "dynamixel2", None, ""):
+            pass
     with pytest.raises(PortError, match="no such device"), open_wire(str(tmp_path / "x"), "dynamixel2", None, ""):
         pass
 

@@ -177,6 +177,12 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
         yield Finding("warning", device.path, problem, fix)
 
 
+def judge_rivals(path: str, found: Iterable[tuple[str, str]]) -> Iterator[Finding]:
+    """Yield what else uses a port, or takes it when it is plugged in (`discovery.rivals`)."""
+    for problem, fix in found:
+        yield Finding("warning", path, problem, fix)
+
+
 def udev_rule(device: SerialDevice) -> str | None:
     """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
@@ -234,11 +240,11 @@ def judge_presence(
             yield Finding("warning", line.name(servo), problem, servo=servo)
 
 
-def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
+def judge_duplicate_ids(ids: Sequence[int], line: Line) -> Iterator[Finding]:
     """Yield the ids to which two servos seem to answer."""
     for servo in ids:
         problem = "two servos seem to answer to this id (or the wire is disturbed)"
-        fix = f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW"
+        fix = f"unplug all but one of them, then: {line.servo(f'set-id {servo} NEW')}"
         yield Finding("error", f"id {servo}", problem, fix, servo=servo)
 
 

@@ -25,6 +25,7 @@ from sfms_robot.app.servo.diagnosis import (
     judge_port,
     judge_presence,
     judge_rate,
+    judge_rivals,
     judge_servo,
     stored_contradictions,
     udev_rule,
@@ -40,7 +41,7 @@ from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
-from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports, rivals
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Table
@@ -101,12 +102,14 @@ def examine_line(
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
     if problem is not None:
-        return _finished(report, [judge_port(path, problem, group_of(path), list_ports())], PORT_FAILED)
+        failed = judge_port(path, problem, group_of(path), list_ports())
+        return _finished(report, [failed, *judge_rivals(path, rivals(path))], PORT_FAILED)
+    others = list(judge_rivals(path, rivals(path)))
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port(path, line.first_baud)
     except PortError as error:
-        return _finished(report, judge_opening(path, str(error), held_by), PORT_FAILED)
+        return _finished(report, [*judge_opening(path, str(error), held_by), *others], PORT_FAILED)
     with closing(port):
         adapter = describe(path)  # after opening, which may have set the latency
         report["adapter"] = asdict(adapter)
@@ -119,7 +122,7 @@ def examine_line(
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
         else:
             report |= {**facts, "udev_rule": udev_rule(adapter)}
-    return _finished(report, [*judge_adapter(adapter, held_by), *found])
+    return _finished(report, [*judge_adapter(adapter, held_by), *others, *found])
 
 
 def _finished(report: dict[str, Any], findings: Iterable[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
@@ -207,7 +210,7 @@ def _look(
             level = seen.table.role("status_level") if seen.table else None
             cure = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
             findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
-    findings += judge_duplicate_ids(double)
+    findings += judge_duplicate_ids(double, line)
     for state in states:
         findings += judge_servo(state, line)
     members = [state for state in states if state.seen.id in here and state.seen.table is not None]

@@ -445,7 +445,7 @@ def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: in
         absent = ", ".join(f"{startup.servo.id} ({startup.servo.joint})" for startup in startups)
         raise BusError(
             f"bus {bus!r} on {link.port.name} at {baud} baud: no answer from id {absent}; "
-            f"look for them: sfms-robot servo scan --port {link.port.name}"
+            f"look for them: {startups[0].servo.doctor.removesuffix(' --fix')}"
         )
     return bits
 
