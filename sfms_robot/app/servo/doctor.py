@@ -31,7 +31,16 @@ from sfms_robot.app.servo.diagnosis import (
     udev_rule,
     wire_budget,
 )
-from sfms_robot.app.servo.serial_line import SIM, Confirm, FoundServo, Wire, check_baud, only_port, protocol_hint
+from sfms_robot.app.servo.serial_line import (
+    SIM,
+    Confirm,
+    FoundServo,
+    Wire,
+    check_baud,
+    only_port,
+    other_wires,
+    protocol_hint,
+)
 from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
@@ -191,7 +200,7 @@ def _look(
     """Return findings and facts that need the open port."""
     here, elsewhere = _present(wire, line, progress)
     baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
-    hint = "" if here or elsewhere else protocol_hint(wire)
+    hint = "" if here or elsewhere else protocol_hint(other_wires(wire))
     findings = list(judge_presence(line, here, elsewhere, baud, hint))
     fixed: list[str] = []
     states: list[ServoState] = []

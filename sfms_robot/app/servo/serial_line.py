@@ -90,6 +90,7 @@ class FoundServo:
             "model_number": self.model_number,
             "firmware": self.firmware,
             "baud": self.baud,
+            "family": self.wire.family,
             "note": note,
         }
 
@@ -319,25 +320,28 @@ _ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
 _RATES: Final = 3  # of each family, those met most often
 
 
-def protocol_hint(wire: Wire) -> str:
-    """Return the `--family` to type where servos answer to another protocol, or nothing.
+def other_wires(wire: Wire) -> Iterator[Wire]:
+    """Yield the same port for each other family whose servos answer, at the rate at which they do.
 
-    Each family is tried at its usual rates, the wire's own first: by a broadcast ping, or for protocol 1, whose frames
-    the families share, by the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
+    Each family is tried at its usual rates: by a broadcast ping, or for protocol 1, whose frames the families share, by
+    the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
     """
     before = wire.baud
     try:
-        for name in sorted(servo_families(), key=lambda name: name != wire.family):
-            family = servo_families()[name]
-            for baud in family.bauds[:_RATES]:
+        for name, family in servo_families().items():
+            for baud in family.bauds[:_RATES] if name != wire.family else ():
                 with suppress(PortError):  # of an adapter that cannot do this rate
                     wire.at(baud)
                     other = Wire(wire.port, name, wire.clock, baud, fixed=True)
                     other.link.silence_s = _ID_S
                     ids = None if family.protocol == 2 else range(1, _FIRST_IDS + 1)
                     if any(seen.table is not None for seen in other.answering(ids)):
-                        same = name == wire.family
-                        return "" if same else f"these servos answer {family.title} at {baud} baud: --family {name}"
+                        yield other
+                        break
     finally:
         wire.at(before)
-    return ""
+
+
+def protocol_hint(wires: Iterable[Wire]) -> str:
+    """Return the `--family` to type for servos that answer to another protocol (`other_wires`); empty for none."""
+    return "; ".join(f"servos answer {each.kind.title} at {each.baud} baud: --family {each.family}" for each in wires)
