@@ -331,7 +331,8 @@ def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: Seria
 def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
     want = line.wanted.get(state.seen.id)
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
-    return {**state.seen.row(), "joint": want and want.joint, **measured, **state.health()}
+    row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the bus has it
+    return {**row, "joint": want and want.joint, **measured, **state.health()}
 
 
 # --- a board of hobby servos ----------------------------------------------------------------------------------------
