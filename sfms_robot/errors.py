@@ -24,6 +24,7 @@ from shlex import quote
 from typing import Final
 
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
+NOTE: Final = 25  # level of a log line that informs: shown as a plain line. A WARNING is something to act on.
 
 
 class RobotError(Exception):

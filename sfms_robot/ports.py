@@ -276,6 +276,7 @@ class Tick:
         written_s: loop time at which the goals were on the wire; None where it was not measured.
         origin_s: loop time 0 in seconds of `time.monotonic`, in virtual time of the virtual clock; None on the way to
             rest.
+        busy: this computer is late, and by how much, in words; None: it is not.
     """
 
     time_s: float
@@ -286,6 +287,7 @@ class Tick:
     why: tuple[str, ...] = ()
     written_s: float | None = None
     origin_s: float | None = None
+    busy: str | None = None
 
 
 class Clock(Protocol):

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sfms_robot.data import find
-from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router
 from sfms_robot.plugins import listener_folder
-from sfms_robot.servo.discovery import access_problem, is_address
+from sfms_robot.servo.discovery import AUTO, check_device
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
 if TYPE_CHECKING:
@@ -116,8 +116,8 @@ def check_names(options: RunOptions) -> None:
         status_server(options.status).close()
     for part in options.port.split(","):
         device = part.rpartition("=")[2]
-        if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
-            raise PortError(f"--port {device}: {problem}")
+        if device not in ("", SIM, AUTO):
+            check_device(device, "--port ")
 
 
 def engine_named(name: str) -> EngineName:

@@ -26,7 +26,7 @@ from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, 
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
 from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.config import Calmness, Head, parse
-from sfms_robot.errors import ConfigError, RobotError, TorqueError
+from sfms_robot.errors import NOTE, ConfigError, RobotError, TorqueError
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
@@ -207,7 +207,7 @@ def run(
         server = None
         if options.status is not None:  # a port that is in use is found before a listener is loaded
             server = stack.enter_context(closing(status_server(options.status)))
-            logger.warning("status: %s%s", server.url, server.note)
+            logger.log(NOTE, "status: %s%s", server.url, server.note)
             server.begin(RunStatus((), facts).document)
         opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:

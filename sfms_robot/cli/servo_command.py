@@ -76,14 +76,12 @@ def scan(
     ids: str | None = Option(None, "--ids", help="Ask these one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
-    from sfms_robot.app.servo.serial_line import protocol_hint
-    from sfms_robot.app.servo.single_servo import scan as look
+    from sfms_robot.app.servo.single_servo import scan_all
 
     asked = _parsed(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
-        hint = protocol_hint(wire)
-        rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
-        where = wire.port.name
+        found, hint = scan_all(wire, asked, progress)
+        rows, where = [seen.row() for seen in found], wire.port.name
     title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
     _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
@@ -98,7 +96,7 @@ def ping(on: Wiring, ids: str = IDS) -> None:
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
-                unknown = dict.fromkeys(("model", "model_number", "firmware", "baud"))
+                unknown = dict.fromkeys(("model", "model_number", "firmware", "baud", "family"))
                 rows.append({"id": servo, **unknown, "note": "", "answers": False})
     _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):

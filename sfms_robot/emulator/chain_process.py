@@ -11,6 +11,8 @@ control socket says how many there are and what time it is. Control requests and
 
     sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
                                                  due by UNTIL; what came by SECONDS for bytes before FROM is lost
+    quiet BYTES                      quiet LENGTH  take BYTES in total and send what is due: LENGTH bytes in total,
+                                                 both since the client's first such request
     time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
@@ -183,6 +185,7 @@ class _Client:
     buffer: bytearray = field(default_factory=bytearray)
     taken: int = 0
     wanted_from: int = 0
+    since: tuple[int, int] | None = None  # bytes that the wire had received and sent at its first `quiet`
 
     def reply(self, answer: str) -> None:
         try:
@@ -273,6 +276,8 @@ class Server:
             try:
                 if words[0] == "sync":
                     self._sync(client, int(words[1]), int(words[2]), *map(float, words[3:5]))
+                elif words[0] == "quiet":
+                    client.reply(self._quiet(client, int(words[1])))
                 else:
                     client.reply(self._command(words))
             except (ValueError, IndexError, TypeError):
@@ -310,6 +315,18 @@ class Server:
         client.reply(f"ack {len(reply)}")
         device.send(reply, _PATIENCE_S)
         self._wire.sent(outs, None)
+
+    def _quiet(self, client: _Client, count: int) -> str:
+        """Take the bytes that a client has written, and send all that is due: a silence after that is the servos'."""
+        if client.since is None:
+            client.since = self._wire.traffic
+        received, sent = client.since
+        while self._device is not None and self._wire.traffic[0] - received < count:
+            if not (data := self._device.take(_CHUNK, _PATIENCE_S)):
+                break
+            self._wire.receive(data, self._device.baud(), self._now())
+        self._deliver()
+        return f"quiet {self._wire.traffic[1] - sent}"
 
     def _command(self, words: list[str]) -> str:
         """Carry out any other request; return the answer. Raises ValueError for a number that cannot be read."""

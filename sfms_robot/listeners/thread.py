@@ -132,7 +132,7 @@ class Lateness:
                 log.warning(text, given_s * 1e3)
                 self._source_said = True
             if self.lasting:
-                log.warning("the listener's plans are in time again")
+                log.info("the listener's plans are in time again")
             self.lasting, self._since_s = False, None
             return
         self._since_s = now_s if self._since_s is None else self._since_s
@@ -196,7 +196,7 @@ class ListenerThread:
             log.warning("the listener has not answered for %.1f s; the run continues", silent_s)
             self._state = "hung"
         elif not hung and self._state == "hung":
-            log.warning("the listener answers again")
+            log.info("the listener answers again")
             self._state = "listening"
         return plans
 

@@ -161,6 +161,7 @@ def drive(
                         why=state.run.why,
                         written_s=written_s,
                         origin_s=clock.origin_s + start_s,
+                        busy=log.pace.busy,
                     )
                 )
         finally:

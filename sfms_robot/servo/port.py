@@ -152,7 +152,7 @@ class SerialPort:
 
     def read(self, n: int, deadline_s: float) -> bytes:
         try:
-            return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
+            return self._io.read(n, max(0.0, deadline_s - self.now_s()))
         except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 

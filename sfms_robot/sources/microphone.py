@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.errors import NOTE
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.ports import Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
@@ -411,5 +412,5 @@ def _opened(recording: Recording, early_s: float | None = None) -> Microphone:
     worker = SourceWorker(name, listen, recording)
     worker.wait()
     microphone = Microphone(worker, early_s)
-    logger.warning("%s: %s", name, microphone.device)
+    logger.log(NOTE, "%s: %s", name, microphone.device)
     return microphone

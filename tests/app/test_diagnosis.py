@@ -125,7 +125,7 @@ def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
 
 def test_findings_alike_are_one_and_the_worst_come_first():
     notes = [Finding("note", f"id {i}", "slow", "do {id}", servo=i) for i in (3, 1, 2)]
-    out = grouped([*notes, *judge_duplicate_ids([7])])
+    out = grouped([*notes, *judge_duplicate_ids([7], LINE)])
     assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
     assert out[1].fix == "do 1-3"
 

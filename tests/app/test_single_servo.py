@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire, protocol_hint
+from sfms_robot.app.servo.serial_line import Wire, open_wire, other_wires, protocol_hint
 from sfms_robot.app.servo.single_servo import (
     Dump,
     checked_ids,
@@ -19,6 +19,7 @@ from sfms_robot.app.servo.single_servo import (
     restore,
     save_dump,
     scan,
+    scan_all,
     set_baud,
     set_id,
     watched,
@@ -299,7 +300,8 @@ def test_a_path_that_is_no_port_and_a_family_that_is_not_known_say_why(tmp_path)
         with open_wire("sim", "dynamixel3", None, "face28"):
             pass
     with pytest.raises(PortError, match="directory"):
-        check_device(str(tmp_path))
+        with open_wire(str(tmp_path), "dynamixel2", None, ""):
+            pass
     with pytest.raises(PortError, match="no such device"), open_wire(str(tmp_path / "x"), "dynamixel2", None, ""):
         pass
 
@@ -388,9 +390,20 @@ def test_servos_of_another_protocol_are_named(model, baud, asked):
     servo = EmulatedServo(1, model, baud, load_firmware_map(model).center_ticks)
     with wire_on(servo, family=asked) as (wire, chain):
         before, began_s = wire.baud, wire.clock.now_s()
-        hint = protocol_hint(wire)
+        hint = protocol_hint(other_wires(wire))
         spoken = SPOKEN[model]
         assert ("" if spoken == asked else f"--family {spoken}") in hint and bool(hint) == (spoken != asked)
         assert wire.baud == before and wire.clock.now_s() - began_s < 3.0
         chain.kill(1)
-        assert protocol_hint(wire) == ""  # an empty wire
+        assert protocol_hint(other_wires(wire)) == ""  # an empty wire
+
+
+@pytest.mark.parametrize("asked", ["dynamixel2", "feetech"])
+def test_a_scan_of_a_mixed_wire_lists_the_servos_of_every_protocol(asked):
+    mixed = EmulatedServo(1), EmulatedServo(7, "sts3215", 1_000_000), EmulatedServo(8, "sts3215", 1_000_000)
+    with wire_on(*mixed, family=asked) as (wire, _):
+        found, hint = scan_all(wire, [1, 7, 8])
+        assert {(seen.id, seen.model, seen.wire.family) for seen in found} == {
+            (1, "xl330-m288", "dynamixel2"), (7, "sts3215", "feetech"), (8, "sts3215", "feetech")
+        }  # fmt: skip
+        assert hint.endswith({"dynamixel2": "--family feetech", "feetech": "--family dynamixel2"}[asked])

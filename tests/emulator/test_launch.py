@@ -10,6 +10,7 @@ import pytest
 import serial
 from virtual_time import Time
 
+from sfms_robot.app.wiring import EmulatedPort
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
 from sfms_robot.errors import BusError, ConfigError, PortError
 from sfms_robot.runtime.clock import RealClock
@@ -67,6 +68,38 @@ def ping(device: str, servo: int, baud: int = BAUD) -> bytes:
     with serial.serial_for_url(device, baud, timeout=10) as port:
         port.write(encode_instruction(servo, dxl2.PING))
         return port.read(14)
+
+
+class Resuming(RealClock):
+    """A clock that lets a stopped process continue once `at_s` is past."""
+
+    at_s, pid = float("inf"), 0
+
+    def now_s(self):
+        now_s = super().now_s()
+        if now_s > self.at_s:
+            os.kill(self.pid, signal.SIGCONT)
+        return now_s
+
+
+@pytest.mark.parametrize("transport", ["pty", "tcp"])
+def test_a_silence_counts_only_if_the_emulator_confirms_it(transport):
+    clock = Resuming()
+    with launch([EmulatedServo(1), EmulatedServo(2)], transport=transport) as chain:
+        port = EmulatedPort(chain.device, chain.control, BAUD, clock)
+        port.discard_input()
+        chain.kill(2)
+        port.write(encode_instruction(2, dxl2.PING))
+        assert port.read(14, port.now_s() + 0.001) == b""  # it is silent
+        os.kill(chain.pid, signal.SIGSTOP)
+        port.write(encode_instruction(1, dxl2.PING))
+        clock.pid, clock.at_s = chain.pid, clock.now_s() + 0.001
+        deadline_s = port.now_s() + 0.001
+        assert len(port.read(14, deadline_s)) == 14  # the emulator is late
+        port.wait_until(deadline_s + 0.001)
+        assert clock.now_s() > clock.at_s + 0.001  # which is not time of the servos
+        assert port.read(14, port.now_s()) == b""
+        port.close()
 
 
 def test_reply_that_is_late_counts_as_silence_and_cannot_come_after_the_next_flush(virtual):

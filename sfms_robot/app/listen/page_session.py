@@ -27,7 +27,7 @@ from sfms_robot.app.listen.report import run_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
-from sfms_robot.errors import InputError
+from sfms_robot.errors import NOTE, InputError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
@@ -257,7 +257,7 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
     Raises PortError, ConfigError where it cannot.
     """
     page.wait()
-    logger.warning("page: %s", page)
+    logger.log(NOTE, "page: %s", page)
     with TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
         yield PageSession(page, options, Path(folder), choices)
 

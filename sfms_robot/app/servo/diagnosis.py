@@ -177,6 +177,12 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
         yield Finding("warning", device.path, problem, fix)
 
 
+def judge_rivals(path: str, found: Iterable[tuple[str, str]]) -> Iterator[Finding]:
+    """Yield what else uses a port, or takes it when it is plugged in (`discovery.rivals`)."""
+    for problem, fix in found:
+        yield Finding("warning", path, problem, fix)
+
+
 def udev_rule(device: SerialDevice) -> str | None:
     """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
@@ -234,11 +240,11 @@ def judge_presence(
             yield Finding("warning", line.name(servo), problem, servo=servo)
 
 
-def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
+def judge_duplicate_ids(ids: Sequence[int], line: Line) -> Iterator[Finding]:
     """Yield the ids to which two servos seem to answer."""
     for servo in ids:
         problem = "two servos seem to answer to this id (or the wire is disturbed)"
-        fix = f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW"
+        fix = f"unplug all but one of them, then: {line.servo(f'set-id {servo} NEW')}"
         yield Finding("error", f"id {servo}", problem, fix, servo=servo)
 
 
@@ -427,10 +433,10 @@ def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> It
     yield Finding("warning", "bus", f"reaches {reached} with {done} ({slow} takes most)", fix)
 
 
-def judge_board(family: str, channels: int, answers: bool, device: SerialDevice) -> Iterator[Finding]:
-    """Yield what can be said of a bus of hobby servos. `answers`: whether the board did."""
-    if not answers:
-        yield Finding("error", "bus", f"no {family} board answers", _BOARD_HELP[family])
+def judge_board(family: str, channels: int, problem: str | None, device: SerialDevice) -> Iterator[Finding]:
+    """Yield what can be said of a bus of hobby servos. `problem`: of what answers on its port (`board_problem`)."""
+    if problem is not None:
+        yield Finding("error", "bus", problem, _BOARD_HELP[family])
     elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
         yield Finding("note", "bus", "a Maestro on USB has two ports: the first takes commands, the second is its TTL")
     unknown = f"which of its {channels} servos are there, nor where they stand"

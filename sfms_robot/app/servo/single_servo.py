@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 import yaml
 
 from sfms_robot.app.output_paths import checked_file
-from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
+from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask, other_wires, protocol_hint
 from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
@@ -65,6 +65,23 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
             found += [replace(seen, twice=wire.has_duplicate(seen.id)) for seen in wire.answering(some)]
     progress(total, total, f"{len(found)} found")
     return found
+
+
+def scan_all(
+    wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_progress
+) -> tuple[list[FoundServo], str]:
+    """Return the servos of `scan` and those of other families on the same wire, and the `--family` of these.
+
+    Families of protocol 1 share their frames: a servo is listed under the one that knows its model.
+    """
+    others = list(other_wires(wire))
+    found: list[FoundServo] = []
+    for each in (wire, *others):
+        wire.at(each.baud)  # one port for all
+        found += scan(each, ids, progress)
+    known = {(seen.id, seen.baud) for seen in found if seen.table is not None}
+    listed = [seen for seen in found if seen.table is not None or (seen.id, seen.baud) not in known]
+    return listed, protocol_hint(others)
 
 
 def checked_ids(text: str) -> list[int]:
