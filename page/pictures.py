@@ -27,7 +27,7 @@ from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.config import load_head
 from sfms_robot.data import data_dir
 
-OUT = Path(__file__).parent.parent / "docs" / "page"
+OUT = Path(__file__).parent.parent / "docs" / "guide" / "page"
 HEADS = ("face28", "reachy_mini", "face24_maestro", "inmoov2_maestro", "inmoov2_ssc32", "interbotix_wxxms", "op3_head",
          "open_duck_mini_v2_head", "poppy_head")  # fmt: skip
 DESKTOP, PHONE = (1280, 980), (390, 844)
