@@ -230,7 +230,7 @@ def load_firmware_map(model: str) -> FirmwareMap:
     if model.endswith(".yaml"):
         return load(FirmwareMap, Path(model))
     files, model = map_files(), model_name(model)
-    named = [file for file in files if file.stem == model]
+    named = [file for file in files if model_name(file.stem) == model]
     if len(named) > 1:
         raise ConfigError(f"{named[1]}: expected another name, as {model} has a map already ({named[0]})")
     if not named:

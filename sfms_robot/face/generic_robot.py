@@ -27,7 +27,7 @@ _PARTS: Final = (
     (("nose",), (0.078, 0.010, 0.084), (0.010, 0.008, 0.012), "1 0 0", "0.80 0.62 0.52"),
     (("jaw", "tongue"), (0.050, 0.020, 0.026), (0.046, 0.050, 0.012), "0 1 0", "0.70 0.52 0.45"),
     (("mouth",), (0.072, 0.022, 0.060), (0.008, 0.018, 0.006), "1 0 0", "0.72 0.30 0.30"),
-    (("",), (0.000, 0.045, 0.176), (0.006, 0.006, 0.050), "1 0 0", "0.45 0.50 0.55"),
+    ((), (0.000, 0.045, 0.176), (0.006, 0.006, 0.050), "1 0 0", "0.45 0.50 0.55"),
 )
 
 
@@ -50,8 +50,8 @@ def generic_urdf(head: Head) -> bytes:
     for name, used in channels.items():
         if name in turning or name in neck:
             continue
-        row = next(i for i, (begins, *_) in enumerate(_PARTS) if not used or any(c.startswith(begins) for c in used))
-        row = row if used else len(_PARTS) - 1
+        rows = (i for i, (begins, *_) in enumerate(_PARTS) if any(c.startswith(begins) for c in used))
+        row = next(rows, len(_PARTS) - 1)
         _, (x, y, z), size, axis, color = _PARTS[row]
         side = 1 if "left" in name or name.endswith("_l") else -1 if "right" in name or name.endswith("_r") else 0
         if len(size) == 1 and not side:  # a joint of both eyes: a bar between them, not a third one

@@ -81,8 +81,13 @@ class Serial:
         self._ranges = {name: ranges[name] for name in self.joints}
         self._column = {name: column for column, name in enumerate(self.joints)}
         self._axes = tuple(rotations.AXIS[name] for name in config.order)
-        # Of each axis its joint, or two; None: the differential's.
-        self._places: Sequence[str | Split | None] = [config.axes.get(name) for name in config.order]
+        places = [config.axes.get(name) for name in config.order]
+        self._places: Sequence[str | Split | None] = places  # per axis its joint, or two; None: the differential's
+        single = [(column, place) for column, place in enumerate(places) if isinstance(place, str)]
+        self._single_axes = np.array([column for column, _ in single], dtype=np.intp)
+        self._single_joints = np.array([self._column[name] for _, name in single], dtype=np.intp)
+        self._single_low, self._single_high = np.array([ranges[name] for _, name in single]).reshape(-1, 2).T
+        self._splits = [(column, place) for column, place in enumerate(places) if isinstance(place, Split)]
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
         """Solve poses (..., 6), each held for ever. Without `body_yaw_rad` (...) the neck's own rule turns the body.
@@ -110,8 +115,8 @@ class Serial:
         """Return the joints (J,) for one pose (6,) after `dt_s`, and the memory after it."""
         wanted = checked(pose)
         angles, slow = self._axis_angles(wanted), memory.copy()
-        for column, place in enumerate(self._places):
-            if isinstance(place, Split) and place.crossover_hz is not None:
+        for column, place in self._splits:
+            if place.crossover_hz is not None:
                 slow[column] = low_pass(angles[column], memory[column], place.crossover_hz, dt_s)
         return self._joint_angles(angles, slow), slow
 
@@ -135,12 +140,10 @@ class Serial:
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
         """Return joints (..., J) inside their ranges for axis angles and their low-passed ones (..., k)."""
         out = np.zeros((*angles.shape[:-1], len(self.joints)))
-        for column, place in enumerate(self._places):
+        alone = np.minimum(np.maximum(angles[..., self._single_axes], self._single_low), self._single_high)
+        out[..., self._single_joints] = alone
+        for column, place in self._splits:
             angle = angles[..., column]
-            if isinstance(place, str):
-                out[..., self._column[place]] = np.clip(angle, *self._ranges[place])
-            if not isinstance(place, Split):
-                continue
             low = slow[..., column] if place.lower_share is None else place.lower_share * angle
             parts = shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
             for joint, part in zip((place.lower, place.upper), parts, strict=True):

@@ -115,3 +115,9 @@ def test_a_folder_that_exists_is_kept(tmp_path):
     (tmp_path / "file.json").write_text(json.dumps(LEROBOT))
     with pytest.raises(ConfigError, match="exists already"):
         import_head(tmp_path / "file.json", tmp_path)
+
+
+def test_a_folder_that_cannot_be_made_names_the_option(tmp_path):
+    (tmp_path / "file.json").write_text(json.dumps(LEROBOT))
+    with pytest.raises(ConfigError, match="--to .*made: cannot be written to"):
+        import_head(tmp_path / "file.json", tmp_path / "file.json" / "made")

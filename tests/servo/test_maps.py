@@ -137,6 +137,8 @@ def test_a_map_in_the_users_folder_is_found_by_name_and_number(tmp_path, monkeyp
     (folder / "sts9999.yaml").write_text(own)
     assert load_firmware_map("sts9999").model_number == 61999 and list_maps()[-1]["model"] == "sts9999"
     assert table_of("feetech", 61999, None).model == "sts9999"
+    (folder / "STS8888.yaml").write_text(own.replace("61999", "61998").replace("sts9999", "STS8888"))
+    assert load_firmware_map("STS8888").model_number == 61998 and table_of("feetech", 61998, None).model == "STS8888"
     (folder / "sts3032.yaml").write_text(text)
     load_firmware_map.cache_clear()
     with pytest.raises(ConfigError, match="sts3032.yaml: expected another name, as sts3032 has a map already"):

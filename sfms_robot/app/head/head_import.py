@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 import yaml
 from pydantic import BaseModel, Field, RootModel
 
+from sfms_robot.app.output_paths import made_folder
 from sfms_robot.config.base import parse, read
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files
 from sfms_robot.config.head import Head
@@ -76,8 +77,7 @@ def import_head(file: Path, folder: Path | None = None, model: str | None = None
     parse(Head, head, file)
     lines = [f"# From {file.name}, read as {source}.", *(f"# {remark}" for remark in remarks)]
     text = yaml.safe_dump(head, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
-    folder.mkdir(parents=True)
-    (folder / "head.yaml").write_text("\n".join([*lines, text]), encoding="utf-8")
+    (made_folder(folder, "--to") / "head.yaml").write_text("\n".join([*lines, text]), encoding="utf-8")
     return ImportedHead(folder, source, list(head["joints"]), remarks)
 
 
