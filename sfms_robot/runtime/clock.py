@@ -83,7 +83,7 @@ def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTim
         index += 1
 
 
-class Pace:
+class TickPace:
     """A judge of the loop's lateness: late ticks close together are one incident, with a log line and a name.
 
     Attributes:

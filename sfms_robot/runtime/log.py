@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.audit import CommandAudit
-from sfms_robot.runtime.clock import Pace, TickTime
+from sfms_robot.runtime.clock import TickPace, TickTime
 from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
@@ -114,7 +114,7 @@ class RunLog:
     ticks: int = 0
     late: int = 0
     skipped: int = 0
-    pace: Pace = field(default_factory=Pace)
+    pace: TickPace = field(default_factory=TickPace)
     frames: int = 0
     judged_frames: int = 0  # whose attention is known
     attentive_frames: int = 0

@@ -167,7 +167,6 @@ def drive(
         finally:
             state = _ending(log, clock.now_s() - start_s, state)
             if not parts.halt.causes:  # a head that was halted moves no more
-                way = tick_times(clock, rate_hz, start_s)
                 seen = partial(_seen_on_the_way, observers, state)
                 come_to_rest(
                     parts.bus,
@@ -175,7 +174,7 @@ def drive(
                     state.limiter,
                     from_rad=state.here_rad,
                     rest_rad=parts.rest_rad,
-                    ticks=way,
+                    ticks=tick_times(clock, rate_hz, start_s),
                     log=log,
                     seen=seen,
                 )

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from sfms_robot.runtime.clock import Pace, VirtualClock, tick_times
+from sfms_robot.runtime.clock import TickPace, VirtualClock, tick_times
 
 
 def test_ticks_are_exact_multiples_of_the_period() -> None:
@@ -47,7 +47,7 @@ def test_ticks_go_on_from_where_the_clock_is() -> None:
 
 
 def test_a_busy_computer_is_one_name_for_an_incident_and_one_line_in_a_minute(caplog):
-    pace, shown = Pace(), []
+    pace, shown = TickPace(), []
     late_s = {100: 0.05, 120: 0.08, 130: 0.06, 1000: 0.04, 7000: 0.041}
     for tick in range(7001):
         pace.judge(tick / 100, late_s.get(tick, 0.0), 0.03 if tick == 7000 else 0.001)
