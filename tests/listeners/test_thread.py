@@ -81,6 +81,7 @@ def test_plans_in_time_are_no_matter_however_late_they_are():
 
 
 def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_time(caplog):
+    caplog.set_level("INFO")
     lateness = Lateness()
     assert told(lateness, 0.0, LATE_S, 0.4) == []
     assert told(lateness, LATE_S, 5.0, 0.4)

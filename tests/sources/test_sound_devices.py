@@ -125,7 +125,7 @@ def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
     told = voice.statistics()
     assert told["rate_hz"] == 192_000 and told["not_finite"] == 4_800 * (2 if channels == 2 else 1)
     heard = np.concatenate([frame for frame in map(voice.take, range(40)) if frame is not None])
-    assert np.abs(heard).max() == pytest.approx(0.1 if channels == 2 else 0.25, abs=0.06) and heard.any()
+    assert np.abs(heard).max() == pytest.approx(0.25, abs=0.06) and heard.any()  # two of opposite sign: one turned
 
 
 def test_a_device_that_gives_no_more_sound_went_away():
