@@ -18,7 +18,6 @@ emergency stop is a switch on the head (docs/safety.md).
 
 from __future__ import annotations
 
-import asyncio
 import hmac
 import json
 import logging
@@ -373,6 +372,8 @@ def fleet_page(fleet: Fleet, port: int = PORT) -> LocalServer:
 
     GET /: the page. GET /heads: {"heads": [tile, ...]}. POST /halt, /resume: {"heads": [name, ...]}, none: all.
     """
+    import asyncio
+
     from starlette.requests import Request
     from starlette.responses import HTMLResponse, JSONResponse, Response
     from starlette.routing import Route

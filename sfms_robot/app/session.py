@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_name
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
@@ -43,7 +42,6 @@ from sfms_robot.runtime.observers import NotifyingObserver, RunStatus, ServiceMa
 from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
-from sfms_robot.viewer.web_server import status_server
 
 if TYPE_CHECKING:
     from sfms_robot.sources.net_person import PageVisitor
@@ -206,6 +204,8 @@ def run(
             stack.enter_context(halt_switch(options.halt_on, halt))
         server = None
         if options.status is not None:  # a port that is in use is found before a listener is loaded
+            from sfms_robot.viewer.web_server import status_server  # a web server: 50 ms
+
             server = stack.enter_context(closing(status_server(options.status)))
             logger.log(NOTE, "status: %s%s", server.url, server.note)
             server.begin(RunStatus((), facts).document)
@@ -231,6 +231,8 @@ def run(
         if (manager := ServiceManager()).wanted:
             watchers.append(NotifyingObserver(manager))
         if options.fleet is not None:
+            from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
+
             reach, key = (FleetControls(halt, interrupt, knobs, controls.set_rates), fleet_key(options.fleet_key))
             fleet = FleetHead(options.fleet, status.document, reach, options.router, key)
             watchers.append(stack.enter_context(closing(fleet)))
@@ -257,6 +259,8 @@ def run(
 def _check(options: RunOptions) -> None:
     """Raise ConfigError for options that exclude one another or cannot work here, before anything is opened."""
     if options.fleet is not None:
+        from sfms_robot.app.fleet import fleet_key, fleet_name  # its messages are models: 30 ms
+
         fleet_name(options.fleet)
         session_config("call", options.router)
         fleet_key(options.fleet_key)
