@@ -226,9 +226,11 @@ def pose(
 ) -> None:
     """Move one expression or channel under the head's limits, hold it, and go back to rest."""
     from sfms_robot.app.head.pose import pose_head
+    from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
-    posed = pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold)
+    options = HeadOptions(head=name, port=port, fast=fast, yes=yes)
+    posed = pose_head(options, face, hold, None if json else live_panel)
     show(posed, json, heading="{head} on {port}: {face}, {exit}")
 
 
@@ -253,6 +255,7 @@ def fit(
     """
     from sfms_robot.app.head.fit import babble as move
     from sfms_robot.app.head.fit import fit_head, see_virtual_face
+    from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
     fitted = partial(
@@ -271,7 +274,7 @@ def fit(
     with tempfile.TemporaryDirectory() as spare:
         folder = record if record is not None else Path(spare)
         servos = HeadOptions(head=name, port=port, fast=port == "sim", yes=yes)
-        report = move(servos, folder, minutes=minutes, seed=seed)
+        report = move(servos, folder, minutes=minutes, seed=seed, panel=None if json else live_panel)
         if port == "sim" and report["exit"] == "done":
             see_virtual_face(name, folder)
             fitted(fit_head(name, folder, practice=True))

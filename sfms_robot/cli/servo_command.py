@@ -90,9 +90,11 @@ def scan(
 @on_wire
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
+    from sfms_robot.app.progress import tracked
+
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
-        for servo in _parsed(ids):
+        for servo in tracked(_parsed(ids), "asking"):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
@@ -417,6 +419,6 @@ def _for_people(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.cli.show_servo import bar
+    from sfms_robot.app.progress import bar
 
     return bar(text, hidden)

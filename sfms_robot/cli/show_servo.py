@@ -1,14 +1,12 @@
-"""The live view and progress bar of the servo tools, and the doctor's report. Imported when something is printed."""
+"""The live view of the servo tools, and the doctor's report. Imported when something is printed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from sfms_robot.cli.show import print_rows, say, screen, table_of
@@ -41,23 +39,6 @@ def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
         say("stopped", "dim")
     if rows:
         print_rows(rows, title)
-
-
-@contextmanager
-def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr where that is a terminal; yield the function that moves it."""
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn(text),
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %  {task.description}"),
-        console=console,
-        transient=True,
-        disable=hidden or not console.is_terminal,
-    )
-    with progress:
-        task = progress.add_task("", total=None)
-        yield lambda done, total, what: progress.update(task, completed=done, total=total, description=what)
 
 
 def print_doctor(report: Mapping[str, Any]) -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 from torch import Tensor, nn
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Dyad
@@ -36,7 +37,7 @@ from sfms_robot.lab.corpora.reading import speaks
 from sfms_robot.lab.evaluation.detection import movement, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import ends
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, tracked
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener

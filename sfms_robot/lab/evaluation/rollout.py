@@ -20,10 +20,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
@@ -76,11 +75,6 @@ def run_in_processes(
         for done in tracked(as_completed(waiting), title, len(tasks)):
             done.result()
         return [one.result() for one in waiting]
-
-
-def tracked(items: Iterable[_Task], title: str, total: int | None = None) -> Iterable[_Task]:
-    """Yield the items, with a progress bar on stderr."""
-    return track(items, title, total, console=Console(stderr=True))
 
 
 def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:

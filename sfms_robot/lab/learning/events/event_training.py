@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, ndtri
 from scipy.stats import ks_2samp
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -24,7 +25,6 @@ from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.corpora.compose.render_events import smile_s
 from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
 from sfms_robot.lab.evaluation.meetings import decisions, tables
-from sfms_robot.lab.evaluation.rollout import tracked
 from sfms_robot.lab.evaluation.whole_recordings import event_spans, heard_in
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
