@@ -64,7 +64,7 @@ class Page {
 
   async #drawRobot(hello) {
     find('stage').classList.remove('no-robot');
-    find('robot-caption').textContent = hello.urdf_generic ? 'shown by the servos, on parts made from the joints; a URDF of this head goes under `urdf:` in its head.yaml' : 'shown by the servos';
+    find('robot-caption').textContent = hello.urdf_generic ? 'what its servos show, on parts made from the joints; a URDF of this head goes under `urdf:` in its head.yaml' : 'what its servos show';
     if (!this.stage) return;
     const complain = (problem) => this.notice(`The robot is not shown whole: ${problem}`);
     try {
@@ -165,7 +165,7 @@ class Page {
     this.panels?.servos.show(status);
     const wire = status.latency_ms?.frame_to_wire?.p50 ?? status.latency_ms?.p50;
     const trip = this.connection.roundTripMs;
-    find('latency').textContent = [wire ? `to the wire ${wire < 1000 ? `${wire.toFixed(0)} ms` : `${(wire / 1000).toFixed(1)} s`}` : '', trip ? `page ${trip.toFixed(0)} ms` : ''].filter(Boolean).join(' · ');
+    find('latency').textContent = [wire ? `moves after ${wire < 1000 ? `${wire.toFixed(0)} ms` : `${(wire / 1000).toFixed(1)} s`}` : '', trip ? `this page is ${trip.toFixed(0)} ms away` : ''].filter(Boolean).join(' · ');
   }
 
   #over(unconfirmed) {

@@ -118,11 +118,11 @@ export class Timeline {
   }
 
   _events(pen, x, top, tall) {
-    this.#label(pen, 'decides', top + tall * 0.3);
+    this.#label(pen, 'events', top + tall * 0.3);
     const hazards = this.frames.filter((frame) => frame.h);
     if (hazards.length) {
       const most = Math.max(0.2, ...hazards.map((frame) => frame.h.nod ?? 0));
-      this.#label(pen, 'nod /s', top + tall * 0.82, 'pitch');
+      this.#label(pen, 'nod soon?', top + tall * 0.82, 'pitch');
       this.#line(pen, x, hazards, (frame) => frame.h.nod ?? 0, (v) => top + tall - (v / most) * tall * 0.75, 'pitch', 1, 0.7);
     }
     pen.textAlign = 'left';
@@ -163,8 +163,8 @@ export class Timeline {
     const low = Math.min(...values), high = Math.max(...values);
     const middle = values.length ? (low + high) / 2 : 0, most = Math.max(0.03, (high - low) / 2 || 0);
     const y = (v) => top + tall / 2 - ((v - middle) / most) * (tall / 2 - 3);
-    this.#label(pen, 'asked', top + tall * 0.70, 'asked');
-    this.#label(pen, 'read', top + tall * 0.90, 'read');
+    this.#label(pen, 'goal', top + tall * 0.70, 'asked');
+    this.#label(pen, 'is at', top + tall * 0.90, 'read');
     this.#line(pen, x, this.frames, read, y, 'read', 2.2);
     this.#line(pen, x, this.frames, asked, y, 'asked', 1.2);
     const lines = wrapped(this.jointNames[chosen] ?? 'joint', (text) => pen.measureText(text).width, LEFT_PX - 6, MOST_LINES);
@@ -230,5 +230,5 @@ export function toldEvent(event, now_s) {
   const why = spoke.map(([name, weight]) => `${name.replaceAll('_', ' ')} ${weight > 0 ? '+' : ''}${weight.toFixed(1)}`).join(', ');
   const chance = event.probability ? ` · chance ${(100 * event.probability).toFixed(1)} %` : '';
   const ago = Math.max(0, now_s - event.at_s);
-  return `${event.event.replaceAll('_', ' ')}${size}, ${ago < 0.5 ? 'now' : `${ago.toFixed(0)} s ago`}${chance}${why ? ` · ${why}` : ''}`;
+  return `${event.event.replaceAll('_', ' ')}${size}, ${ago < 0.5 ? 'now' : `${ago.toFixed(0)} s ago`}${chance}${why ? ` · why: ${why}` : ''}`;
 }

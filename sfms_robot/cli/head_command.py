@@ -12,7 +12,7 @@ from typing import Any
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, cell, print_rows, say, show
+from sfms_robot.cli.show import JSON, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
 
 PACKAGES = Option(
@@ -107,9 +107,9 @@ def _print_check(checked: Mapping[str, Any]) -> None:
     """Print the verdict, the problems and remarks, one line each; without problems, the table of the joints."""
     problems, remarks = checked["problems"], checked["remarks"]
     found = ((problems, "problem"), (remarks, "remark"))
-    counted = [f"{len(each)} {name}{'s' * (len(each) > 1)}" for each, name in found if each]
+    numbers = [counted(len(each), name) for each, name in found if each]
     verdict = "not fit to run" if problems else "fit to run"
-    say(f"{checked['name']}: {', '.join([verdict, *counted])}", "bold red" if problems else "bold")
+    say(f"{checked['name']}: {', '.join([verdict, *numbers])}", "bold red" if problems else "bold")
     for line in (*problems, *remarks):
         say(line, "red" if problems else "")
     if problems:

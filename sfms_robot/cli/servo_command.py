@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, print_json, print_rows, show
+from sfms_robot.cli.show import JSON, counted, print_json, print_rows, show
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def scan(
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
         found, hint = scan_all(wire, asked, progress)
         rows, where = [seen.row() for seen in found], wire.port.name
-    title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
+    title = f"{counted(len(rows), 'servo')} on {where}{f': {hint}' if hint else ''}"
     _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
 
@@ -140,7 +140,7 @@ def monitor(
         else:
             from sfms_robot.cli.show_servo import live
 
-            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}")
+            live(seen, f"{counted(len(servos), 'servo')} on {wire.port.name}")
     if on.json:
         print_json({"samples": taken})
 

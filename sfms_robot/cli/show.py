@@ -184,5 +184,10 @@ def cell(value: object, missing: str = "-") -> str:
     return str(value)
 
 
+def counted(number: float, name: str) -> str:
+    """Return "1 nod" or "2 nods"."""
+    return f"{number} {name}{'s' * (number != 1)}"
+
+
 def _nested(value: object) -> str:
     return f"[{cell(value)}]" if isinstance(value, list | tuple) else cell(value)
