@@ -130,7 +130,7 @@ function facesPanel(hello, connection) {
       return row;
     })));
   const expressions = make('div', { className: 'row', role: 'group', 'aria-label': 'Expressions' },
-    ...Object.keys(hello.expressions).map((name) => make('button', { type: 'button', onclick: () => connection.send('expression', { name, seconds: EXPRESSION_S }) }, name)));
+    ...Object.keys(hello.expressions).map((name) => make('button', { type: 'button', onclick: () => connection.send('expression', { name, seconds: EXPRESSION_S }) }, name.replaceAll('_', ' '))));
   const release = () => confirm('Switch all torque off and end the run? A neck may fall.') && connection.send('release');
   const actions = make('div', { className: 'row' },
     make('button', { type: 'button', onclick: () => { letGo(); connection.send('neutral'); } }, 'Neutral'),

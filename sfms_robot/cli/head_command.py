@@ -127,8 +127,8 @@ def _print_check(checked: Mapping[str, Any]) -> None:
     over = [row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1]
     print_rows(rows, f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces")
     say(
-        "used: share of the range. clipped: of the time, at an end that is not rest. speed, jerk: of the limit, the "
-        "99th percentile of what the faces ask.",
+        "used: the part of the range that these faces need. clipped: the part of the time at an end of it that is not "
+        "rest. speed, jerk: what the fastest hundredth of the motion needs, of the limit; over 100 % is slowed down.",
         "dim",
     )
     if over:
@@ -140,10 +140,10 @@ def _print_check(checked: Mapping[str, Any]) -> None:
         reach = cell([f"{axis} {low:g}..{high:g} {unit[axis]}" for axis, (low, high) in neck["reach"].items()])
         share = "no" if neck["reached"] is None else f"{neck['reached']:.1%} of the"
         say(f"neck, one axis at a time: {reach}; {share} recorded poses in reach")
-    say(f"cannot show: {cell(checked['blind_channels'], 'none')}")
+    say(f"parts of a face that it cannot show: {cell(checked['blind_channels'], 'none')}")
     if checked["limitation"] is not None:
         say(f"the listener: {checked['limitation']}")
-    say(f"not driven: {cell(checked['dead_joints'], 'none')}")
+    say(f"joints that no face moves: {cell(checked['dead_joints'], 'none')}")
     if checked["calibrate_first"]:
         say("calibrate first: until then it moves 20 % of its travel at 0.3 of its speed on real servos")
 

@@ -37,6 +37,7 @@ _WORDS = {
     "position_deg": "deg",
     "position_rad": "rad",
     "return_delay_us": "delay us",
+    "speaker_frames": "frames of the person (40 ms)",
     "temperature_degC": "degC",
     "torque_unconfirmed": "torque not confirmed off",
     "voltage_V": "V",

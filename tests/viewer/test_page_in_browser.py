@@ -418,3 +418,5 @@ def test_a_run_that_has_ended_stays_as_its_replay(tmp_path):
             page.until("!page.connection.open")
             assert page.ask("document.getElementById('state-name').textContent") == "ended"
             assert page.ask("document.getElementById('notice').textContent") == "The run has ended. This is its replay."
+            page.until("document.body.classList.contains('gone')")  # its program too
+            assert not page.ask("document.getElementById('controls').checkVisibility()")

@@ -139,7 +139,7 @@ def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_
             frames += speaker
     kept = frames[: round(drift_s * FRAME_HZ)]
     timed = [changed(frame, time_s=(index + 1) * FRAME_S) for index, frame in enumerate(kept)]
-    return np.asarray(rollout(listener, timed, [seed]).motion[0])
+    return np.asarray(rollout(listener, timed, [seed], title="a long run").motion[0])
 
 
 def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:

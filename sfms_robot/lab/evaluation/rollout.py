@@ -148,17 +148,21 @@ def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) 
 
 
 def rollout(
-    listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int], events: Sequence[ListenerEvent] = ()
+    listener: Listener,
+    speaker: Sequence[SpeakerFrame],
+    seeds: Sequence[int],
+    events: Sequence[ListenerEvent] = (),
+    title: str = "",
 ) -> Rollout:
     """Play the listener to `speaker` once for every seed, all streams together if it can.
 
-    `events`: for a listener that follows events.
+    `events`: for a listener that follows events. `title`: of a bar; "": none.
     """
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
     decided: list[list[ListenerEvent]] = [[] for _ in seeds]
-    for index, frame in enumerate(speaker):
+    for index, frame in enumerate(tracked(speaker, title) if title else speaker):
         control = control_at(listener, events, index)
         controls = () if control is None else ([control] * len(seeds),)
         stepped = step_each(listener, [frame] * len(seeds), memories, *controls)

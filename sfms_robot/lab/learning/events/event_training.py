@@ -180,7 +180,7 @@ def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) ->
     figures, theirs_s = counted(event_trainer.begun_in(one.person.nods, one.listening)[:, 0] for one in judged)
     found = {"people": figures}
     heard = [heard_in(one.scene) for one in judged]
-    for knob in KNOBS:
+    for knob in tracked(KNOBS, "nods decided at each rate"):
         asked = Calmness.model_validate(dict.fromkeys(EVENT_KINDS, 0.0) | {"nod": knob})
         decided = (decisions(model, rows, [at + 1000 * seed], asked)[0] for at, rows in enumerate(heard))
         figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in decided)
