@@ -11,7 +11,7 @@ from typing import Any
 from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
-from sfms_robot.cli.show import JSON, cell, print_report, say, show
+from sfms_robot.cli.show import JSON, cell, counted, print_report, say, show
 from sfms_robot.data import head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError
 
@@ -246,18 +246,22 @@ def _print_run(report: Mapping[str, Any]) -> None:
     """Print the report of a run on one screen."""
     motion, limits, bus = report["motion"], report["limits"], report["bus"]
     tick, latency, step = report["tick"], report["latency_ms"], report["listener_step_ms"]
-    rate = f"in virtual time, {tick['target_hz']:g} a second"
+    rate = f"{tick['target_hz']:g} a second, in virtual time"
     if tick["achieved_hz"] is not None:
-        rate = f"at {tick['achieved_hz']:.4g} Hz of {tick['target_hz']:g}, {tick['late']} late, jitter p99 "
-        rate += f"{cell(tick['jitter_ms']['p99'])} ms"
+        rate = f"{tick['achieved_hz']:.4g} a second of {tick['target_hz']:g}, {tick['late']} late"
+    answer = [
+        f"{latency[key]['p50']:.0f} ms after {what}"
+        for key, what in (("frame_to_wire", "each picture or sound of the person"), ("speech_to_wire", "speech begins"))
+        if latency[key]["p50"] is not None
+    ]
+    planned = f", a plan takes {step['p50']:.0f} ms, 1 of 100 {step['p99']:.0f} ms or more" if step["p50"] else ""
     facts = {
-        "face": f"{motion['nods']} nods, {motion['blinks']} blinks, {motion['smiles']} smiles",
-        "ticks": f"{report['ticks']} {rate}",
-        "latency": f"frame to wire p50 {cell(latency['frame_to_wire']['p50'])} ms, "
-        f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
-        "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
-        "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
+        "showed": ", ".join(counted(motion[f"{kind}s"], kind) for kind in ("nod", "blink", "smile")),
+        "goals to the servos": f"{report['ticks']}, {rate}",
+        "moves": f"{cell(answer)} (half of the times sooner)" if answer else "in virtual time, where nothing is late",
+        "listener": f"{report['listener']}{planned}",
+        "limits": f"exceeded {limits['violations']} times; {limits['clamped']} goals were slowed down to stay within",
+        "servos": f"{bus['writes']} times written, {bus['reads']} times read, {bus['errors']} errors, "
         f"silent: {cell(bus['silent'], 'none')}",
     }
     if "recording" in report:
@@ -337,8 +341,9 @@ def _print_demo(found: Mapping[str, Any]) -> None:
 
 def _line(seen: Mapping[str, Any]) -> str:
     return (
-        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): {seen['nods']} nods, "
-        f"{seen['blinks']} blinks, {seen['smiles']} smiles, {seen['neck_travel_deg']:.0f} degrees of neck travel"
+        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): "
+        f"{', '.join(counted(seen[f'{kind}s'], kind) for kind in ('nod', 'blink', 'smile'))}; "
+        f"the neck turned {seen['neck_travel_deg']:.0f} degrees in all"
     )
 
 

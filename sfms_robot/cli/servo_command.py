@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, print_json, print_rows, show
+from sfms_robot.cli.show import JSON, counted, print_json, print_rows, show
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def scan(
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
         found, hint = scan_all(wire, asked, progress)
         rows, where = [seen.row() for seen in found], wire.port.name
-    title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
+    title = f"{counted(len(rows), 'servo')} on {where}{f': {hint}' if hint else ''}"
     _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
 
@@ -90,9 +90,11 @@ def scan(
 @on_wire
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
+    from sfms_robot.app.progress import tracked
+
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
-        for servo in _parsed(ids):
+        for servo in tracked(_parsed(ids), "asking"):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
@@ -138,7 +140,7 @@ def monitor(
         else:
             from sfms_robot.cli.show_servo import live
 
-            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}")
+            live(seen, f"{counted(len(servos), 'servo')} on {wire.port.name}")
     if on.json:
         print_json({"samples": taken})
 
@@ -417,6 +419,6 @@ def _for_people(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.cli.show_servo import bar
+    from sfms_robot.app.progress import bar
 
     return bar(text, hidden)

@@ -72,8 +72,8 @@ class Goals:
             stands, low, high = np.degrees([angle_rad, servo.min_rad, servo.max_rad]).round(1)
             log.log(
                 NOTE,
-                "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
-                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
+                "%s stands at %g deg, outside its limits %g..%g, and is moved back slowly: usual for a joint that hung "
+                "without torque (any other: `sfms-robot head calibrate`)",
                 servo, stands, low, high,
             )  # fmt: skip
 

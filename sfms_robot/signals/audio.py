@@ -47,6 +47,7 @@ class Downmix:
 
     Attributes:
         decided: enough sound was heard.
+        line: what is logged of a mix that is not the mean; empty before, and for the mean.
     """
 
     def __init__(self, name: str = "sound") -> None:
@@ -55,6 +56,7 @@ class Downmix:
         self._moments: Doubles = np.zeros((0, 0))
         self._heard = 0
         self.decided = False
+        self.line = ""
 
     def __call__(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return (n,) of finite samples (n,) or (n, channels)."""
@@ -89,7 +91,8 @@ class Downmix:
         if self._weights is not None:
             turned = ", those of opposite sign turned around" if (self._weights < 0).any() else ""
             count = len(self._weights)
-            logger.warning("%s: the mean of %d channels loses the voice: they are added%s", self._name, count, turned)
+            self.line = f"{self._name}: the mean of {count} channels loses the voice: they are added{turned}"
+            logger.warning("%s", self.line)
 
 
 class Resampler:

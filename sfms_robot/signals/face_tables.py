@@ -1,7 +1,8 @@
 """Tables of faces in files: CSV (also gzipped) and JSON as a header and rows, OpenFace's columns as ours, row times.
 
 JSON is a list of frames, one after the other or in the first list of an object: `{"time_s": 0.04, "jawOpen": 0.2}`, or
-with the categories that MediaPipe returns, at any depth: `{"categoryName": "jawOpen", "score": 0.2}`.
+with the categories that MediaPipe returns, at any depth: `{"categoryName": "jawOpen", "score": 0.2}`. Its
+transformation matrix becomes the head pose.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from sfms_robot.data import archive_kind
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
-from sfms_robot.signals.rotations import about, angles_of
+from sfms_robot.signals.rotations import about, angles_of, camera_angles
 from sfms_robot.signals.spaces import channel_of
 
 logger = logging.getLogger(__name__)
@@ -37,6 +38,11 @@ _MOST_DOUBLED: Final = 0.1  # share of rows; more are times that are too coarse
 _COUNTS: Final = (24, 25, 30, 48, 50, 60, 100, 120)  # frames that a timecode counts in a second
 _USUAL_COUNT: Final = 60  # of the Live Link app, whatever the rate of its rows
 _LABELS: Final = ("categoryName", "category_name")
+_MATRIX: Final = re.compile(r"(facial)?_?transform(ation)?_?matri(x|ces|xes)", re.IGNORECASE)  # of MediaPipe
+_LANDMARKS: Final = re.compile(r"landmark", re.IGNORECASE)  # points x, y, z of the picture: not places of the head
+_LAST_ROW: Final = (0.0, 0.0, 0.0, 1.0)
+_SCALED: Final = 0.1  # of a determinant from 1: not a rotation
+_DIVIDERS: Final = (",", ";", "\t")
 _OPENFACE_FULL: Final = 5.0  # intensity of an action unit
 _LOST: Final = ("success", "confidence")
 
@@ -49,7 +55,7 @@ def is_counted(name: str) -> bool:
 def csv_cells(file: Path) -> Table:
     """Return the header and the rows that are not empty, of a CSV or JSON file that may be gzipped.
 
-    Raises ConfigError.
+    Cells are divided by commas, or by semicolons or tabs, and then decimals may have a comma. Raises ConfigError.
     """
     try:
         data = file.read_bytes()
@@ -60,7 +66,10 @@ def csv_cells(file: Path) -> Table:
         text = data.decode("utf-8-sig")
         if text.lstrip()[:1] in ("[", "{"):
             return _json_table(file, text)
-        rows = [row for row in csv.reader(io.StringIO(text)) if row]
+        mark = max(_DIVIDERS, key=text.lstrip().partition("\n")[0].count)
+        rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
+        if mark != ",":  # of a country in which 0,5 is a half
+            rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     except FileNotFoundError:
         raise ConfigError(f"{file}: no such file") from None
     except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
@@ -113,12 +122,44 @@ def _named(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
     if isinstance(value, dict):
         label = next((value[each] for each in _LABELS if isinstance(value.get(each), str)), None)
         for key, inner in (value if label is None else {label: value.get("score")}).items():
-            yield from _named(inner, key)
+            if _MATRIX.search(key):
+                yield from _pose(key, inner)
+            elif not _LANDMARKS.search(key):
+                yield from _named(inner, key)
     elif isinstance(value, list):
         for inner in value:
             yield from _named(inner)
     elif name and isinstance(value, int | float) and not isinstance(value, bool):
         yield name, value
+
+
+def _pose(name: str, value: Any) -> Iterator[tuple[str, float]]:
+    """Yield the head pose of a transformation matrix face -> camera [cm], by rows or by columns, of the first face.
+
+    What is not such a matrix is yielded under its name, which is not known.
+    """
+    numbers = list(_numbers(value))[:16]
+    if not numbers:  # no face
+        return
+    matrix = np.array(numbers).reshape(4, 4) if len(numbers) == 16 else np.zeros((4, 4))
+    if not np.allclose(matrix[3], _LAST_ROW):
+        matrix = matrix.T
+    if not np.allclose(matrix[3], _LAST_ROW) or abs(np.linalg.det(matrix[:3, :3]) - 1.0) > _SCALED:
+        yield name, 0.0
+        return
+    yield from zip(("headRoll_rad", "headPitch_rad", "headYaw_rad"), camera_angles(matrix).tolist(), strict=True)
+    yield from zip(("headX_cm", "headY_cm", "headZ_cm"), matrix[:3, 3].tolist(), strict=True)
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Yield the numbers of nested lists, and of the `data` of objects."""
+    if isinstance(value, dict):
+        yield from _numbers(value.get("data"))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _numbers(inner)
+    elif isinstance(value, int | float):
+        yield float(value)
 
 
 # --- Times of the rows ------------------------------------------------------------------------------------------------

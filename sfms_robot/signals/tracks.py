@@ -105,13 +105,11 @@ class Track:
 def read_track(path: Path | str) -> Track:
     """Read a face track; its axes are recognised by the header.
 
-    Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, cells
-    divided by something else than commas, values or times that are in another unit.
+    Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, values
+    or times that are in another unit.
     """
     file = Path(path)
     header, rows = csv_cells(file)
-    if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
-        raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
     time_at = time_column(file, header)
     rows = _even(file, header, rows, time_at)
     if is_openface(header):

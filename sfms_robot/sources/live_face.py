@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, address_text, host_and_port, is_address, is_loopback
-from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.errors import NOTE, ConfigError, PacketError, PortError
 from sfms_robot.frames import (
     BLENDSHAPES,
     CHANNEL_INDEX,
@@ -347,7 +347,7 @@ class UdpSight(LiveFace):
         self._said: set[str] = set()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused", "errors"), 0)
-        logger.warning("%s: %s", kind, self._hint)
+        logger.log(NOTE, "%s: %s", kind, self._hint)
 
     def at(self, time_s: float) -> Sighting | None:
         for packet in self._packets():

@@ -220,12 +220,17 @@ class Pace:
     @property
     def problem(self) -> str | None:
         """A fault of the pace, in one line, or None."""
-        if self.rate is not None and abs(self.rate - 1.0) > OFF_PACE:
-            way = "falls behind" if self.rate < 1.0 else "is ahead"
-            return f"sound comes at {self.rate:.2f} of real time: its sender {way}; pace it by the clock"
+        if self.off:
+            way = "falls behind" if self.off < 1.0 else "is ahead"
+            return f"sound comes at {self.off:.2f} of real time: its sender {way}; pace it by the clock"
         if self.apart_s:
             return f"sound comes in bursts, up to {self.apart_s * 1e3:.0f} ms apart: send it as it is recorded"
         return None
+
+    @property
+    def off(self) -> float | None:
+        """Return the rate where it is not that of time, else None."""
+        return None if self.rate is None or abs(self.rate - 1.0) <= OFF_PACE else self.rate
 
     @property
     def apart_s(self) -> float:
@@ -244,13 +249,16 @@ class Pace:
 class LiveVoice(SourcePart):
     """`ports.Voice` of a live stream. All methods may be called from any thread; none blocks for longer than a piece
     takes to be resampled.
+
+    Attributes:
+        mix: of its channels; `name` is that of the sound in its line.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now: Callable[[], float] = time.monotonic, name: str = "sound") -> None:
         super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s: float | None = None
-        self._mix = Downmix()
+        self.mix = Downmix(name)
         self._rate_hz = 0.0
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
         self._skew = 0.0  # of the card, kept over its gaps
@@ -288,7 +296,7 @@ class LiveVoice(SourcePart):
         if not len(finite):
             return
         with self._lock:
-            mono = np.ascontiguousarray(np.clip(self._mix(finite), -1.0, 1.0))
+            mono = np.ascontiguousarray(np.clip(self.mix(finite), -1.0, 1.0))
             self._counts["not_finite"] += not_finite
             self._observe(len(mono), rate_hz, captured_s)
             if self._origin_s is not None:

@@ -244,4 +244,4 @@ def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_
     held = rig.hold()
     (line,) = caplog.messages
     assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line
-    assert "held there and led in" in line and "head calibrate" in line and "\n" not in line
+    assert "is moved back slowly" in line and "head calibrate" in line and "\n" not in line

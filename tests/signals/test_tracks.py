@@ -1,6 +1,6 @@
 import gzip
+import json
 import math
-import re
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, ORDERS
+from sfms_robot.signals.rotations import about
 from sfms_robot.signals.tracks import Track, read_track, resample, write_track
 
 JAW, SMILE, BLINK = CHANNEL_INDEX["jawOpen"], CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["eyeBlinkLeft"]
@@ -180,10 +181,12 @@ def test_what_is_in_another_unit_or_ragged_is_one_line(tmp_path, header, rows, t
 
 
 @pytest.mark.parametrize("mark", [";", "\t"])
-def test_a_table_with_other_dividers_is_refused_for_that(tmp_path, mark):
-    (tmp_path / "a.csv").write_text("\n".join(mark.join(row) for row in (["t_s", "jawOpen"], ["0", "0,1"])))
-    with pytest.raises(ConfigError, match=re.escape(f"divided by {mark!r}, a comma is needed")):
-        read_track(tmp_path / "a.csv")
+def test_cells_may_be_divided_by_semicolons_or_tabs_and_decimals_by_a_comma(tmp_path, mark):
+    rows = (["t_s", "jawOpen", "yaw_deg"], ["0", "0,25", "-9,0"], ["0,04", "0.5", ""])
+    (tmp_path / "a.csv").write_text("\r\n".join(mark.join(row) for row in rows))
+    track = read_track(tmp_path / "a.csv")
+    assert track.times_s.tolist() == [0.0, 0.04] and track.motion[0, JAW] == 0.25
+    assert track.motion[0, CHANNEL_INDEX["yaw"]] == pytest.approx(math.radians(-9)) and np.isnan(track.motion[1]).all()
 
 
 def test_a_last_row_that_is_cut_off_is_left_out_and_said(tmp_path, caplog):
@@ -301,6 +304,35 @@ def test_json_is_read_as_a_table(tmp_path, text):
     track = read_track(tmp_path / "a.json")
     np.testing.assert_allclose(track.motion[0, [JAW, SMILE]], [0.2, 0.6], rtol=1e-6)
     assert np.isnan(track.motion[1]).all() and track.times_s.tolist() == [0.0, 0.04]
+
+
+TURNED = about(1, 0.3) @ about(0, 0.2) @ about(2, -0.1)  # a camera's axes: yaw about y, pitch about x, roll about z
+MATRIX = np.block([[TURNED, np.array([[3.0], [-5.0], [-40.0]])], [np.array([0.0, 0.0, 0.0, 1.0])]])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("facialTransformationMatrixes", [{"rows": 4, "columns": 4, "data": MATRIX.T.ravel().tolist()}]),  # in browsers
+        ("facial_transformation_matrixes", [MATRIX.tolist()]),  # in Python
+        ("transformation_matrix", MATRIX.ravel().tolist()),
+    ],
+)
+def test_the_transformation_matrix_of_mediapipe_is_the_head_pose(tmp_path, key, value):
+    shapes = {"faceBlendshapes": [{"categories": [{"categoryName": "jawOpen", "score": 0.2}]}]}
+    points = {"faceLandmarks": [[{"x": 0.5, "y": 0.4, "z": 0.01}]]}
+    frames = [{"time_s": n / 25, key: value, **shapes, **points} for n in range(3)] + [{"time_s": 0.12, key: []}]
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    track = read_track(tmp_path / "a.json")
+    np.testing.assert_allclose(track.motion[0, :6], [-0.1, 0.2, 0.3, 0.0, 0.0, 0.0], atol=1e-6)  # it stands still
+    assert track.motion[0, JAW] == pytest.approx(0.2) and np.isnan(track.motion[3]).all()
+
+
+def test_a_matrix_that_is_none_is_named_and_the_face_is_used(tmp_path, caplog):
+    frames = [{"time_s": n / 25, "jawOpen": 0.2, "transformMatrix": [1, 2, 3]} for n in range(3)]
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    assert read_track(tmp_path / "a.json").motion[2, JAW] == pytest.approx(0.2)
+    assert "not known: transformMatrix" in caplog.text
 
 
 @pytest.mark.parametrize("text", ["[", "{}", "[1, 2]", '[{"a": "b"}]', "[" * 100_000])

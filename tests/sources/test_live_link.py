@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
 from sfms_robot.endpoint import addresses_of_this_machine
-from sfms_robot.errors import PacketError
+from sfms_robot.errors import NOTE, PacketError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
 from sfms_robot.sources.live_face import Datagram
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
@@ -297,12 +297,14 @@ def test_a_million_packets_of_noise_never_raise(sight):
 
 
 def test_the_log_says_what_to_type_in_the_app(caplog):
+    caplog.set_level(NOTE)
     port = free_port()
     opened = open_live_link(str(port))
     assert opened.address == ("127.0.0.1", port)
     opened.close()
     open_live_link(f"0.0.0.0:{port}").close()
     alone, wider = [record.getMessage() for record in caplog.records]
+    assert {record.levelno for record in caplog.records} == {NOTE}  # a plain line
     target = " or ".join(addresses_of_this_machine()) or "the address of this machine"
     app = f"in the app, capture mode Live Link (ARKit), enter the target {target}, port {port}"
     flag = f"--face live-link:0.0.0.0:{port}"

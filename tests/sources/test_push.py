@@ -75,7 +75,9 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
     pcm = (np.sin(np.arange(3200) / 9) * 9000).astype(np.int16)
     outs = []
     two = np.stack([pcm, pcm], axis=1)
-    for way in (pcm.tobytes(), pcm, pcm / 32768, two, two.T, pcm[None] / 32768, (pcm / 32768).astype(np.float32)):
+    data, full = pcm.tobytes(), pcm / 32768
+    ways = (data, bytearray(data), memoryview(data), pcm, full, full.tolist(), two, two.T, full[None])
+    for way in (*ways, full.astype(np.float32)):
         person = Person()
         person.voice.hear(way, 16000)
         outs.append(heard(person.read(0.4)))
@@ -96,6 +98,12 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
         (np.full(9, 8000.0), 16000, r"pcm: holds samples up to 8000, full scale is 1: .* by 32768"),
         (np.zeros(9), "16000", "rate_hz = '16000': expected a rate of speech"),
         (np.zeros(9), None, "rate_hz = None"),
+        (np.zeros(9, np.uint8), 16000, "pcm is uint8"),
+        (np.zeros(9, ">i2"), 16000, "pcm is >i2"),
+        (np.zeros(9, complex), 16000, "pcm is complex128"),
+        ("UklGRg==", 16000, "pcm is <U8"),
+        (None, 16000, "pcm is object"),
+        ((0, 1), 16000, "pcm is int64"),
     ],
 )
 def test_what_is_no_sound_is_refused_and_leaves_no_trace(pcm, rate_hz, told):
@@ -168,6 +176,8 @@ def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     assert [frame.face is not None for at_s in (0.445, 0.52) for frame in source.read(at_s)] == [True, False, False]
     with pytest.raises(ConfigError, match=r"face has the shape \(52,\)"):
         person.sight.see(np.zeros(52))
+    with pytest.raises(ConfigError, match=r"shape \(1, 58\)"):
+        person.sight.see(np.zeros((1, 58)))
 
 
 def test_a_face_by_names_is_seen_and_one_in_other_units_is_refused():

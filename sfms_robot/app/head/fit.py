@@ -20,6 +20,7 @@ from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.report import failure
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.app.session import Panel
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import drives
 from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
@@ -49,14 +50,16 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
-def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> dict[str, Any]:
+def babble(
+    options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0, panel: Panel | None = None
+) -> dict[str, Any]:
     """Move, and record the run in a folder. Block until then; return its report.
 
     Raises RobotError, the head at rest.
     """
     blind = HeadRetargeter(load_head(options.head)).blind_channels
     faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
-    report = faces.play(options, record=record)
+    report = faces.play(options, panel, record=record)
     if (error := failure(report)) is not None:
         raise error
     return report

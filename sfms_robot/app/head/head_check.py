@@ -25,6 +25,7 @@ from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head, remarks
 from sfms_robot.config.head import drives
@@ -241,7 +242,7 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, A
     faces: dict[str, list[Floats]] = {}
     for face, clip in named_faces(data):
         faces.setdefault(face, []).append(clip)
-    return {"version": 1, "rows": [row for name in names for row in _fidelity(name, faces)]}
+    return {"version": 1, "rows": [row for name in tracked(names, "showing faces") for row in _fidelity(name, faces)]}
 
 
 def _fidelity(name: str, faces: dict[str, list[Floats]]) -> list[dict[str, Any]]:

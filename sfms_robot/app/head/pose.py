@@ -88,14 +88,16 @@ def parse_face(words: Sequence[str]) -> Floats:
     return motion
 
 
-def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
+def pose_head(
+    options: HeadOptions, words: Sequence[str], hold_s: float = 2.0, panel: Panel | None = None
+) -> dict[str, Any]:
     """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
     Blocks until then. Raises any other RobotError, the head at rest.
     """
     face, head = parse_face(words), load_head(options.head)
     furthest = Furthest(head)
-    report = held_face(face, hold_s).play(options, observers=[furthest])
+    report = held_face(face, hold_s).play(options, panel, observers=[furthest])
     error = failure(report)
     if error is not None and str(error) != str(TorqueError(report["torque_unconfirmed"])):
         raise error

@@ -406,7 +406,9 @@ def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> It
         return
     reached = f"{usual['hz']:.0f} Hz of {line.rate_hz:g}"
     if fast_works and budget["fast"] and budget["fast"]["hz"] >= least_hz:
-        yield Finding("note", "bus", f"plain reads reach {reached}, fast sync read {budget['fast']['hz']:.0f}")
+        yield Finding(
+            "note", "bus", f"each servo read: {reached}; all in one answer, as a run does: {budget['fast']['hz']:.0f}"
+        )
         return
     set_baud = line.servo("set-baud ID RATE", budget["baud"])
     slow, _, fix = max(

@@ -11,6 +11,7 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from typing import Any, Final, cast
 
+from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.app.servo.diagnosis import (
     SEVERITIES,
     Budget,
@@ -41,7 +42,7 @@ from sfms_robot.app.servo.serial_line import (
     other_wires,
     protocol_hint,
 )
-from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
+from sfms_robot.app.servo.single_servo import ServoState, read_all, scan
 from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError

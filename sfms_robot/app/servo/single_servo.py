@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,14 +16,13 @@ from typing import Any, Final, Literal
 import yaml
 
 from sfms_robot.app.output_paths import checked_file
+from sfms_robot.app.progress import Progress, no_progress, tracked
 from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask, other_wires, protocol_hint
 from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
 from sfms_robot.servo.registers import Field
-
-Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is looked at
 
 BACK_S: Final = 2.0  # a servo that restarts is back by then
 _STEP_S: Final = 0.1
@@ -39,10 +38,6 @@ _WATCHED: Final = (
     "voltage",
     "temperature",
 )
-
-
-def no_progress(done: int, total: int, what: str) -> None:
-    """Show no progress."""
 
 
 # --- finding ----------------------------------------------------------------------------------------------------
@@ -400,7 +395,7 @@ class Dump(Model):
 def dump(servos: Sequence[FoundServo]) -> Dump:
     """Read every register of `servos`. Raises ConfigError for a model without a firmware map, ServoError."""
     found = []
-    for seen in servos:
+    for seen in tracked(servos, "reading registers"):
         who = {"id": seen.id, "model": seen.registers().model, "model_number": seen.model_number}
         seen.wire.at(seen.baud)
         found.append(DumpedServo(**who, firmware=seen.firmware, registers=read_all(seen).values))
