@@ -113,7 +113,7 @@ def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_pa
     with closing(begin_page("0")) as page, page_session(page, options) as pages:
         assert pages.run()["exit"] == "done"
     (line,) = [record.message for record in caplog.records if "/etc/passwd" in record.message]
-    assert line.startswith(f"{head}/robot.urdf: link ") and line.endswith("the page leaves it out")
+    assert line.startswith(f"{head}/robot.urdf: link ") and line.endswith("got '/etc/passwd': not drawn")
     assert "/etc/passwd" not in capfd.readouterr().err
 
 
