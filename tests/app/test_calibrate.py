@@ -256,6 +256,13 @@ def test_practice_on_emulated_servos_is_kept_apart(name):
     assert outcome.file.exists() and not overlay_file("two").exists()
 
 
+def test_a_stored_value_that_stops_a_joint_names_the_command_with_the_arguments_of_this_one(name):
+    person = Person("k", "", "", "", "n")
+    with launch([EmulatedServo(1, registers={"startup_configuration": 1}), EmulatedServo(2)]) as chain:
+        outcome = calibrate(name, chain.device, person.say, person.ask, ["jaw"])
+    assert f"; sfms-robot doctor --port {chain.device} --head {shlex.quote(name)} --fix" in outcome.skipped["jaw"]
+
+
 # --- what a run makes of it -------------------------------------------------------------------------------------
 
 
