@@ -73,8 +73,8 @@ class Goals:
             log.log(
                 NOTE,
                 "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
-                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
-                servo, stands, low, high,
+                "there and led in (one that hangs on nothing: %s)",
+                servo, stands, low, high, servo.calibrate,
             )  # fmt: skip
 
     def allows(self, index: int, goal_rad: float) -> bool:

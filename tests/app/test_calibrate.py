@@ -354,6 +354,7 @@ def test_the_command_that_a_refusal_names_records_the_value_and_the_head_starts(
         stored = identify(load_head(head), ["pan", "tilt"], {"main": chain.device}, RealClock())
         refused = command_line(*start)
         assert refused.code == 4 and "servo 2 (tilt): homing_offset is -100, wanted 0" in refused.err
+        assert f"(sfms-robot head calibrate --port {chain.device} {shlex.quote(head)} --joint tilt)" in refused.err
         cure = shlex.split(refused.err.strip().partition("fits it: sfms-robot ")[2])
         looked = command_line(*cure[:-1], "--json")
         errors = [each for each in looked.told["findings"] if each["severity"] == "error"]
