@@ -115,7 +115,8 @@ def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_pa
         assert pages.run()["exit"] == "done"
     odd, empty, line = [record.message for record in caplog.records if "robot.urdf: link" in record.message]
     assert "<capsule>, not box" in odd and "without a geometry: not drawn" in empty
-    assert line.startswith(f"{head}/robot.urdf: link ") and line.endswith("got '/etc/passwd': not drawn")
+    assert line.startswith(f"picture of the head: {head}/robot.urdf: link ")
+    assert line.endswith("got '/etc/passwd': not drawn")
     assert "/etc/passwd" not in capfd.readouterr().err
 
 
