@@ -94,6 +94,11 @@ class OpenHead:
         return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
 
 
+def doctor_command(head: str, port: str) -> str:
+    """Return the command that corrects what the servos of a head store, as it can be typed."""
+    return f"sfms-robot doctor --port {quote(port)} --head {quote(head)} --fix"
+
+
 def fastest_hz(head: Head) -> float:
     """Return the rate of the head's fastest bus."""
     return max(bus.rate_hz for bus in head.buses.values())
@@ -138,7 +143,7 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         head = calibrated_head(options.head, options.port, clock, kept)
         motion = build_motion(head, fastest_hz(head))
         opened = stack.enter_context(open_wires(head, options))
-        doctor = f"sfms-robot doctor --port {options.port} --head {quote(options.head)} --fix"
+        doctor = doctor_command(options.head, options.port)
         confirmed = options.confirmed
         bus = build_bus(head, opened, clock, confirmed=confirmed, without=options.without, doctor=doctor, kept=kept)
         stack.callback(bus.close)

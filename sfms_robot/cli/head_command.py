@@ -258,12 +258,16 @@ def fit(
     from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
-    fitted = partial(
-        show,
-        json=json,
-        heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
-        note="rms in joint units (1 = half the range), on held-out frames",
-    )
+    def fitted(learnt: Mapping[str, Any]) -> None:
+        practice = "; practice on emulated servos: no run uses this file" if learnt["practice"] else ""
+        show(
+            learnt,
+            json,
+            heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
+            keys=("joints",),
+            note=f"rms in joint units (1 = half the range), on held-out frames{practice}",
+        )
+
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")
     if recording is not None:
@@ -277,7 +281,7 @@ def fit(
         report = move(servos, folder, minutes=minutes, seed=seed, panel=None if json else live_panel)
         if port == "sim" and report["exit"] == "done":
             see_virtual_face(name, folder)
-            fitted(fit_head(name, folder, practice=True))
+            fitted(fit_head(name, folder))
             return
     seconds = round(report["duration_s"], 1)
     moved = {"head": report["head"], "exit": report["exit"], "seconds": seconds, "record": str(record)}

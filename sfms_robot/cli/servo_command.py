@@ -98,7 +98,7 @@ def ping(on: Wiring, ids: str = IDS) -> None:
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
-                unknown = dict.fromkeys(("model", "model_number", "firmware", "baud", "family"))
+                unknown = dict.fromkeys(("model", "model_number", "firmware", "firmware_minor", "baud", "family"))
                 rows.append({"id": servo, **unknown, "note": "", "answers": False})
     _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):

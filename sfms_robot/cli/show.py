@@ -30,6 +30,7 @@ _WORDS = {
     "blind": "cannot show",
     "current_mA": "mA",
     "firmware": "fw",
+    "firmware_minor": "minor",
     "load_percent": "load %",
     "missing": "to calibrate first (until then 20 % of the travel, 0.3 of the speed)",
     "model_number": "number",

@@ -16,6 +16,7 @@ _COLUMNS = (
     "joint",
     "model",
     "firmware",
+    "firmware_minor",
     "baud",
     "voltage_V",
     "temperature_degC",

@@ -73,8 +73,8 @@ class Goals:
             log.log(
                 NOTE,
                 "%s stands at %g deg, outside its limits %g..%g, and is moved back slowly: usual for a joint that hung "
-                "without torque (any other: `sfms-robot head calibrate`)",
-                servo, stands, low, high,
+                "without torque (any other: %s)",
+                servo, stands, low, high, servo.calibrate,
             )  # fmt: skip
 
     def allows(self, index: int, goal_rad: float) -> bool:

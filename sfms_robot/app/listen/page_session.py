@@ -89,7 +89,7 @@ class PageSession:
         with ExitStack() as stack:
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out:
-                logger.warning("%s; the page leaves it out", line)
+                logger.warning("picture of the head: %s", line)
             speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
             facts = page_facts(
                 head,

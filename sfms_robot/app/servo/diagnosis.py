@@ -91,6 +91,7 @@ class Line:
     Attributes:
         shown: Its name in commands.
         ports: The ports of the whole head, as `--port` named them.
+        control: Of an emulator, which confirms silences there.
     """
 
     device: str
@@ -102,6 +103,7 @@ class Line:
     bus: str | None = None
     head: str | None = None
     ports: str | None = None
+    control: str | None = None
     crc: bool = False
 
     @property
@@ -116,14 +118,14 @@ class Line:
     @property
     def fix(self) -> str:
         """The command that mends stored values against the head's file."""
-        return f"sfms-robot doctor --port {self.ports or self.shown}{self._of_head or self._of_family} --fix"
+        return f"sfms-robot doctor --port {quote(self.ports or self.shown)}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         """Return a `servo` command for this port."""
         rate = f" --baud {baud}" if baud is not None else ""
         # Which emulated servos there are, and at what rate, is their head's to say.
         which = self._of_head if self.shown == SIM and self.head else f"{rate}{self._of_family}"
-        return f"sfms-robot servo {words} --port {self.shown}{which}"
+        return f"sfms-robot servo {words} --port {quote(self.shown)}{which}"
 
     def name(self, servo: int) -> str:
         """Return a servo with its joint, for people."""
@@ -223,7 +225,8 @@ def judge_presence(
         if (seen := here.get(servo)) is not None:
             if want.model_number is not None and seen.model_number not in (None, want.model_number):
                 said = f"the head says {want.model} ({want.model_number})"
-                problem = f"{seen.model} ({seen.model_number}) answers, {said}"
+                number = f" ({seen.model_number})" if seen.table is not None else ""  # an unknown model has it already
+                problem = f"{seen.model}{number} answers, {said}"
                 fix = "two cables swapped, or the head's file names the wrong model or id"
         elif servo in elsewhere:
             rate = elsewhere[servo].baud

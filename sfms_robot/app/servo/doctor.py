@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, Final, cast
 
 from sfms_robot.app.progress import Progress, no_progress
@@ -92,7 +93,8 @@ def examine(
     clock = RealClock()
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
-        buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
+        controls = {line.device: line.control for line in lines}
+        buses = [examine_line(line, clock, partial(_port, controls, clock), progress, fix) for line in lines]
     codes = {bus["exit_code"] for bus in buses}
     return {
         "version": 1,
@@ -102,6 +104,15 @@ def examine(
         "findings": sum((each["findings"] for each in buses), []),
         "exit_code": next((code for code in (PORT_FAILED, BUS_FAILED) if code in codes), FINE),
     }
+
+
+def _port(controls: Mapping[str, str | None], clock: Clock, device: str, baud: int) -> Port:
+    """Open a device, on emulated servos as a run does: a silence is one only if the emulator confirms it."""
+    if (control := controls[device]) is None:
+        return SerialPort(device, baud, clock)
+    from sfms_robot.app.wiring import EmulatedPort
+
+    return EmulatedPort(device, control, baud, clock)
 
 
 def examine_line(
@@ -169,6 +180,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
             bus=name,
             head=head,
             ports=port,
+            control=None if isinstance(each, str) else each.control,
             crc=bus.crc,
         )
 
@@ -242,7 +254,8 @@ def _present(wire: Wire, line: Line, progress: Progress) -> tuple[Found, Found]:
         found = scan(wire, None, progress)
         usual = max({each.baud for each in found}, key=lambda b: sum(s.baud == b for s in found), default=0)
         return {s.id: s for s in found if s.baud == usual}, {s.id: s for s in found if s.baud != usual}
-    here = _at_this_rate(wire, line, list(line.wanted))
+    wanted = list(line.wanted)
+    here = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # one lost packet hides no bus
     elsewhere: dict[int, FoundServo] = {}
     for step, _ in enumerate(wire.reachable()):
         missing = [servo for servo in line.wanted if servo not in here and servo not in elsewhere]

@@ -47,6 +47,7 @@ class FoundServo:
     baud: int
     model_number: int | None
     firmware: int | None
+    firmware_minor: int | None = None
     table: Table | None
     twice: bool = False
     wire: Wire = field(repr=False, compare=False)
@@ -89,6 +90,7 @@ class FoundServo:
             "model": self.model,
             "model_number": self.model_number,
             "firmware": self.firmware,
+            "firmware_minor": self.firmware_minor,
             "baud": self.baud,
             "family": self.wire.family,
             "note": note,
@@ -228,9 +230,8 @@ class Wire:
             raise ConfigError.at("servo", what, servo, "is not a servo id", [f"0..{self.kind.max_id}"])
 
     def _identified(self, servo: int, found: Found) -> FoundServo:
-        number, firmware = found
-        table = self._table or table_of(self.family, number, firmware)
-        return FoundServo(id=servo, baud=self.baud, model_number=number, firmware=firmware, table=table, wire=self)
+        table = self._table or table_of(self.family, found.model_number, found.firmware)
+        return FoundServo(id=servo, baud=self.baud, **found._asdict(), table=table, wire=self)
 
     def _link(self, baud: int) -> RegisterLink:
         link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S)
@@ -247,19 +248,23 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
     check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
-            from sfms_robot.app.wiring import plugged_in  # its numerics take longer to load than most tools to run
+            from sfms_robot.app.wiring import (
+                EmulatedPort,
+                plugged_in,
+            )  # its numerics take longer to load than most tools to run
 
             described = load_head(head)
             board = family_named(next(iter(described.buses.values())).family)
             if board.board:
                 raise ConfigError(f"--head {head}: its servos are on a {board.title}, which has no ids or registers")
             servos = next(iter(plugged_in(head, described).values()))
-            device, first = stack.enter_context(launch(servos)).device, servos[0].baud
+            chain, first = stack.enter_context(launch(servos)), servos[0].baud
+            line: Port = EmulatedPort(chain.device, chain.control, baud or first, clock)
             place = f"--port {SIM} --head {quote(head)}"
         else:
             device, first = port or only_port(), kind.bauds[0]
             check_device(device)
-        line = SerialPort(device, baud or first, clock)
+            line = SerialPort(device, baud or first, clock)
         stack.callback(line.close)
         yield Wire(line, family, clock, baud or first, baud is not None, model, place)
 

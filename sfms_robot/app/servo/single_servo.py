@@ -323,25 +323,35 @@ def reboot(seen: FoundServo, confirm: Confirm) -> FoundServo:
 
 
 def factory_reset(seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
-    """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud."""
+    """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud.
+
+    Protocol 1 resets everything; what is to be kept is written back.
+    """
     if keep not in _RESETS:
         raise ConfigError.at("servo", "factory reset", keep, "is unknown", _RESETS)
-    wire, identity, rate = seen.wire, seen.registers().role("id"), seen.registers().default_baud
-    new_id = seen.id if keep != "all" or identity is None else identity.initial
+    wire, table, home = seen.wire, seen.registers(), seen.wire.baud
+    identity, rate, whole = table.role("id"), table.default_baud, keep == "all" or table.protocol == 1
+    new_id = seen.id if not whole or identity is None else identity.initial
+    taken = new_id != seen.id and wire.ping(new_id) is not None  # at this rate, which need not be the factory's
     if new_id != seen.id:
-        home = wire.baud
         if rate is not None and wire.at(rate).ping(new_id) is not None:
             raise ConfigError(f"id {new_id}, which a new servo has, is taken by another one at {rate} baud: unplug it")
         wire.at(home)
     seen.guard(f"every setting of id {seen.id} to its factory value ({keep})", confirm)
-    _accepted(seen, wire.link.factory_reset(seen.id, _RESETS[keep]), "the reset")
-    expected = wire.baud if keep == "keep-id-and-baud" or rate is None else rate
-    for baud in dict.fromkeys((expected, wire.baud)):
+    _accepted(seen, wire.link.factory_reset(seen.id, _RESETS["all" if whole else keep]), "the reset")
+    expected = home if rate is None or (keep == "keep-id-and-baud" and not whole) else rate
+    for baud in dict.fromkeys((expected, expected if taken else home)):
         wire.at(baud)
-        back = _wait_for(wire, new_id)
-        if back is not None:
-            return back
+        if (back := _wait_for(wire, new_id)) is not None:
+            return _as_before(back, None if keep == "all" else seen.id, home if keep == "keep-id-and-baud" else None)
     raise ServoError(f"id {seen.id} was reset and does not answer as {new_id} at {expected} baud")
+
+
+def _as_before(seen: FoundServo, servo: int | None, baud: int | None) -> FoundServo:
+    """Give a servo that was reset its id and its rate again, if they are to be kept."""
+    if servo not in (None, seen.id):
+        seen = set_id(seen, servo, lambda question: True, in_chain=True)
+    return seen if baud in (None, seen.baud) else set_baud(seen, baud, lambda question: True)
 
 
 def _accepted(seen: FoundServo, answer: Any, what: str) -> None:

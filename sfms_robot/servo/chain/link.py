@@ -41,10 +41,14 @@ _MOST_READS: Final = 64  # after which a wire that never falls silent is given u
 
 
 class Found(NamedTuple):
-    """The servo that answered a ping. None if the protocol's ping does not report it."""
+    """The servo that answered a ping. None if the protocol's ping does not report it.
+
+    `firmware_minor`: of Feetech, whose firmware has two numbers.
+    """
 
     model_number: int | None
     firmware: int | None
+    firmware_minor: int | None = None
 
 
 class Answer(NamedTuple):

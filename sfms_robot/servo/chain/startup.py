@@ -418,7 +418,7 @@ def _inside(ticks: int, limits: tuple[int, int]) -> bool:
 
 
 def _cure(found: Contradiction, servo: BusServo) -> str:
-    kept = "measure the joint (sfms-robot head calibrate), or record the value if the head's file fits it: "
+    kept = f"measure the joint ({servo.calibrate}), or record the value if the head's file fits it: "
     return f"; {kept * found.in_file}{servo.doctor}" if found.fixable else ""
 
 
