@@ -30,6 +30,11 @@ KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     vmc="avatars:open_vmc",
     vmc_single="avatars:open_vmc_single",
     live_link="avatars:LiveLinkOutput",
+    vtube_studio="vtube_studio:VtubeStudio",
+    vtube_studio_add="vtube_studio:VtubeStudioAdd",
+    reachy_mini="reachy_mini:ReachyMini",
+    reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
+    furhat="furhat:Furhat",
 )
 
 
