@@ -27,8 +27,8 @@ def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
 
 KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     json="json_stream:JsonStream",
-    vmc="avatars:open_vmc",
-    vmc_single="avatars:open_vmc_single",
+    vmc="avatars:VmcOutput",
+    vmc_single="avatars:VmcSingleOutput",
     live_link="avatars:LiveLinkOutput",
     vtube_studio="vtube_studio:VtubeStudio",
     vtube_studio_add="vtube_studio:VtubeStudioAdd",
