@@ -232,9 +232,10 @@ class ReachyMini(ReachyDaemon):
 
     def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
         super().heard(messages, now_s)
-        for message in messages:
-            if message.get("type") == "head_pose":
-                self._reported.append((now_s, -math.asin(min(max(float(_reported(message)[2, 0]), -1.0), 1.0))))
+        poses = [_reported(each) for each in messages if each.get("type") == "head_pose"]
+        for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest came now
+            pitch_rad = -math.asin(min(max(float(pose[2, 0]), -1.0), 1.0))
+            self._reported.append((now_s - back / RATE_HZ, pitch_rad))
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the frames that a slow peer missed, and how the reported pitch followed over the last 30 s."""
