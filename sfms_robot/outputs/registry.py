@@ -42,6 +42,11 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "vmc": "vmc[:HOST[:PORT]], 39539: avatar software (VSeeFace, VNyan, Warudo, Blender, Unity)",
     "vmc-single": "vmc-single[:HOST[:PORT]], 39539: the same, for receivers that read no bundles",
     "live-link": "live-link[:HOST[:PORT]], 11111: Unreal's MetaHumans, as Live Link Face on an iPhone",
+    "vtube-studio": "vtube-studio[:HOST[:PORT]], 8001: VTube Studio (Live2D), in place of its tracking",
+    "vtube-studio-add": "vtube-studio-add[:HOST[:PORT]], 8001: the same, added to the streamer's own tracking",
+    "reachy-mini": "reachy-mini[:HOST[:PORT]], 8000: Reachy Mini's daemon: head, body and antennas",
+    "reachy-mini-overlay": "reachy-mini-overlay[:HOST[:PORT]], 8000: the same daemon, on top of the app that it runs",
+    "furhat": "furhat[:HOST[:PORT]], 9000: Furhat's Realtime API: face, eyes and neck",
 }
 
 
