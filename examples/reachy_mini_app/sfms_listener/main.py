@@ -17,6 +17,8 @@ class SfmsListener(ReachyMiniApp):
     def run(self, reachy_mini: ReachyMini, stop_event: threading.Event) -> None:
         """Listen until the daemon stops the app; the robot then eases to neutral."""
         media = reachy_mini.media
+        if media.audio is None:
+            raise RuntimeError("the daemon gives no sound: start it with its media")
         media.start_recording()
         with sr.Robot("none", listener="sfms-small", outputs=["reachy-mini"]) as robot:
             robot.on("nod", lambda nod: self.logger.info("nod of %.0f ms", 1e3 * nod.duration_s))
