@@ -34,7 +34,7 @@ from sfms_robot.ports import OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
 PORT: Final = 8001
-RATE_HZ: Final = 30.0
+RATE_HZ: Final = 50.0
 PLUGIN: Final = {"pluginName": "sfms-robot", "pluginDeveloper": "sfms-robot"}
 GROW_S: Final = 1.0  # of weight, once access is given
 ANSWER_S: Final = 5.0  # longest wait for an answer, except for the user's
