@@ -267,9 +267,12 @@ def _print_run(report: Mapping[str, Any]) -> None:
         f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
         "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
         "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
-        f"silent: {cell(bus['silent'], 'none')}",
     }
+    if "writes" in bus:  # not without servos
+        facts["bus"] = (
+            f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
+            f"silent: {cell(bus['silent'], 'none')}"
+        )
     if "recording" in report:
         kept = report["recording"]
         problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")

@@ -41,7 +41,9 @@ RATE_HZ: Final = 50.0  # more than 100 targets a second overload a daemon
 
 _SETTLE_S: Final = 0.2  # until the daemon takes targets again after the way to neutral
 _KNOWN_MAJOR: Final = "1"  # version of the daemon
-_NEAR_RAD, _NEAR_M = 0.2, 0.02  # from neutral, after the way there
+_NEAR_RAD, _NEAR_M = 0.2, 0.02  # from where it is sent
+_APART_S: Final = 0.5  # longest time farther away: then it eases in again, which the daemon would not do by itself
+_DRIVEN: Final = "another move or program drives it, or something holds its head"
 
 LEAN_RAD: Final = math.radians(35)
 SHIFT_M: Final = 0.015
@@ -199,7 +201,8 @@ class ReachyMini(ReachyDaemon):
         super().__init__(address)
         self._sent: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
         self._reported: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
-        self._pitch_rad = 0.0
+        self._goal = np.eye(4)  # sent last
+        self._together_s: float | None = None  # when the head was last seen near it
 
     def greet(self, link: WebSocketPeer) -> None:
         self.check()
@@ -214,28 +217,32 @@ class ReachyMini(ReachyDaemon):
             at = _reported(message) if message.get("type") == "head_pose" else at
         if at is None:
             raise OutputError("reports no head_pose")
-        if np.abs(at[:3, :3] - np.eye(3)).max() > _NEAR_RAD or np.abs(at[:3, 3]).max() > _NEAR_M:
-            raise OutputError("did not go to neutral: another move or program drives it, or something holds its head")
+        if not _near(at, np.eye(4)):
+            raise OutputError(f"did not go to neutral: {_DRIVEN}")
+        self._goal, self._together_s = np.eye(4), None
 
     def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any]:
         pose = in_reach(frame.motion[POSE].astype(np.float64))
-        self._pitch_rad = float(pose[1])
+        self._goal = matrix(pose)
         return {
             "type": "set_full_target",
-            "head": matrix(pose).ravel(),
+            "head": self._goal.ravel(),
             "antennas": antennas(frame.motion),
             "body_yaw": body_yaw(float(pose[2])),
         }
 
     def shown(self, frame: OutputFrame, now_s: float) -> None:
-        self._sent.append((now_s, self._pitch_rad))
+        self._sent.append((now_s, _pitch(self._goal)))
 
     def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
         super().heard(messages, now_s)
         poses = [_reported(each) for each in messages if each.get("type") == "head_pose"]
         for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest came now
-            pitch_rad = -math.asin(min(max(float(pose[2, 0]), -1.0), 1.0))
-            self._reported.append((now_s - back / RATE_HZ, pitch_rad))
+            self._reported.append((now_s - back / RATE_HZ, _pitch(pose)))
+        if self._together_s is None or not poses or _near(poses[-1], self._goal):
+            self._together_s = now_s
+        elif now_s - self._together_s > _APART_S:
+            raise OutputError(f"does not follow: {_DRIVEN}")
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the frames that a slow peer missed, and how the reported pitch followed over the last 30 s."""
@@ -287,6 +294,15 @@ class ReachyMiniOverlay(ReachyDaemon):
 def _offset(pose: Doubles) -> dict[str, Any]:
     """Return the message of an offset (6,): place first, then angles."""
     return {"type": "set_speech_offsets", "offsets": np.concatenate([pose[3:], pose[:3]])}
+
+
+def _near(pose: Doubles, goal: Doubles) -> bool:
+    away = np.abs(pose - goal)
+    return bool(away[:3, :3].max() < _NEAR_RAD and away[:3, 3].max() < _NEAR_M)
+
+
+def _pitch(pose: Doubles) -> float:
+    return -math.asin(min(max(float(pose[2, 0]), -1.0), 1.0))
 
 
 def _reported(message: Mapping[str, Any]) -> Doubles:

@@ -63,13 +63,13 @@ class WebSocketPeer:
         self._messages: list[bytes] = []
         self._open = False
         self._end: OutputError | None = None
+        self._protocol = ClientProtocol(parse_uri(f"ws://{address_text(host, port)}{path}"))
         try:
             self._socket = socket.create_connection((host, port), CONNECT_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise OutputError(_unreached(error, host, absent)) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        self._protocol = ClientProtocol(parse_uri(f"ws://{address_text(host, port)}{path}"))
         self._protocol.send_request(self._protocol.connect())
         try:
             until_s = time.monotonic() + CONNECT_S
@@ -193,9 +193,9 @@ class WebSocketPeer:
         return OutputError(f"has closed the connection{reason}")
 
 
-def _unreached(error: OSError, host: str, absent: str) -> str:
+def _unreached(error: OSError | UnicodeError, host: str, absent: str) -> str:
     """Return why there is no connection."""
-    if isinstance(error, socket.gaierror):
+    if isinstance(error, socket.gaierror | UnicodeError):
         return f"no host of the network has the name {host}"
     if isinstance(error, TimeoutError):
         return f"does not answer within {CONNECT_S:g} s: {absent}"

@@ -9,6 +9,7 @@ import logging
 import os
 import socket
 import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -141,6 +142,27 @@ def test_what_is_sent_is_reported_and_a_halt_holds_it(daemon):
     drive(sender, 1.5, lambda t: face_of())
     finish(sender)
     assert daemon.reported()[0] == pytest.approx(np.eye(4), abs=5e-3)
+
+
+def test_a_run_reports_how_the_robot_follows(daemon, command_line):
+    output = f"reachy-mini:{daemon.address}"
+    done = command_line("run", "--head", "none", "--output", output, "--audio", "katie", "--duration", "20", "--json")
+    (figures,) = done.told["outputs"]
+    sys.stdout.write(f"pitch: correlation {figures['pitch_correlation']}, lag {figures['lag_ms']} ms\n")
+    assert done.code == 0 and figures["pitch_correlation"] >= 0.99 and figures["lag_ms"] <= 60, figures
+
+
+def test_a_move_of_another_program_is_noticed_and_the_robot_eases_in_again(daemon):
+    sender, away = OutputSender(ReachyMini(daemon.address)), matrix(np.array([0, 0, 0.8, 0, 0, 0]))
+    drive(sender, 2.5, lambda t: face_of())
+    with connect(f"ws://{daemon.address}/ws/sdk") as other:
+        other.send(json.dumps({"type": "goto_target", "head": away.ravel().tolist(), "duration": 3.0}))
+        drive(sender, 2.5, lambda t: face_of(yaw=-0.3))
+        assert sender.lost and sender.statistics()["problem"].startswith(("does not follow", "did not go to neutral"))
+    drive(sender, 9.0, lambda t: face_of(yaw=-0.3))
+    assert not sender.lost
+    assert daemon.reported()[0] == pytest.approx(matrix(np.array([0, 0, -0.3, 0, 0, 0])), abs=5e-3)
+    finish(sender)
 
 
 def test_an_app_that_drives_the_robot_stays_in_charge_and_an_overlay_is_added(daemon):
