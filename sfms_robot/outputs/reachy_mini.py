@@ -38,7 +38,6 @@ from sfms_robot.signals.rotations import rotation
 
 PORT: Final = 8000
 RATE_HZ: Final = 50.0  # more than 100 targets a second overload a daemon
-
 _SETTLE_S: Final = 0.2  # until the daemon takes targets again after the way to neutral
 _KNOWN_MAJOR: Final = "1"  # version of the daemon
 _NEAR_RAD, _NEAR_M = 0.2, 0.02  # from where it is sent
@@ -139,7 +138,7 @@ def _correlations(goals: Doubles, angles: Doubles) -> Doubles | None:
 
 
 class ReachyDaemon(WebSocketOutput):
-    """An output to the daemon, which is there and whose robot is awake."""
+    """An output to the daemon. It checks, at first and once a second, that the robot can be driven."""
 
     usual_port = PORT
     path = "/ws/sdk"

@@ -132,11 +132,11 @@ class VtubeStudio(WebSocketOutput):
         if self._asked_s is not None and not messages and now_s - self._asked_s > ANSWER_S:
             raise OutputError(f"has not answered for {ANSWER_S:g} s")
         for message in messages:
+            if (version := message.get("apiVersion")) != _API["apiVersion"]:
+                raise OutputError(f"speaks API version {version}, not {_API['apiVersion']}")
             data = message.get("data")
-            if message.get("apiVersion", "1.0") != "1.0" or not isinstance(data, dict):
-                raise OutputError(f"speaks API version {message.get('apiVersion')}, not 1.0")
             self._asked_s = None
-            self._answered(str(message.get("messageType")), data)
+            self._answered(str(message.get("messageType")), data if isinstance(data, dict) else {})
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the frames that a slow VTube Studio missed, and whether its user gave access."""
@@ -146,7 +146,9 @@ class VtubeStudio(WebSocketOutput):
         link = self.link
         assert link is not None
         if kind == "AuthenticationTokenResponse":
-            token = str(data.get("authenticationToken"))
+            token = str(data.get("authenticationToken", ""))
+            if not re.fullmatch(r"[!-~]{1,64}", token):
+                raise OutputError(f"gives {token[:64]!r}, which is not a token")
             self._keep(token)
             self._authenticate(link, token)
         elif kind == "AuthenticationResponse" and data.get("authenticated"):
@@ -162,7 +164,7 @@ class VtubeStudio(WebSocketOutput):
                 _ASKED_ALREADY: "; click Allow in its window",
                 _TAKEN: "; stop the other plug-in, or use vtube-studio-add",
             }
-            text = str(data.get("message")).splitlines()[0].rstrip(".")
+            text = " ".join(str(data.get("message")).split()).rstrip(".")
             raise OutputError(f"{text} (error {data.get('errorID')}){hints.get(data.get('errorID', -1), '')}")
 
     def _ask(self, link: WebSocketPeer) -> None:

@@ -303,8 +303,8 @@ def test_furhat_is_taken_over_and_given_back(monkeypatch):
 class Studio:
     """Answers of VTube Studio."""
 
-    def __init__(self, allows=True, version="1.0", error=None):
-        self.allows, self.version, self.error, self.token = allows, version, error, "abc"
+    def __init__(self, allows=True, version="1.0", error=None, token="abc"):
+        self.allows, self.version, self.error, self.token = allows, version, error, token
 
     def __call__(self, message):
         kind, data = message["messageType"], message["data"]
@@ -365,6 +365,7 @@ def test_a_token_that_is_not_valid_any_more_is_asked_for_again(tmp_path):
     [
         (Studio(allows=False), "User has denied API access for your plugin (error 50); start the run again"),
         (Studio(version="2.0"), "speaks API version 2.0, not 1.0"),
+        (Studio(token="a b"), "gives 'a b', which is not a token"),
         (
             Studio(error={"errorID": 454, "message": "Taken."}),
             "Taken (error 454); stop the other plug-in, or use vtube-",
