@@ -6,6 +6,7 @@ colon ("" without one) and returns a `ports.Output`. Kinds are imported when the
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Final
@@ -79,13 +80,14 @@ def open_output(value: str, others: Iterable[EntryPoint] | None = None) -> Outpu
 
 
 def open_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> list[Output]:
-    """Return the outputs of a run, in order. Raises ConfigError, also for two of one kind and address."""
+    """Return the outputs of a run, in order. Raises ConfigError, also for two that reach one program."""
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
         output = open_output(value, others)
-        if (output.kind, output.peer) in opened:
-            raise ConfigError(f"--output {value}: {output.peer} gets {output.kind} already")
-        opened[output.kind, output.peer] = output
+        to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
+        if to in opened:
+            raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")
+        opened[to] = output
     return list(opened.values())
 
 

@@ -17,11 +17,12 @@ from websockets.server import ServerProtocol
 from websockets.sync.server import serve
 
 from sfms_robot import load_head
-from sfms_robot.errors import OutputError
+from sfms_robot.errors import ConfigError, OutputError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM
 from sfms_robot.outputs import websocket_peer
 from sfms_robot.outputs.furhat import Furhat, params_of
 from sfms_robot.outputs.reachy_mini import ReachyMini, ReachyMiniOverlay, antennas, body_yaw, following, in_reach
+from sfms_robot.outputs.registry import open_outputs
 from sfms_robot.outputs.sender import MotionShaper, OutputSender
 from sfms_robot.outputs.vtube_studio import VtubeStudio, VtubeStudioAdd, inputs_of
 from sfms_robot.ports import OutputFrame
@@ -177,6 +178,13 @@ def test_vtube_studio_gets_degrees_and_shares_that_are_0_for_a_neutral_face_in_t
     moved = inputs_of(motion_of(yaw=0.5, pitch=0.1, eyeBlinkLeft=1, mouthSmileLeft=1, mouthSmileRight=1))
     assert (moved["FaceAngleX"], moved["FaceAngleY"]) == (pytest.approx(28.648, abs=1e-3), pytest.approx(-5.73, 1e-3))
     assert (moved["EyeOpenLeft"], moved["EyeOpenRight"], moved["MouthSmile"]) == (0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("kind", ["reachy-mini-overlay", "vtube-studio-add", "vmc-single"])
+def test_one_program_gets_one_output(kind):
+    plain = kind.rpartition("-")[0]
+    with pytest.raises(ConfigError, match=f"--output {kind}: 127.0.0.1:.* gets {plain} already"):
+        open_outputs([plain, kind])
 
 
 # --- What moves a machine ---------------------------------------------------------------------------------------------
