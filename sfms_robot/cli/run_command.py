@@ -272,9 +272,12 @@ def _print_run(report: Mapping[str, Any]) -> None:
         "moves": f"{cell(answer)} (half of the times sooner)" if answer else "in virtual time, where nothing is late",
         "listener": f"{report['listener']}{planned}",
         "limits": f"exceeded {limits['violations']} times; {limits['clamped']} goals were slowed down to stay within",
-        "servos": f"{bus['writes']} times written, {bus['reads']} times read, {bus['errors']} errors, "
-        f"silent: {cell(bus['silent'], 'none')}",
     }
+    if "writes" in bus:  # not without servos
+        facts["servos"] = (
+            f"{bus['writes']} times written, {bus['reads']} times read, {bus['errors']} errors, "
+            f"silent: {cell(bus['silent'], 'none')}"
+        )
     if "recording" in report:
         kept = report["recording"]
         problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")

@@ -6,6 +6,7 @@ colon ("" without one) and returns a `ports.Output`. Kinds are imported when the
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Final
@@ -30,6 +31,11 @@ KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     vmc="avatars:VmcOutput",
     vmc_single="avatars:VmcSingleOutput",
     live_link="avatars:LiveLinkOutput",
+    vtube_studio="vtube_studio:VtubeStudio",
+    vtube_studio_add="vtube_studio:VtubeStudioAdd",
+    reachy_mini="reachy_mini:ReachyMini",
+    reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
+    furhat="furhat:Furhat",
 )
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
@@ -37,6 +43,11 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "vmc": "vmc[:HOST[:PORT]], 39539: avatar software (VSeeFace, VNyan, Warudo, Blender, Unity)",
     "vmc-single": "vmc-single[:HOST[:PORT]], 39539: the same, for receivers that read no bundles",
     "live-link": "live-link[:HOST[:PORT]], 11111: Unreal's MetaHumans, as Live Link Face on an iPhone",
+    "vtube-studio": "vtube-studio[:HOST[:PORT]], 8001: VTube Studio (Live2D), in place of its tracking",
+    "vtube-studio-add": "vtube-studio-add[:HOST[:PORT]], 8001: the same, added to the streamer's own tracking",
+    "reachy-mini": "reachy-mini[:HOST[:PORT]], 8000: Reachy Mini's daemon: head, body and antennas",
+    "reachy-mini-overlay": "reachy-mini-overlay[:HOST[:PORT]], 8000: the same daemon, on top of the app that it runs",
+    "furhat": "furhat[:HOST[:PORT]], 9000: Furhat's Realtime API: face, eyes and neck",
 }
 
 
@@ -69,13 +80,14 @@ def open_output(value: str, others: Iterable[EntryPoint] | None = None) -> Outpu
 
 
 def open_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> list[Output]:
-    """Return the outputs of a run, in order. Raises ConfigError, also for two of one kind and address."""
+    """Return the outputs of a run, in order. Raises ConfigError, also for two that reach one program."""
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
         output = open_output(value, others)
-        if (output.kind, output.peer) in opened:
-            raise ConfigError(f"--output {value}: {output.peer} gets {output.kind} already")
-        opened[output.kind, output.peer] = output
+        to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
+        if to in opened:
+            raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")
+        opened[to] = output
     return list(opened.values())
 
 

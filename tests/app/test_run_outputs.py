@@ -174,3 +174,8 @@ def test_a_receiver_that_is_away_is_said_once_and_named_by_the_state(caplog):
     assert [f"vmc:{sent['peer']}"] in [each["why"] for each in report["states"]["changes"]]
     said = Counter(each.levelname for each in caplog.records if sent["peer"] in each.getMessage())
     assert said["WARNING"] == 1
+
+
+def test_a_run_without_servos_prints_its_report(command_line):
+    done = command_line("run", "--head", "none", "--fast", "--duration", "1", "--audio", "none")
+    assert done.code == 0 and "none listened for 1 s (done)" in done.out and "bus:" not in done.out, done.err
