@@ -1,0 +1,152 @@
+"""Messages of ROS 2 against rosbags, an independent writer and reader of them, and faces as action units."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from sfms_robot.errors import PacketError
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE
+from sfms_robot.signals.ros2_messages import (
+    ACTION_UNITS,
+    AUDIO,
+    DIAGNOSTICS,
+    EXPRESSION,
+    JOINT_STATE,
+    POINT,
+    STRING,
+    face_of,
+    from_cdr,
+    header,
+    schema_text,
+    to_cdr,
+    type_hash,
+    units_of,
+)
+
+rosbags = pytest.importorskip("rosbags.typesys", reason="needs rosbags, of the extra [dev]")
+
+AT = header(1_700_000_000.25, "head")
+WIDE = np.linspace(0, 1, 99, dtype=np.float32)
+PAIRS = [{"key": "state", "value": "idle"}, {"key": "", "value": "äöü"}]
+STATUS = {"level": 2, "name": "sfms_robot: run", "message": "fault", "hardware_id": "face28", "values": PAIRS}
+MESSAGES = {
+    "joints": (JOINT_STATE, {"header": AT, "name": ["neck_yaw", "jaw", ""], "position": np.array([0.5, -1e-9, 3.0])}),
+    "joints moving": (JOINT_STATE, {"header": AT, "name": ["a"], "position": [1.0], "velocity": [2.0], "effort": [3]}),
+    "no joints": (JOINT_STATE, {}),
+    "units": (ACTION_UNITS, {"header": AT, "intensity": WIDE, "confidence": 1 - WIDE}),
+    "expression": (EXPRESSION, {"header": AT, "expression": "happy", "valence": 0.8, "arousal": 0.5, "confidence": 1}),
+    "text": (STRING, {"data": '{"kind": "nod"}'}),
+    "diagnostics": (DIAGNOSTICS, {"header": AT, "status": [STATUS, {**STATUS, "values": []}]}),
+    "no diagnostics": (DIAGNOSTICS, {"header": AT, "status": []}),
+    "sound": (AUDIO, {"header": AT, "audio": {"data": bytes(range(256))}}),
+    "point": (POINT, {"header": AT, "point": {"x": 1.0, "y": -0.25, "z": 0.5}}),
+}
+
+
+@pytest.fixture(scope="module")
+def store():
+    """Return rosbags' own types of ROS 2 Jazzy, and those that it does not have, from our definitions."""
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_JAZZY)
+    for kind in (ACTION_UNITS, EXPRESSION, AUDIO):
+        found = rosbags.get_types_from_msg(schema_text(kind), kind)
+        store.register({name: each for name, each in found.items() if name not in store.types})
+    return store
+
+
+def filled(store, kind, message):
+    """Return rosbags' object of a message, with what was left out."""
+    values = []
+    for name, (sort, what) in store.fielddefs[kind][1]:
+        value, inner = message.get(name), what[0] if sort > 2 else (sort, what)
+        if sort > 2 and inner[0] == 1 and inner[1][0] != "string":
+            value = (
+                np.frombuffer(value, np.uint8)
+                if isinstance(value, bytes)
+                else np.asarray(() if value is None else value)
+            )
+            value = value.astype(inner[1][0])
+        elif sort > 2:
+            value = [filled(store, inner[1], each) if inner[0] == 2 else each for each in value or ()]
+        elif sort == 2:
+            value = filled(store, what, value or {})
+        values.append(("" if what[0] == "string" else 0) if value is None else value)
+    return store.types[kind](*values)
+
+
+@pytest.mark.parametrize(("kind", "message"), MESSAGES.values(), ids=MESSAGES)
+def test_a_message_is_byte_for_byte_what_rosbags_writes_and_reads_back_whole(store, kind, message):
+    data = to_cdr(kind, message)
+    assert data == bytes(store.serialize_cdr(filled(store, kind, message), kind, little_endian=True))
+    assert to_cdr(kind, from_cdr(kind, data)) == data
+
+
+@pytest.mark.parametrize("kind", sorted({kind for kind, _ in MESSAGES.values()}))
+def test_the_hash_of_a_type_is_the_one_that_rosbags_computes(store, kind):
+    assert type_hash(kind) == store.hash_rihs01(kind)
+
+
+def test_the_hash_of_a_text_is_the_published_one():
+    assert type_hash(STRING) == "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+
+
+@pytest.mark.parametrize(("kind", "message"), MESSAGES.values(), ids=MESSAGES)
+def test_a_message_that_is_cut_off_anywhere_is_refused_in_one_line(kind, message):
+    data = to_cdr(kind, message)
+    for length in range(len(data)):
+        with pytest.raises(PacketError, match=rf"^{kind}: .*expected .*, got .*$"):
+            from_cdr(kind, data[:length])
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "problem"),
+    [
+        (
+            STRING,
+            b"\0\0\0\0" + struct.pack(">I", 2) + b"a\0",
+            "expected CDR, little-endian .00 01 00 00., got 00 00 00 00",
+        ),
+        (STRING, b'{"data": 1}', "got 7b 22 64 61"),
+        (STRING, b"", "got nothing"),
+        (STRING, b"\0\1\0\0" + struct.pack("<I", 2**32 - 1) + b"a\0", "data: expected 4294967295 bytes, got 2"),
+        (AUDIO, to_cdr(AUDIO, {})[:-4] + struct.pack("<I", 2**31), "data: expected 2147483648 bytes, got 0"),
+        (
+            JOINT_STATE,
+            to_cdr(JOINT_STATE, {})[:-4] + struct.pack("<I", 2**30),
+            "effort: expected 8589934592 bytes, got 0",
+        ),
+        (DIAGNOSTICS, to_cdr(DIAGNOSTICS, {})[:-4] + struct.pack("<I", 2**24), "status: expected 16777216 items, got 0 bytes"),
+        (STRING, to_cdr(STRING, {"data": "ab"}) + b"more", "expected 11 bytes, got 4 more"),
+    ],
+)
+def test_bytes_that_are_not_the_message_and_counts_that_lie_are_refused_in_one_line(kind, data, problem):
+    with pytest.raises(PacketError, match=f"^{kind}: .*{problem}"):
+        from_cdr(kind, data)
+
+
+def test_a_face_goes_to_action_units_and_back_by_one_table():
+    face = np.zeros(58, np.float32)
+    for place, name in enumerate(("mouthSmileLeft", "mouthSmileRight", "jawOpen", "browInnerUp", "eyeLookUpLeft")):
+        face[CHANNEL_INDEX[name]] = 0.1 + 0.2 * place
+    face[CHANNEL_INDEX["mouthSmileRight"]], face[CHANNEL_INDEX["eyeLookUpRight"]] = 0.1, 0.9
+    face[POSE][:3] = 0.25, -0.125, 0.5
+    units = units_of(face)
+    assert units["intensity"][[12, 26, 1, 63]] == pytest.approx([0.1, 0.5, 0.7, 0.9])
+    assert units["intensity"][[51, 52, 53, 54, 55, 56]] == pytest.approx(
+        np.array([0.5, 0, 0.125, 0, 0, 0.25]) * 4 / np.pi
+    )
+    assert (units["confidence"] > 0).sum() == 34 and not units["intensity"][units["confidence"] == 0].any()
+    read = from_cdr(ACTION_UNITS, to_cdr(ACTION_UNITS, units))
+    np.testing.assert_allclose(face_of(read), face, atol=1e-6)
+    lost = {
+        name for name in BLENDSHAPES if not face_of(units_of(np.eye(58, dtype=np.float32)[CHANNEL_INDEX[name]])).any()
+    }
+    assert lost == {"jawLeft", "jawRight", "mouthClose", "mouthLeft", "mouthRight", "mouthShrugUpper"}
+
+
+def test_units_that_were_not_detected_are_no_face_and_one_that_is_not_finite_is_refused():
+    units = {"intensity": np.full(99, np.nan, np.float32), "confidence": np.zeros(99, np.float32)}
+    assert not face_of(units).any()
+    units["confidence"][12] = 0.9
+    with pytest.raises(PacketError, match="^action unit 12: expected 0 to 1, got nan$"):
+        face_of(units)
