@@ -5,6 +5,7 @@ RobotError                      base; `exit_code` is what the command line retur
 |   +-- MissingExtra     (2)    a feature needs an optional package that is not installed; names the pip install
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or another program holds it
++-- OutputError          (3)    an output's peer is away, refuses, or answers in another way than it should
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
 |   +-- TorqueError      (4)    torque could not be confirmed off; names the joints
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
@@ -80,6 +81,12 @@ class InputError(ConfigError, ValueError):
 
 class PortError(RobotError):
     """A serial port cannot be opened. Example: no such device, no permission, held by another program."""
+
+    exit_code = 3
+
+
+class OutputError(RobotError):
+    """The peer of an output is away, refuses, or is something else. The run continues without it."""
 
     exit_code = 3
 

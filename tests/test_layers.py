@@ -15,10 +15,11 @@ BASE = {
     *("errors", "frames", "ports", "signals", "data", "config", "ranges", "endpoint", "network", "plugins"),
     "processes",
 }
-PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
+PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "outputs", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
     "runtime": BASE | {"runtime", "motion", "retarget"},  # the loop calls both at every tick
+    "outputs": BASE | {"outputs", "motion"},  # a machine that is moved passes the same limiter as joints
     "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
     "app": BASE | PEERS | {"viewer", "emulator", "app"},

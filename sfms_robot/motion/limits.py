@@ -85,6 +85,11 @@ def curve_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: 
     return np.asarray(np.maximum.reduce([v / speed, np.sqrt(a / acceleration), np.cbrt(j / jerk)]).clip(GENTLE_S))
 
 
+def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:
+    """Return angle, speed and acceleration (3, J) at `here` from three samples (J,) one period apart."""
+    return np.stack([here, (ahead - before) / (2 * period_s), (ahead - 2 * here + before) / period_s**2])
+
+
 class Recovery(NamedTuple):
     """The curves by which joints that were found outside their own ranges come in, (J,) each.
 

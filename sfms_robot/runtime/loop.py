@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
-from sfms_robot.motion.limits import JerkLimiter, LimiterState
+from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
 from sfms_robot.runtime.clock import tick_times
@@ -401,8 +401,3 @@ def _is_lost(reading: Reading) -> bool:
 def _due(now_s: float, period_s: float, every_s: float) -> bool:
     """Return whether this is the first tick of a new `every_s`."""
     return math.floor(now_s / every_s + 1e-9) != math.floor((now_s - period_s) / every_s + 1e-9)
-
-
-def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:
-    """Return angle, speed and acceleration (3, J) at `here` from three samples (J,) one period apart."""
-    return np.stack([here, (ahead - before) / (2 * period_s), (ahead - 2 * here + before) / period_s**2])

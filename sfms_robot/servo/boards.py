@@ -125,7 +125,7 @@ class BoardStatus(NamedTuple):
         return self.went_home and not self.lasting
 
 
-class Output:
+class PulseOutput:
     """The state of one channel of a board.
 
     Attributes:

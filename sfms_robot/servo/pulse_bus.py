@@ -30,7 +30,7 @@ from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.boards import (
     TRIES,
-    Output,
+    PulseOutput,
     RateLimitedPort,
     answers,
     board_for,
@@ -104,7 +104,7 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _forget(self) -> None:
         """Reset what holds for one connection only."""
-        self._outputs = [Output(index, servo) for index, servo in enumerate(self._servos)]
+        self._outputs = [PulseOutput(index, servo) for index, servo in enumerate(self._servos)]
         self._latched = False  # by `torque_off`: nothing is sent until `enable` or `resume`
         self._off_due = False  # torque off is to be sent again by the next poll
         self._pending = False  # goals that have not been sent yet
@@ -179,7 +179,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._check_latch()
         return np.array(held)
 
-    def _output(self, joint: str) -> Output:
+    def _output(self, joint: str) -> PulseOutput:
         return self._outputs[self.joints.index(joint)]
 
     def _unlatch(self) -> None:
@@ -195,7 +195,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.enabled = False
             raise BusError(f"bus {self.name!r}: torque was switched off while joints came on")
 
-    def _switch_on(self, wire: RateLimitedPort, output: Output) -> float:
+    def _switch_on(self, wire: RateLimitedPort, output: PulseOutput) -> float:
         """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` comes."""
         new, index = not output.enabled, output.index
         self._powered |= {output.channel}
@@ -409,7 +409,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._counts["writes"] += 1
         return True
 
-    def _send(self, wire: RateLimitedPort, outputs: Sequence[Output]) -> None:
+    def _send(self, wire: RateLimitedPort, outputs: Sequence[PulseOutput]) -> None:
         """Send goals, unless torque is off; if it was switched off while these bytes left, send torque off again."""
         outputs = [output for output in outputs if not output.resting]
         if self._latched or not outputs:
@@ -476,7 +476,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._report_fault(self._outputs, status.faults, shown=status.lasting)
         return True
 
-    def _report_fault(self, outputs: Sequence[Output], fault: str, shown: bool = True) -> None:
+    def _report_fault(self, outputs: Sequence[PulseOutput], fault: str, shown: bool = True) -> None:
         """Record a fault of some outputs; `shown` puts it into their readings, too."""
         for output in outputs if shown else ():
             output.fault = fault

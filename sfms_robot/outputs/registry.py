@@ -1,0 +1,89 @@
+"""Values of `--output`: KIND or KIND:ADDRESS, a head that takes a face or a pose instead of joint angles.
+
+A kind of another package is an entry point of the group `sfms_robot.outputs`: a callable that takes the text behind the
+colon ("" without one) and returns a `ports.Output`. Kinds are imported when they are opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Final
+
+from sfms_robot.endpoint import LOOPBACK, port_number
+from sfms_robot.errors import ConfigError
+from sfms_robot.plugins import plug_in, plugins
+
+if TYPE_CHECKING:  # numpy, which a look at a name does not need
+    from sfms_robot.ports import Output
+
+GROUP: Final = "sfms_robot.outputs"
+
+
+def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
+    named = {name.replace("_", "-"): place for name, place in kinds.items()}
+    return {name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP) for name, place in named.items()}
+
+
+KINDS: Final[Mapping[str, EntryPoint]] = _ours(
+    json="json_stream:JsonStream",
+    vmc="avatars:open_vmc",
+    vmc_single="avatars:open_vmc_single",
+    live_link="avatars:LiveLinkOutput",
+)
+
+
+def output_kinds(others: Iterable[EntryPoint] | None = None) -> Mapping[str, EntryPoint]:
+    """Return every kind by name, not yet imported; shipped kinds go before those of other packages.
+
+    `others`: those of other packages; None for the installed ones.
+    """
+    found = plugins(GROUP) if others is None else {each.name: each for each in others}
+    return {**found, **KINDS}
+
+
+def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> None:
+    """Check that there are such kinds. Imports and opens nothing. Raises ConfigError with the choices."""
+    kinds = output_kinds(others)
+    for value in values:
+        if value.partition(":")[0] not in kinds:
+            raise ConfigError(f"--output {value}: expected KIND or KIND:ADDRESS (valid: {', '.join(kinds)})")
+
+
+def open_output(value: str, others: Iterable[EntryPoint] | None = None) -> Output:
+    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError."""
+    check_outputs([value], others)
+    kind, _, address = value.partition(":")
+    entry = output_kinds(others)[kind]
+    output: Output = plug_in(entry, address)
+    if not callable(getattr(output, "send", None)):
+        raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
+    return output
+
+
+def open_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> list[Output]:
+    """Return the outputs of a run, in order. Raises ConfigError, also for two of one kind and address."""
+    opened: dict[tuple[str, str], Output] = {}
+    for value in values:
+        output = open_output(value, others)
+        if (output.kind, output.peer) in opened:
+            raise ConfigError(f"--output {value}: {output.peer} gets {output.kind} already")
+        opened[output.kind, output.peer] = output
+    return list(opened.values())
+
+
+def parse_address(kind: str, text: str, usual_port: int, host: str = LOOPBACK) -> tuple[str, int]:
+    """Return host and port of "", PORT, :PORT, HOST, HOST:PORT, [HOST] or [HOST]:PORT (IPv6 in brackets).
+
+    `host`: where none is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
+    """
+    name, colon, digits = text.rpartition(":")
+    if text.endswith("]") or not (colon or text.isdigit()):  # no port
+        name, digits = text, ""
+    bracketed = name.startswith("[") and name.endswith("]")
+    port = port_number(digits, 1) if digits else usual_port
+    bare = name[1:-1] if bracketed else name
+    odd = not bare if bracketed else any(mark in name for mark in ":[]/@ ") or (colon and not digits)
+    if port is None or odd or not bare.isprintable():
+        raise ConfigError(f"--output {kind}:{text}: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got {text!r}")
+    return bare or host, port
