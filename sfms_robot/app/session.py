@@ -294,6 +294,7 @@ def _open(
             play=options.play,
             agent=controls.speech,
             visitor=controls.visitor,
+            router=options.router,
         )
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())

@@ -122,11 +122,11 @@ Message = dict[str, Any]
 
 
 class MessageField(NamedTuple):
-    """One field of a message. `count`: None for a single value, 0 for a list of any length."""
+    """One field of a message. `size`: None for a single value, 0 for a list of any length."""
 
     name: str
     part: str
-    count: int | None
+    size: int | None
 
 
 @cache
