@@ -221,7 +221,8 @@ def run(
         recorder = None
         if options.record is not None:
             about = run_facts(opened.config, options)
-            recorder = Recorder(options.record, joints, "wait" if options.fast else "drop", about)
+            full = "wait" if options.fast else "drop"
+            recorder = Recorder(options.record, joints, full, about, record_format=options.record_format)
             watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
             stack.enter_context(panel(controls))
@@ -271,6 +272,8 @@ def _check(options: RunOptions) -> None:
             raise ConfigError(f"--{flag} {value}: {why} takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
+    elif options.record_format != "json":
+        raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
 
 
 def _open(

@@ -110,6 +110,12 @@ def run(
     record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
     ),
+    record_format: str = Option(
+        "json",
+        metavar="json|ros2",
+        rich_help_panel=OUTPUT,
+        help="Messages of the recording (MCAP): JSON, for Foxglove; those of ROS 2, for its tools and PlotJuggler too.",
+    ),
     overwrite: bool = Option(
         False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
     ),
@@ -179,7 +185,14 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.options import RunOptions, begin_listening, begin_page, check_names, engine_named
+    from sfms_robot.app.options import (
+        RunOptions,
+        begin_listening,
+        begin_page,
+        check_names,
+        engine_named,
+        record_format_named,
+    )
 
     calm = None
     if calmness or addressed != "sense":
@@ -204,6 +217,7 @@ def run(
         style=tuple(style),
         calmness=calm,
         record=record,
+        record_format=record_format_named(record_format),
         overwrite=overwrite,
         dry_run=dry_run,
         halt_on=halt_on,

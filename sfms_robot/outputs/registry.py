@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from sfms_robot.endpoint import LOOPBACK, port_number
 from sfms_robot.errors import ConfigError
+from sfms_robot.network import LOCAL, Router
 from sfms_robot.plugins import plug_in, plugins
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
@@ -30,6 +31,7 @@ KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     vmc="avatars:open_vmc",
     vmc_single="avatars:open_vmc_single",
     live_link="avatars:LiveLinkOutput",
+    ros2="ros2:Ros2Output",
 )
 
 
@@ -50,22 +52,27 @@ def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = N
             raise ConfigError(f"--output {value}: expected KIND or KIND:ADDRESS (valid: {', '.join(kinds)})")
 
 
-def open_output(value: str, others: Iterable[EntryPoint] | None = None) -> Output:
-    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError."""
+def open_output(value: str, others: Iterable[EntryPoint] | None = None, router: Router = LOCAL) -> Output:
+    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError.
+
+    router: of ROS 2.
+    """
     check_outputs([value], others)
     kind, _, address = value.partition(":")
     entry = output_kinds(others)[kind]
-    output: Output = plug_in(entry, address)
+    output: Output = plug_in(entry, address, router) if kind == "ros2" else plug_in(entry, address)
     if not callable(getattr(output, "send", None)):
         raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
     return output
 
 
-def open_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> list[Output]:
+def open_outputs(
+    values: Sequence[str], others: Iterable[EntryPoint] | None = None, router: Router = LOCAL
+) -> list[Output]:
     """Return the outputs of a run, in order. Raises ConfigError, also for two of one kind and address."""
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
-        output = open_output(value, others)
+        output = open_output(value, others, router)
         if (output.kind, output.peer) in opened:
             raise ConfigError(f"--output {value}: {output.peer} gets {output.kind} already")
         opened[output.kind, output.peer] = output

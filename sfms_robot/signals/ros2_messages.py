@@ -39,6 +39,13 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 AUDIO: Final = "audio_common_msgs/msg/AudioDataStamped"
 POINT: Final = "geometry_msgs/msg/PointStamped"
 
+# What a run says in ROS's own types, live and in recordings.
+TYPED_TOPICS: Final[Mapping[str, str]] = {
+    "/joint_states": JOINT_STATE,
+    "/robot_face/action_units": ACTION_UNITS,
+    "/robot_face/expression": EXPRESSION,
+    "/diagnostics": DIAGNOSTICS,
+}
 NO_HASH: Final = "TypeHashNotSupported"
 
 _RULE: Final = "=" * 80  # between the definitions of an MCAP schema `ros2msg`
@@ -305,6 +312,16 @@ def header(time_s: float, frame: str = "") -> Message:
     return {"stamp": {"sec": int(whole), "nanosec": min(round(part * 1e9), 999_999_999)}, "frame_id": frame}
 
 
+_LEVELS: Final = {"degraded": 1, "halted": 1, "fault": 2}  # WARN, ERROR; 0 is OK
+
+
+def diagnostics(head: Message, state: str, values: Mapping[str, Any]) -> Message:
+    """Return the state of a run, and its figures, as a DiagnosticArray."""
+    pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
+    status = {"level": _LEVELS.get(state, 0), "name": "sfms_robot: run", "message": state, "values": pairs}
+    return {"header": head, "status": [status]}
+
+
 # --- Faces as action units --------------------------------------------------------------------------------------------
 
 UNITS: Final = 99
@@ -343,3 +360,26 @@ def face_of(message: Message) -> Floats:
     for channel, (positive, negative) in _HEAD_UNITS.items():
         motion[CHANNEL_INDEX[channel]] = (intensity[positive] - intensity[negative]) * HEAD_FULL_RAD
     return motion
+
+
+_SHOWN: Final = 0.25  # mean intensity of its units, from which an expression is named
+# Units of each expression (EMFACS), and where it lies on the axes of valence and arousal (Russell 1980; rounded).
+_EXPRESSIONS: Final[Mapping[str, tuple[tuple[int, ...], float, float]]] = {
+    "happy": ((12,), 0.8, 0.4),
+    "surprised": ((1, 2, 5, 26), 0.2, 0.8),
+    "sad": ((1, 15), -0.7, -0.4),
+    "angry": ((4, 7, 24), -0.6, 0.7),
+    "disgusted": ((9, 10), -0.7, 0.3),
+    "scared": ((1, 4, 5, 20), -0.6, 0.7),
+}
+
+
+def expression_of(intensity: Floats) -> Message:
+    """Return the expression that action units (99,) are nearest to, "neutral" where none is strong."""
+    scores = {name: float(intensity[list(units)].mean()) for name, (units, _, _) in _EXPRESSIONS.items()}
+    name = max(scores, key=lambda each: scores[each])
+    score = scores[name]
+    if score < _SHOWN:
+        return {"expression": "neutral", "confidence": 1.0 - score}
+    _, valence, arousal = _EXPRESSIONS[name]
+    return {"expression": name, "valence": score * valence, "arousal": score * arousal, "confidence": score}

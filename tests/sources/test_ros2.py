@@ -1,46 +1,21 @@
 """A person in a graph of ROS 2: two sessions of zenoh and their router, in this process."""
 
-import json
-import socket
-import threading
 import time
 from contextlib import closing
 
 import numpy as np
 import pytest
+from ros2_graph import client, free_endpoint, until
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX
-from sfms_robot.network import Ros2Node, Router, close_session, ros_domain, serve_session, session_config
+from sfms_robot.network import Ros2Node, ros_domain
 from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, NO_HASH, STRING, to_cdr, units_of, wire_name
 from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.ros2 import Ros2Sight, Ros2Voice
 
-pytest.importorskip("zenoh", reason="needs the extra [ros2]")
-
 FACS = "/humans/faces/23bd5/facs"
 SMILE = CHANNEL_INDEX["mouthSmileLeft"]
-
-
-def client(folder, endpoint):
-    """Return the router of a configuration file in `folder`, at an endpoint."""
-    file = folder / "robot.json5"
-    alone = {"scouting": {"multicast": {"enabled": False}}}
-    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **alone}))
-    return Router(file)
-
-
-def free_endpoint():
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
-
-
-@pytest.fixture
-def router(tmp_path):
-    endpoint = free_endpoint()
-    served = serve_session(session_config("serve", endpoint=endpoint))
-    yield client(tmp_path, endpoint)
-    close_session(served)
 
 
 def face(**shapes):
@@ -48,11 +23,6 @@ def face(**shapes):
     for name, value in shapes.items():
         motion[CHANNEL_INDEX[name]] = value
     return motion
-
-
-def until(true):
-    while not true():
-        threading.Event().wait(0.001)
 
 
 def send(part, router, topic, wire, data, count="received", domain=0):

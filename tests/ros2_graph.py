@@ -1,0 +1,33 @@
+"""A router of zenoh in this process, on a free port, as the middleware of ROS 2 has one."""
+
+import json
+import socket
+import threading
+from contextlib import contextmanager
+
+from sfms_robot.network import Router, close_session, serve_session, session_config
+
+
+def free_endpoint():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def client(folder, endpoint):
+    """Return the router of a configuration file in `folder`, at an endpoint."""
+    file = folder / "robot.json5"
+    alone = {"scouting": {"multicast": {"enabled": False}}}
+    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **alone}))
+    return Router(file)
+
+
+@contextmanager
+def serving(endpoint):
+    served = serve_session(session_config("serve", endpoint=endpoint))
+    yield
+    close_session(served)
+
+
+def until(true):
+    while not true():
+        threading.Event().wait(0.001)
