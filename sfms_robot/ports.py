@@ -301,7 +301,7 @@ class ChannelLimit(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputFrame:
-    """What an output shows at one instant.
+    """A frame of motion for an output, at one instant.
 
     Attributes:
         time_s: loop time.
@@ -320,7 +320,7 @@ class OutputFrame:
 
 
 class Output(Protocol):
-    """A head that takes a face or a pose: an avatar, a robot with a daemon of its own. One thread calls it.
+    """A head that takes a face or a pose: an avatar, a robot with a daemon. One thread calls it.
 
     A subclass has to define what has no value here. Constructing one connects to nothing.
 

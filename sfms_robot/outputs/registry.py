@@ -28,8 +28,8 @@ def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
 
 KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     json="json_stream:JsonStream",
-    vmc="avatars:open_vmc",
-    vmc_single="avatars:open_vmc_single",
+    vmc="avatars:VmcOutput",
+    vmc_single="avatars:VmcSingleOutput",
     live_link="avatars:LiveLinkOutput",
     ros2="ros2:Ros2Output",
 )

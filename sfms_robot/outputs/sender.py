@@ -1,4 +1,4 @@
-"""How motion gets to an output: eased, limited, in a thread of its own, over losses of the peer.
+"""Motion on its way to an output: eased, limited, in a thread of its own, over losses of the peer.
 
     MotionShaper    motion that an output shows, a value passed from step to step: no jump at start, end, halt, return
     OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument

@@ -1,4 +1,4 @@
-"""How motion gets to an output: eased, limited, over losses; every time is an argument."""
+"""Motion on its way to an output: eased, limited, over losses; every time is an argument."""
 
 import logging
 
