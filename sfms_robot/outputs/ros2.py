@@ -101,7 +101,7 @@ class Ros2Output(Output):
         if frame.joints:
             joints = {"name": frame.joints, "position": frame.goals_rad}
             messages.append(("/joint_states", {"header": header(time_s), **joints}))
-        messages += [("/sfms_robot/events", {"data": json.dumps(asdict(event))}) for event in frame.events]
+        messages += [("/sfms_robot/events", {"data": json.dumps(asdict(event), default=float)}) for event in frame.events]
         if due or frame.state != self._state:
             self._checked_s, self._state = now_s, frame.state
             messages.append(("/diagnostics", diagnostics(header(time_s), frame.state, {"time_s": frame.time_s})))

@@ -51,7 +51,7 @@ def _number(flag: str, name: str, text: str) -> int:
 
 
 class _Heard:
-    """What comes of one topic: whether it is lost, and a line where nothing came."""
+    """Arrivals of one topic: lost or not, and a line where there are none."""
 
     def __init__(self, flag: str, topic: str, node: Ros2Node, lost_after_s: float) -> None:
         self._flag, self._topic, self._node, self._lost_after_s = flag, topic, node, lost_after_s
