@@ -101,7 +101,9 @@ class Ros2Output(Output):
         if frame.joints:
             joints = {"name": frame.joints, "position": frame.goals_rad}
             messages.append(("/joint_states", {"header": header(time_s), **joints}))
-        messages += [("/sfms_robot/events", {"data": json.dumps(asdict(event), default=float)}) for event in frame.events]
+        messages += [
+            ("/sfms_robot/events", {"data": json.dumps(asdict(event), default=float)}) for event in frame.events
+        ]
         if due or frame.state != self._state:
             self._checked_s, self._state = now_s, frame.state
             messages.append(("/diagnostics", diagnostics(header(time_s), frame.state, {"time_s": frame.time_s})))
@@ -117,7 +119,7 @@ class Ros2Output(Output):
             self._node.close()
 
     def _take_point(self, topic: str, wire: str, data: bytes) -> None:
-        message = read_message((POINT,), wire, data)
+        message = read_message(POINT, wire, data)
         frame, point = message["header"]["frame_id"].lstrip("/"), message["point"]
         if frame not in FRAMES:
             raise PacketError(f"frame_id: expected the head's ({', '.join(FRAMES[1:])}) or none, got {frame!r}")

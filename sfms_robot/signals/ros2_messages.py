@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
@@ -195,15 +195,14 @@ def wire_name(kind: str, hashed: bool = True) -> str:
     return f"{kind.replace('/msg/', '::msg::dds_::')}_/{type_hash(kind) if hashed else NO_HASH}"
 
 
-def read_message(kinds: Sequence[str], wire: str, data: bytes) -> Message:
-    """Return a message of one of these kinds. Raises PacketError for another type or hash, and as `from_cdr`."""
+def read_message(kind: str, wire: str, data: bytes) -> Message:
+    """Return a message of this kind. Raises PacketError for another type or hash, and as `from_cdr`."""
     sort, _, found = wire.partition("/")
-    for kind in kinds:
-        if wire_name(kind).startswith(f"{sort}/"):
-            if found not in (type_hash(kind), NO_HASH):
-                raise PacketError(f"{kind}: expected {type_hash(kind)}, got {found}: another version of the message")
-            return from_cdr(kind, data)
-    raise PacketError(f"expected {' or '.join(kinds)}, got {sort.replace('::msg::dds_::', '/msg/').rstrip('_')}")
+    if not wire_name(kind).startswith(f"{sort}/"):
+        raise PacketError(f"expected {kind}, got {sort.replace('::msg::dds_::', '/msg/').rstrip('_')}")
+    if found not in (type_hash(kind), NO_HASH):
+        raise PacketError(f"{kind}: expected {type_hash(kind)}, got {found}: another version of the message")
+    return from_cdr(kind, data)
 
 
 # --- CDR --------------------------------------------------------------------------------------------------------------
@@ -348,13 +347,9 @@ def units_of(motion: Floats) -> Message:
 
 
 def face_of(message: Message) -> Floats:
-    """Return the face (58,) of action units whose confidence is above 0. Raises PacketError for what is not finite."""
-    detected = message["confidence"] > 0
+    """Return the face (58,) of action units whose confidence is above 0; what is not finite stays so."""
     motion = np.zeros(MOTION_DIM, np.float32)
-    intensity = np.where(detected, message["intensity"], np.float32(0))
-    for unit in _KNOWN:
-        if not math.isfinite(intensity[unit]):
-            raise PacketError(f"action unit {unit}: expected 0 to 1, got {intensity[unit]}")
+    intensity = np.where(message["confidence"] > 0, message["intensity"], np.float32(0))
     for unit, places in _PLACES.items():
         motion[places] = np.maximum(motion[places], intensity[unit])
     for channel, (positive, negative) in _HEAD_UNITS.items():

@@ -10,32 +10,32 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PacketError
-from sfms_robot.frames import FRAME_S, SHAPES, Floats, Sighting
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, SHAPES, Floats, Sighting
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
-from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, face_of, read_message, wire_name
+from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
 from sfms_robot.signals.spaces import beyond
 from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, parse_face_argument
+from sfms_robot.sources.live_voice import check_rate
 from sfms_robot.sources.push import PushedVoice
 
 logger = logging.getLogger(__name__)
 
 SILENT_S: Final = 1.0  # a voice that is away for so long is lost: publishers send silence too
+MOST_CHANNELS: Final = 8
 _OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
-_OPENFACE_FULL: Final = 5.0  # full intensity of trackers that count 0 to 5
-_OVERSHOOT: Final = 1.1
 _FILES: Final = (b"RIFF", b"ID3", b"OggS", b"fLaC")  # begin sound files
-_RATES: Final = {"rate": (16_000, 4_000, 384_000), "channels": (1, 1, 8)}  # value, least, most
 
 
-def _options(flag: str, argument: str, more: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """Return what stands before the options of `ros2:PLACE,NAME=VALUE`, and these. Raises ConfigError."""
-    place, given = argument, {"domain": "", **more}
+def _options(flag: str, argument: str, **given: str) -> tuple[str, dict[str, str]]:
+    """Return what stands before the options of `PLACE,NAME=VALUE`, and these; `given`: defaults. Raises ConfigError."""
+    place, given = argument, {"domain": "", **given}
     while option := _OPTION.search(place):
         if option[1] not in given:
             raise ConfigError(f"{flag}: option {option[1]!r} is not known ({', '.join(given)})")
@@ -43,31 +43,36 @@ def _options(flag: str, argument: str, more: Mapping[str, str]) -> tuple[str, di
     return place, given
 
 
-def _number(flag: str, name: str, text: str) -> int:
-    value, least, most = _RATES[name]
-    if text and not (text.isascii() and text.isdigit() and least <= int(text[:9]) <= most):
-        raise ConfigError(f"{flag}: {name}: expected {least} to {most}, got {text!r}")
-    return int(text or value)
+class _Subscription:
+    """One topic: its messages, whether they have stopped, and a line where none came.
 
+    take: is handed each message.
+    """
 
-class _Heard:
-    """Arrivals of one topic: lost or not, and a line where there are none."""
-
-    def __init__(self, flag: str, topic: str, node: Ros2Node, lost_after_s: float) -> None:
-        self._flag, self._topic, self._node, self._lost_after_s = flag, topic, node, lost_after_s
+    def __init__(
+        self, flag: str, topic: str, domain: str, router: Router, *, kind: str, take: Callable[[Message], None]
+    ) -> None:
+        self._flag, self._topic = flag, topic
+        self.node = Ros2Node(
+            f"sfms_robot_{flag.split()[0].strip('-')}",
+            ros_domain(domain, flag),
+            router,
+            takes={topic: wire_name(kind)},
+            received=lambda _, wire, data: take(read_message(kind, wire, data)),
+        )
         self._counted = 0
         self._heard_s: float | None = None
         self._said = False
 
-    def lost(self, time_s: float) -> bool:
-        """Return whether messages came before loop time `time_s`, and have stopped."""
-        counted = self._node.counts["received"] - self._node.counts["refused"]
+    def lost(self, time_s: float, after_s: float) -> bool:
+        """Return whether messages came before loop time `time_s`, and have stopped for `after_s`."""
+        counted = self.node.counts["received"] - self.node.counts["refused"]
         if counted > self._counted:
             self._counted, self._heard_s = counted, time_s
         if self._heard_s is None and time_s > UNHEARD_S and not self._said:
             self._said = True
-            logger.warning("%s: nothing came yet: %s", self._flag, self._node.absence(self._topic))
-        return self._heard_s is not None and time_s - self._heard_s > self._lost_after_s
+            logger.warning("%s: nothing came yet: %s", self._flag, self.node.absence(self._topic))
+        return self._heard_s is not None and time_s - self._heard_s > after_s
 
 
 class Ros2Voice(PushedVoice):
@@ -77,29 +82,32 @@ class Ros2Voice(PushedVoice):
 
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
         super().__init__()
-        place, given = _options(self._way, argument, {"rate": "", "channels": ""})
-        self._sent_hz, self._channels = (_number(self._way, name, given[name]) for name in _RATES)
+        place, given = _options(self._way, argument, rate=str(AUDIO_HZ), channels="1")
+        try:
+            self._sent_hz, self._channels = whole_number(given["rate"]), whole_number(given["channels"])
+            check_rate(self._sent_hz)
+        except ConfigError as error:
+            raise ConfigError(f"{self._way}:{argument}: {error}") from None
+        if not 0 < self._channels <= MOST_CHANNELS:
+            raise ConfigError(f"{self._way}: channels: expected 1 to {MOST_CHANNELS}, got {self._channels}")
         topic = ros_topic(place, self._way)
-        domain = ros_domain(given["domain"], self._way)
-        takes = {topic: wire_name(AUDIO)}
-        self._node = Ros2Node("sfms_robot_voice", domain, router, takes=takes, received=self._take_message)
-        self._heard = _Heard(self._way, topic, self._node, SILENT_S)
+        self._topic = _Subscription(self._way, topic, given["domain"], router, kind=AUDIO, take=self._hear)
 
     def take(self, index: int) -> Floats | None:
-        self.lost = self._heard.lost((index + 1) * FRAME_S)
+        self.lost = self._topic.lost((index + 1) * FRAME_S, SILENT_S)
         return super().take(index)
 
     def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), **self._node.counts}
+        return {**super().statistics(), **self._topic.node.counts}
 
     def close(self) -> None:
-        self._node.close()
+        self._topic.node.close()
 
-    def _take_message(self, topic: str, wire: str, data: bytes) -> None:
-        sound = read_message((AUDIO,), wire, data)["audio"]["data"].tobytes()
-        if sound.startswith(_FILES) or len(sound) % (2 * self._channels):
-            what = f"{len(sound)} bytes" if len(sound) % (2 * self._channels) else "a sound file"
-            raise PacketError(f"data: expected 16-bit samples of {self._channels} channels (format wave), got {what}")
+    def _hear(self, message: Message) -> None:
+        sound = message["audio"]["data"].tobytes()
+        if len(sound) % (2 * self._channels) or sound.startswith(_FILES):
+            what = "a sound file" if sound.startswith(_FILES) else f"{len(sound)} bytes"
+            raise PacketError(f"data: expected 16-bit samples, {self._channels} in a row (format wave), got {what}")
         samples = np.frombuffer(sound, "<i2").reshape(-1, self._channels)
         self.hear(samples if self._channels > 1 else samples[:, 0], self._sent_hz)
 
@@ -107,36 +115,26 @@ class Ros2Voice(PushedVoice):
 class Ros2Sight(LiveFace):
     """`ports.Sight` of `--face ros2:FACE_ID|TOPIC[,domain=N][,flip=...]`. Raises ConfigError."""
 
-    _way = "--face ros2"
-
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
-        place, given = _options(self._way, argument, {"flip": ""})
+        flag = "--face ros2"
+        place, given = _options(flag, argument, flip="")
         super().__init__(parse_face_argument("ros2", f",flip={given['flip']}" if given["flip"] else "")[1])
-        self._full = 1.0
-        topic = ros_topic(place if "/" in place else f"/humans/faces/{place}/facs", self._way)
-        domain = ros_domain(given["domain"], self._way)
-        takes = {topic: wire_name(ACTION_UNITS)}
-        self._node = Ros2Node("sfms_robot_face", domain, router, takes=takes, received=self._take_message)
-        self._heard = _Heard(self._way, topic, self._node, LOST_S)
+        topic = ros_topic(place if "/" in place else f"/humans/faces/{place}/facs", flag)
+        self._topic = _Subscription(flag, topic, given["domain"], router, kind=ACTION_UNITS, take=self._see)
 
     def at(self, time_s: float) -> Sighting | None:
-        self.lost = self._heard.lost(time_s)
+        self.lost = self._topic.lost(time_s, LOST_S)
         return super().at(time_s)
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the node's counts of messages."""
-        return dict(self._node.counts)
+        return dict(self._topic.node.counts)
 
     def close(self) -> None:
-        self._node.close()
+        self._topic.node.close()
 
-    def _take_message(self, topic: str, wire: str, data: bytes) -> None:
-        units = read_message((ACTION_UNITS,), wire, data)
-        peak = np.max(units["intensity"], where=units["confidence"] > 0, initial=0.0)
-        if self._full == 1.0 and _OVERSHOOT < peak <= _OPENFACE_FULL:
-            self._full = _OPENFACE_FULL
-            logger.warning("%s: intensities of %s are taken as 0 to %g", self._way, topic, self._full)
-        motion = face_of({**units, "intensity": units["intensity"] / np.float32(self._full)})
+    def _see(self, message: Message) -> None:
+        motion = face_of(message)
         if (problem := beyond(motion)) is not None:
             raise PacketError(problem)
         motion[SHAPES] = np.clip(motion[SHAPES], 0.0, 1.0)
