@@ -257,14 +257,14 @@ def from_cdr(kind: str, data: bytes) -> Message:
         raise PacketError(
             f"{kind}: expected CDR, little-endian ({_BEGIN.hex(' ')}), got {data[:4].hex(' ') or 'nothing'}"
         )
-    reader = _Reader(kind, memoryview(data)[len(_BEGIN) :])
+    reader = CdrReader(kind, memoryview(data)[len(_BEGIN) :])
     message = reader.message(kind)
     if (left := len(reader.data) - reader.at) > _PADDING:
         raise PacketError(f"{kind}: expected {reader.at + len(_BEGIN)} bytes, got {left} more")
     return message
 
 
-class _Reader:
+class CdrReader:
     """A place in the bytes of a message, behind the first four."""
 
     def __init__(self, kind: str, data: memoryview) -> None:
