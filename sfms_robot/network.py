@@ -299,7 +299,9 @@ class Ros2Node:
 
     def matched(self, topic: str) -> bool:
         """Return whether a topic of `sends` has a subscriber now."""
-        return topic in self._publishers and bool(self._publishers[topic].matching_status.matching)
+        if (publisher := self._publishers.get(topic)) is None:
+            return False
+        return bool(getattr(publisher.matching_status, "matching", False))  # an object, though declared as bool
 
     def publish(self, topic: str, data: bytes, time_ns: int) -> None:
         """Send a message of one of `sends`; without a router it is dropped."""

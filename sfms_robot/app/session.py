@@ -221,8 +221,9 @@ def run(
         recorder = None
         if options.record is not None:
             about = run_facts(opened.config, options)
-            full = "wait" if options.fast else "drop"
-            recorder = Recorder(options.record, joints, full, about, record_format=options.record_format)
+            recorder = Recorder(
+                options.record, joints, "wait" if options.fast else "drop", about, record_format=options.record_format
+            )
             watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
             stack.enter_context(panel(controls))

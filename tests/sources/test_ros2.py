@@ -74,7 +74,7 @@ BAD = {
     "not finite": (
         wire_name(ACTION_UNITS),
         to_cdr(ACTION_UNITS, units_of(face(jawOpen=0.5)) | {"intensity": np.full(99, np.nan)}),
-        "browDownLeft is not finite",
+        "roll is not finite",
     ),
     "too large": (
         wire_name(ACTION_UNITS),
