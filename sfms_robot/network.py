@@ -60,7 +60,7 @@ LOCAL: Final = Router()
 
 def check_zenoh() -> None:
     """Raise MissingExtra where zenoh is not installed."""
-    with optional("listening from another machine"):
+    with optional("a network of other machines, or of ROS 2,"):
         import zenoh  # noqa: F401
 
 
@@ -282,8 +282,7 @@ class Ros2Node:
         self._said: set[str] = set()
         self._kept: list[Any] = []  # what is declared, for as long as the node lives
         config = session_config("call", router)
-        if limit_s is not None:
-            config.insert_json5("connect/timeout_ms", str(round(1e3 * limit_s)))
+        config.insert_json5("connect/timeout_ms", "-1" if limit_s is None else str(round(1e3 * limit_s)))
         self._connection = Connection(config, self._declare)
 
     def wait(self, limit_s: float) -> bool:

@@ -17,7 +17,7 @@ def client(folder, endpoint):
     """Return the router of a configuration file in `folder`, at an endpoint."""
     file = folder / "robot.json5"
     alone = {"scouting": {"multicast": {"enabled": False}}}
-    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **alone}))
+    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}, **alone}))
     return Router(file)
 
 

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from ros2_graph import client, free_endpoint, until
+from ros2_graph import client, free_endpoint, serving, until
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX
@@ -120,6 +120,16 @@ def test_where_nothing_comes_one_line_says_why(router, tmp_path, caplog):
             assert here.absence("/mic").endswith("in domain 0; one is in domain 7 (,domain=N or ROS_DOMAIN_ID)")
             with closing(Ros2Node("too", 0, router, sends={"/mic": wire_name(AUDIO)})):
                 until(lambda: "sends nothing" in here.absence("/mic"))
+
+
+def test_a_router_that_comes_late_goes_and_comes_back_is_found_again(tmp_path):
+    endpoint = free_endpoint()
+    router = client(tmp_path, endpoint)
+    with closing(Ros2Sight("23bd5", router)) as sight:
+        for _ in range(2):
+            with serving(endpoint):
+                send(sight, router, FACS, wire_name(ACTION_UNITS), UNITS)
+        assert sight.statistics() == {"sent": 0, "received": 2, "refused": 0}
 
 
 @pytest.mark.parametrize(
