@@ -16,6 +16,7 @@ from sfms_robot.signals.ros2_messages import (
     POINT,
     STRING,
     face_of,
+    fields_of,
     from_cdr,
     header,
     schema_text,
@@ -54,32 +55,26 @@ def store():
     return store
 
 
+def theirs(store, kind, message):
+    """Return rosbags' object of a message, made from the same values."""
+
+    def field(name, part, size):
+        value = message.get(name)
+        if size is None:
+            missing = "" if part == "string" else 0
+            return theirs(store, part, value or {}) if "/" in part else value or missing
+        if "/" in part or part == "string":
+            return [theirs(store, part, each) if "/" in part else each for each in value or ()]
+        return np.array(() if value is None else list(value), part)
+
+    return store.types[kind](*(field(*each) for each in fields_of(kind)))
+
+
 @pytest.mark.parametrize(("kind", "message"), MESSAGES.values(), ids=MESSAGES)
-def test_a_message_is_byte_for_byte_what_rosbags_writes_of_it(store, kind, message):
+def test_a_message_is_byte_for_byte_what_rosbags_writes_and_is_read_back_whole(store, kind, message):
     data = to_cdr(kind, message)
-    read = store.deserialize_cdr(data, kind)
-    assert data == bytes(store.serialize_cdr(read, kind, little_endian=True)) == to_cdr(kind, from_cdr(kind, data))
-    for name in message.keys() - {"header", "status", "audio", "point"}:
-        assert np.array_equal(
-            getattr(read, name),
-            np.float32(message[name]) if kind == EXPRESSION and name != "expression" else message[name],
-        )
-    if "header" in message:
-        assert (read.header.stamp.sec, read.header.stamp.nanosec, read.header.frame_id) == (
-            1_700_000_000,
-            250_000_000,
-            "head",
-        )
-
-
-def test_what_is_inside_a_message_is_what_rosbags_reads(store):
-    read = [store.deserialize_cdr(to_cdr(kind, message), kind) for kind, message in list(MESSAGES.values())[-3:]]
-    assert bytes(read[1].audio.data) == bytes(range(256)) and vars(read[2].point) | MESSAGES["point"][1][
-        "point"
-    ] == vars(read[2].point)
-    (status, _) = store.deserialize_cdr(to_cdr(*MESSAGES["diagnostics"]), DIAGNOSTICS).status
-    assert (status.level, status.name, status.hardware_id) == (2, "sfms_robot: run", "face28")
-    assert [(each.key, each.value) for each in status.values] == [("state", "idle"), ("", "äöü")]
+    assert data == bytes(store.serialize_cdr(theirs(store, kind, message), kind, little_endian=True))
+    assert data == to_cdr(kind, from_cdr(kind, data))
 
 
 @pytest.mark.parametrize("kind", sorted({kind for kind, _ in MESSAGES.values()}))
@@ -99,29 +94,21 @@ def test_a_message_that_is_cut_off_anywhere_is_refused_in_one_line(kind, message
             from_cdr(kind, data[:length])
 
 
+def lying(kind, count):
+    return to_cdr(kind, {})[:-4] + struct.pack("<I", count)
+
+
 @pytest.mark.parametrize(
     ("kind", "data", "problem"),
     [
-        (
-            STRING,
-            b"\0\0\0\0" + struct.pack(">I", 2) + b"a\0",
-            "expected CDR, little-endian .00 01 00 00., got 00 00 00 00",
-        ),
+        (STRING, b"\0\0\0\0\0\0\0\1\0", "expected CDR, little-endian .00 01 00 00., got 00 00 00 00"),
         (STRING, b'{"data": 1}', "got 7b 22 64 61"),
         (STRING, b"", "got nothing"),
-        (STRING, b"\0\1\0\0" + struct.pack("<I", 2**32 - 1) + b"a\0", "data: expected 4294967295 bytes, got 2"),
-        (AUDIO, to_cdr(AUDIO, {})[:-4] + struct.pack("<I", 2**31), "data: expected 2147483648 bytes, got 0"),
-        (
-            JOINT_STATE,
-            to_cdr(JOINT_STATE, {})[:-4] + struct.pack("<I", 2**30),
-            "effort: expected 8589934592 bytes, got 0",
-        ),
-        (
-            DIAGNOSTICS,
-            to_cdr(DIAGNOSTICS, {})[:-4] + struct.pack("<I", 2**24),
-            "status: expected 16777216 items, got 0 bytes",
-        ),
+        (STRING, b"\0\1\0\0\xff\xff\xff\xffa\0", "data: expected 4294967295 bytes, got 2"),
         (STRING, to_cdr(STRING, {"data": "ab"}) + b"more", "expected 11 bytes, got 4 more"),
+        (AUDIO, lying(AUDIO, 2**31), "data: expected 2147483648 bytes, got 0"),
+        (JOINT_STATE, lying(JOINT_STATE, 2**30), "effort: expected 8589934592 bytes, got 0"),
+        (DIAGNOSTICS, lying(DIAGNOSTICS, 2**24), "status: expected 16777216 items, got 0 bytes"),
     ],
 )
 def test_bytes_that_are_not_the_message_and_counts_that_lie_are_refused_in_one_line(kind, data, problem):
@@ -153,7 +140,4 @@ def test_units_that_were_not_detected_are_no_face():
     units = {"intensity": np.full(99, np.nan, np.float32), "confidence": np.zeros(99, np.float32)}
     assert not face_of(units).any()
     units["confidence"][12] = 0.9
-    assert np.flatnonzero(np.isnan(face_of(units))).tolist() == [
-        CHANNEL_INDEX["mouthSmileLeft"],
-        CHANNEL_INDEX["mouthSmileRight"],
-    ]
+    assert np.isnan(face_of(units)).sum() == 2
