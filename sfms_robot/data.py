@@ -11,6 +11,8 @@ from sfms_robot.errors import ConfigError, did_you_mean
 SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
 _ARCHIVES: Final = {b"PK\x03\x04": "zip", b"7z\xbc\xaf": "7z", b"Rar!": "rar", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
+NO_HEAD: Final = "none"  # the head without servos, which outputs alone show
+
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
 

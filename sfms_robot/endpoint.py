@@ -81,6 +81,14 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
     raise AssertionError("no port was tried")
 
 
+def leads_here(address: str, port: int) -> bool:
+    """Return whether HOST:PORT is this machine at `port`. Asks no name server."""
+    host, at = host_and_port(address) or ("", 0)
+    name = socket.gethostname()
+    named = host in ("localhost", name, f"{name}.local", "0.0.0.0", "::", *addresses_of_this_machine())
+    return at == port and (named or is_loopback(host))
+
+
 def connect(address: str) -> socket.socket:
     """Return a connection to HOST:PORT, without Nagle's delay, or to a socket in the file system. Raises OSError."""
     place = host_and_port(address)

@@ -56,6 +56,7 @@ export class ServoTable {
       tick ? `${tick.toFixed(0)} ticks a second` : '',
       hottest ? `warmest: ${hottest.joint}, ${hottest.temperature_C.toFixed(0)} °C` : '',
       `${Object.keys(faults).length || 'no'} fault${Object.keys(faults).length === 1 ? '' : 's'}`,
+      ...(status.outputs ?? []).map(({ kind, peer, state, frames_per_s: rate }) => `${kind} ${peer}: ${state === 'sending' ? `${rate.toFixed(0)} frames a second` : state}`),
     ].filter(Boolean).join(' · ');
   }
 }

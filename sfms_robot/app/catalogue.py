@@ -7,6 +7,7 @@ from typing import Any, Literal
 from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
+from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.registry import shipped_speaker
 
@@ -60,6 +61,14 @@ def shipped_speakers() -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def outputs() -> list[dict[str, Any]]:
+    """Return the rows of `output list`, those of other packages too. `name` begins the value for --output."""
+    return [
+        {"name": name, "description": DESCRIPTIONS.get(name, f"of package {entry.dist.name if entry.dist else '?'}")}
+        for name, entry in output_kinds().items()
+    ]
 
 
 def serial_ports() -> list[dict[str, Any]]:

@@ -21,13 +21,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.wiring import Opened, calibration_of, devices, firmware_maps, open_wires, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_head
 from sfms_robot.config.check import check_registers
 from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
+from sfms_robot.data import NO_HEAD
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.frames import Doubles
@@ -51,6 +52,7 @@ from sfms_robot.servo.stored_settings import JointNeeds, home_ticks
 log = logging.getLogger(__name__)
 
 _REVERSED: Final = 1  # bit of the drive mode: the direction in which ticks rise
+NO_BUS_HZ: Final = 50.0  # rate of the loop of a head without servos
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,14 +98,16 @@ class OpenHead:
 
 def fastest_hz(head: Head) -> float:
     """Return the rate of the head's fastest bus."""
-    return max(bus.rate_hz for bus in head.buses.values())
+    return max((bus.rate_hz for bus in head.buses.values()), default=NO_BUS_HZ)
 
 
 def prepare_head(options: HeadOptions) -> Head:
     """Check a head and its ports before anything is opened; return the head. Raises ConfigError, PortError."""
     if options.fast and options.port != SIM:
         raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
-    head = load_head(options.head)
+    head = load_head(options.head, servos=not isinstance(options, RunOptions))
+    if not head.joints and options.port != SIM:
+        raise ConfigError(f"--port {options.port!r}: --head {NO_HEAD} has no servos: leave it out")
     for joint in options.without:
         if joint not in head.joints:
             raise ConfigError(
@@ -160,7 +164,9 @@ def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -
 
     Raises ConfigError, PortError.
     """
-    head = load_head(name)
+    head = load_head(name, servos=False)  # `prepare_head` has judged it
+    if not head.joints:
+        return head
     overlay, sha256 = load_overlay(head), head_hash(name)
     if port == SIM:
         layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
@@ -238,7 +244,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     if len(neck := retargeter.neck_columns):
         leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
     safety = [head.safety_of(joint) for joint in head.joints]
-    holds = np.array([each.halt == "hold" for each in safety])
+    holds = np.array([each.halt == "hold" for each in safety], np.bool_)
     holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
     return Motion(
         timeline=PlanTimeline(1.0 / rate_hz),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sfms_robot.data import find
+from sfms_robot.data import NO_HEAD, find
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router
 from sfms_robot.plugins import listener_folder
@@ -40,7 +40,7 @@ class HeadOptions:
     """A head and its servos.
 
     Attributes:
-        head: shipped name, or a folder with a head.yaml.
+        head: shipped name, or a folder with a head.yaml; of a run also "none": no servos.
         port: "sim", "auto", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
         fast: virtual time; needs emulated servos.
         yes: hobby servos may jump when they come on.
@@ -61,7 +61,10 @@ class HeadOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(HeadOptions):
-    """The options of `sfms-robot run`; None where a default depends on other options."""
+    """The options of `sfms-robot run`; None where a default depends on other options.
+
+    `outputs`: KIND or KIND:ADDRESS each, see `outputs.registry`.
+    """
 
     listener: str = "sfms-small"
     audio: str = "default"
@@ -85,6 +88,7 @@ class RunOptions(HeadOptions):
     zenoh: Path | None = None
     insecure: bool = False
     packages: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
 
     @property
     def confirmed(self) -> bool:
@@ -110,7 +114,12 @@ def check_names(options: RunOptions) -> None:
 
     Raises ConfigError, PortError.
     """
-    find("heads", options.head, "head.yaml")
+    if options.head != NO_HEAD:
+        find("heads", options.head, "head.yaml")
+    if options.outputs:
+        from sfms_robot.outputs.registry import check_outputs
+
+        check_outputs(options.outputs)
     listener_folder(options.listener)
     check_source(options.audio, options.face, options.agent_audio, play=options.play)
     if options.status is not None:

@@ -44,7 +44,7 @@ def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
         if options.port != SIM:
             yield devices(head, options.port)
             return
-        chains = plugged_in(options.head, head)
+        chains = plugged_in(options.head, head) if head.joints else {}
         yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
 
 

@@ -25,11 +25,13 @@ app = Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_ar
 listener = Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = Typer(help="Recorded people: list.", no_args_is_help=True)
 port = Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
+output = Typer(help="Outputs, heads that take a face or a pose: list.", no_args_is_help=True)
 
 
 @listener.callback()
 @speaker.callback()
 @port.callback()
+@output.callback()
 def _group() -> None: ...
 
 
@@ -47,6 +49,14 @@ def list_speakers(json: bool = JSON) -> None:
     from sfms_robot.app.catalogue import shipped_speakers
 
     show({"version": 1, "speakers": shipped_speakers()}, json)
+
+
+@output.command("list")
+def list_outputs(json: bool = JSON) -> None:
+    """Kinds of --output, with the address that each takes; those of installed packages too."""
+    from sfms_robot.app.catalogue import outputs
+
+    show({"version": 1, "outputs": outputs()}, json)
 
 
 @port.command("list")

@@ -58,6 +58,7 @@ for _name, _group in (
     ("listener", head_command.listener),
     ("speaker", head_command.speaker),
     ("port", head_command.port),
+    ("output", head_command.output),
     ("servo", servo_command.app),
     ("data", train_command.data_app),
     ("train", train_command.app),

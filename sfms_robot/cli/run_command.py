@@ -27,7 +27,10 @@ OPTIONAL = {
 
 def run(
     head: str = Option(
-        "face28", autocompletion=head_names, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
+        "face28",
+        autocompletion=head_names,
+        rich_help_panel=HEAD,
+        help="Shipped head, or a folder with a head.yaml; 'none': no servos, --output alone.",
     ),
     port: str = Option(
         "sim",
@@ -106,6 +109,12 @@ def run(
     ),
     fast: bool = Option(
         False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
+    ),
+    output: list[str] = Option(
+        [],
+        metavar="KIND[:ADDRESS]",
+        rich_help_panel=OUTPUT,
+        help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
     ),
     record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
@@ -227,6 +236,7 @@ def run(
         zenoh=zenoh,
         insecure=insecure,
         packages=tuple(packages),
+        outputs=tuple(output),
     )
     check_names(options)
     if check:
@@ -278,6 +288,10 @@ def _print_run(report: Mapping[str, Any]) -> None:
         kept = report["recording"]
         problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")
         facts["recording"] = f"{kept['bytes'] * 1e-6:.1f} MB" + (f", INCOMPLETE: {problem}" if problem else "")
+    for sent in report["outputs"]:
+        facts[f"{sent['kind']}:{sent['peer']}"] = f"{sent['frames']} frames, {sent['losses']} losses" + (
+            f", away at the end: {sent['problem']}" if sent["state"] == "lost" else ""
+        )
     if report["torque_unconfirmed"]:
         facts["torque"] = f"NOT confirmed off: {cell(report['torque_unconfirmed'])}"
     say(f"{report['head']} listened for {report['duration_s']:g} s ({report['exit']})", "bold")

@@ -89,7 +89,7 @@ class RobotScene:
         if neck is not None and self._pose is not None and self._pose.joints:
             self.joints += self._pose.joints
             self.undriven = tuple(name for name in self.undriven if name not in neck.joints)
-        if not self.joints:
+        if not self.joints and self._names:
             ours, theirs = ", ".join(self._names), ", ".join(_free(self.robot)) or "none"
             raise ConfigError(
                 f"{urdf}: none of its joints ({theirs}) follows a joint of this head ({ours}): urdf.joints"

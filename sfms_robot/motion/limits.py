@@ -235,7 +235,7 @@ class JerkLimiter:
         Returns angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
         """
         before = state.motion.T.tolist()
-        after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).T
+        after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).reshape(-1, 3).T
         # Rounding may have left the range in force by an ulp.
         reach = self._own.reaching(state.motion[0])
         np.clip(after[0], reach.low, reach.high, out=after[0])

@@ -34,6 +34,13 @@ KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     ros2="ros2:Ros2Output",
 )
 
+DESCRIPTIONS: Final[Mapping[str, str]] = {
+    "json": "json[:PORT], 8782: WebSocket server of this machine, a JSON object a frame",
+    "vmc": "vmc[:HOST[:PORT]], 39539: avatar software (VSeeFace, VNyan, Warudo, Blender, Unity)",
+    "vmc-single": "vmc-single[:HOST[:PORT]], 39539: the same, for receivers that read no bundles",
+    "live-link": "live-link[:HOST[:PORT]], 11111: Unreal's MetaHumans, as Live Link Face on an iPhone",
+}
+
 
 def output_kinds(others: Iterable[EntryPoint] | None = None) -> Mapping[str, EntryPoint]:
     """Return every kind by name, not yet imported; shipped kinds go before those of other packages.

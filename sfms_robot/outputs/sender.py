@@ -287,6 +287,11 @@ class Outputs(Observer):
             thread.start()
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """KIND:ADDRESS of each."""
+        return tuple(each.sender.name for each in self.threads)
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """Names of outputs whose peer is away."""
         return tuple(each.sender.name for each in self.threads if each.sender.lost)

@@ -128,6 +128,7 @@ class RunLog:
     state: Any = None  # of the loop at its end, with the counters of timeline and limiter
     torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
+    reported: Sequence[str] = ()  # lost parts that log their own loss
     states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
     state_s: dict[str, float] = field(default_factory=dict)
     _low_rad: Doubles = field(init=False)  # (J,), as the two below
@@ -171,7 +172,7 @@ class RunLog:
             if last.name == "halted" and state.name == "starting":
                 logger.info("halt released")
         self.states.append((now_s, state))
-        reported = {"listener", *self.joints}  # each by a line of its own, which has the reason
+        reported = {"listener", *self.joints, *self.reported}  # each by a line of its own, which has the reason
         level = logging.WARNING if set(state.why) - reported - set(before) else logging.INFO
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
 

@@ -54,6 +54,7 @@ class Parts:
         holds: (J,) joints that keep their torque when halted; None: no joint does.
         heat: temperature derating; None disables it.
         ignored: joints whose faults are known and accepted.
+        missing: called at every tick for names of further lost parts.
     """
 
     source: Source
@@ -73,6 +74,7 @@ class Parts:
     holds: NDArray[np.bool_] | None = None
     heat: HeatGuard | None = None
     ignored: frozenset[str] = frozenset()
+    missing: Callable[[], Sequence[str]] = tuple
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,8 +233,9 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
     """Return the state with the state of the run from here on."""
     presence = state.presence
-    lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
-    eased_in = bool(now_s - state.since_s.max() >= EASE_S)
+    listener = ("listener",) if parts.feed.lost else ()
+    lost = (*parts.source.missing, *listener, *parts.missing(), *state.lost_joints)
+    eased_in = bool(now_s - state.since_s.max(initial=0.0) >= EASE_S)
     halted, released = parts.halt.causes, state.released
     if not halted and state.run.name == "halted" and not state.stands:
         halted = state.run.why  # it ends when the head stands, not before

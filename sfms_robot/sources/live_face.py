@@ -59,6 +59,7 @@ LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
 LOST_S: Final = 0.5  # five packets of one that sends ten a second
 SILENT_S: Final = 2.0  # after so long another sender may take over, and what is left out of a new one is logged
+USUAL_PORTS: Final = {"vmc": 39539, "live-link": 11111}  # what the protocol, and the app, suggest
 ANY: Final = ("0.0.0.0", "::")  # every address of this machine
 UNHEARD_S: Final = 5.0  # into a run without a sender, what to type there is logged
 _REASONS_SAID: Final = 6

@@ -26,9 +26,9 @@ from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, Floats
 from sfms_robot.signals.spaces import LiveUnits
-from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
+from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
 
-PORT: Final = 11111  # what the app suggests
+PORT: Final = USUAL_PORTS["live-link"]
 VERSION: Final = 6
 LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began again
 

@@ -35,9 +35,9 @@ from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.rotations import angles_of
 from sfms_robot.signals.spaces import LiveUnits, channel_of, used_line
-from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
+from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
 
-PORT: Final = 39539  # what the protocol gives those who receive
+PORT: Final = USUAL_PORTS["vmc"]
 
 # The ARKit shapes nearest to a preset of VRM 0 and 1.
 _SMILE: Final = {"mouthSmileLeft": 1.0, "mouthSmileRight": 1.0, "cheekSquintLeft": 0.5, "cheekSquintRight": 0.5}

@@ -23,6 +23,7 @@ from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.thread import ListenerThread
+from sfms_robot.outputs.registry import check_outputs
 from sfms_robot.ports import Listener, Source
 from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.sources.paired import JudgedSource, PairedSource
@@ -42,7 +43,7 @@ class Robot(Driven):
     and `stop` wait for the loop.
 
     Args:
-        head: shipped name, folder, or what `load_head` gave.
+        head: shipped name, folder, or what `load_head` gave; "none": no servos, `outputs` alone show the face.
         port: "sim" for emulated servos, "auto", a device, or NAME=DEVICE[,NAME=DEVICE].
         listener: shipped name, folder, zenoh/NAME, a name that another package registers; or an object that implements
             `Listener`, which is then stepped in a thread of this process.
@@ -61,6 +62,7 @@ class Robot(Driven):
         without: joints that are left alone.
         intensity, style: of regions, as in `knobs`.
         calmness, addressed: as in `calm`.
+        outputs: KIND or KIND:ADDRESS each, as `run --output`: "vmc:127.0.0.1:39539".
 
     Raises ConfigError, PortError, InputError for what cannot be right, before anything is opened.
     """
@@ -89,6 +91,7 @@ class Robot(Driven):
         calmness: Mapping[str, float] | None = None,
         addressed: str = "sense",
         engine: EngineName = "auto",
+        outputs: Sequence[str] = (),
     ) -> None:
         pushed = source is None and audio == PUSH
         if pushed and (face, agent_audio) != ("auto", "none"):
@@ -118,8 +121,10 @@ class Robot(Driven):
             record=None if record is None else Path(record),
             record_format=record_format_named(record_format),
             overwrite=overwrite,
+            outputs=tuple(outputs),
         )
         prepare_head(self._options)
+        check_outputs(self._options.outputs)
         self._listener = own
         self._person = (PushedVoice(), PushedSight()) if pushed else None
         hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
@@ -127,7 +132,7 @@ class Robot(Driven):
         self._source: Source | None = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
-        self._controls = RunControls(load_head(self._options.head), self._options)
+        self._controls = RunControls(load_head(self._options.head, servos=False), self._options)
         self._controls.speech = self._speech
 
     def __enter__(self) -> Self:

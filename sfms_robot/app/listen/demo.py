@@ -116,7 +116,7 @@ def free_folder(folder: Path) -> Path:
 
 def _summary(options: RunOptions, report: dict[str, Any]) -> dict[str, Any]:
     """Return what a person in front of the head would have seen."""
-    head = load_head(options.head)
+    head = load_head(options.head, servos=False)
     retargeter = HeadRetargeter(head)
     neck = [retargeter.joints[int(column)] for column in retargeter.neck_columns]
     travel_rad = sum(report["joints"][joint]["travel_rad"] for joint in neck if joint in report["joints"])

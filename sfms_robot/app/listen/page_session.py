@@ -80,7 +80,7 @@ class PageSession:
 
         `feed`: a listener of these options that loads already.
         """
-        options, head = self.options, load_head(self.options.head)
+        options, head = self.options, load_head(self.options.head, servos=False)
         joints, by_visitor = list(head.joints), _taken_of_visitors(options)
         controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
         self.released = False

@@ -236,6 +236,7 @@ def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool 
         ("ticks", rates),
         ("latency", _latency(document.get("latency_ms") or {})),
         ("hottest", hottest and f"{hottest['joint']} {hottest['temperature_C']:.0f} C"),
+        ("outputs", ", ".join(map(_output, document.get("outputs") or ()))),
         ("faults", _faults(document.get("faults") or {})),
     ):
         if text:
@@ -270,6 +271,11 @@ def _intensity(regions: Mapping[str, float]) -> str:
     if len(regions) > 1 and len(set(regions.values())) == 1 and 1.0 not in regions.values():
         return f"{next(iter(regions.values())):g}"
     return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
+
+
+def _output(sent: Mapping[str, Any]) -> str:
+    rate = f"{sent['frames_per_s']:.0f} a second" if sent["state"] == "sending" else sent["state"]
+    return f"{sent['kind']}:{sent['peer']} {rate}"
 
 
 def _latency(latency_ms: Mapping[str, Mapping[str, float | None]]) -> str:
