@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
 Document = Callable[[], Mapping[str, Any]]
@@ -214,7 +215,7 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
-        sinks = _outputs(options, stack)
+        sinks = _outputs(options, controls, stack)
         server = None
         if options.status is not None:  # a port that is in use is found before a listener is loaded
             server = stack.enter_context(closing(status_server(options.status)))
@@ -301,15 +302,16 @@ def _check(options: RunOptions) -> None:
         raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
 
 
-def _outputs(options: RunOptions, stack: ExitStack) -> list[Output]:
+def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> list[Output]:
     """Return the outputs, not connected yet; none in a dry run. Raises ConfigError, PortError."""
     if not options.outputs or options.dry_run:
         return []
     from sfms_robot.outputs.registry import open_outputs
 
-    sinks = open_outputs(options.outputs)
+    sinks = open_outputs(options.outputs, router=options.router)
     for sink in sinks:
         stack.callback(sink.close)
+        sink.look_at = partial(controls.puppet.look_at, seconds=LOOK_S)
     kind, argument = split_kind(options.face)
     if kind in ("vmc", "live-link"):
         from sfms_robot.sources.live_face import USUAL_PORTS, parse_endpoint, parse_face_argument

@@ -39,6 +39,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "vmc": "vmc[:HOST[:PORT]], 39539: avatar software (VSeeFace, VNyan, Warudo, Blender, Unity)",
     "vmc-single": "vmc-single[:HOST[:PORT]], 39539: the same, for receivers that read no bundles",
     "live-link": "live-link[:HOST[:PORT]], 11111: Unreal's MetaHumans, as Live Link Face on an iPhone",
+    "ros2": "ros2[:DOMAIN][,humble], ROS_DOMAIN_ID or 0: a graph of ROS 2 (rmw_zenoh), without ROS installed",
 }
 
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
-from sfms_robot.errors import InputError, OutputError, PacketError, PortError
+from sfms_robot.errors import OutputError, PacketError, PortError
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain
 from sfms_robot.ports import Output, OutputFrame
 from sfms_robot.signals.ros2_messages import (
@@ -41,16 +41,12 @@ SENT: Final[Mapping[str, str]] = {**TYPED_TOPICS, "/sfms_robot/events": STRING}
 OPEN_S: Final = 1.8
 CHECK_S: Final = 1.0  # between two looks at the router, and two diagnostics
 FRAMES: Final = ("", "head", "head_link", "sellion_link")  # whose points need no transform
-FAR_M: Final = 1000.0
 
 
 class Ros2Output(Output):
     """`ports.Output` of `--output ros2`. Raises ConfigError for another address.
 
     wall: seconds since 1970, of the headers.
-
-    Attributes:
-        look_at: called with x, y, z [m] of each point that comes, in a thread of zenoh.
     """
 
     kind = "ros2"
@@ -60,7 +56,6 @@ class Ros2Output(Output):
         self._domain = ros_domain(domain + rest, "--output ros2")
         self._hashed, self._router, self._wall = not humble, router, wall
         self.peer = str(self._domain)
-        self.look_at: Callable[[float, float, float], object] = lambda x_m, y_m, z_m: None
         self._node: Ros2Node | None = None
         self._checked_s = -math.inf
         self._state = ""
@@ -123,8 +118,5 @@ class Ros2Output(Output):
         frame, point = message["header"]["frame_id"].lstrip("/"), message["point"]
         if frame not in FRAMES:
             raise PacketError(f"frame_id: expected the head's ({', '.join(FRAMES[1:])}) or none, got {frame!r}")
-        if not all(abs(value) <= FAR_M for value in point.values()):
-            raise InputError(
-                f"point: expected metres up to {FAR_M:g}, got {', '.join(f'{v:g}' for v in point.values())}"
-            )
-        self.look_at(point["x"], point["y"], point["z"])
+        if self.look_at is not None:
+            self.look_at(point["x"], point["y"], point["z"])
