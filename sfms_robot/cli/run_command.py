@@ -18,6 +18,12 @@ from sfms_robot.errors import ConfigError
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods, beside a mean of 4.4
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
+OUTPUTS = Option(
+    [],
+    metavar="KIND[:ADDRESS]",
+    rich_help_panel=OUTPUT,
+    help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
+)
 OPTIONAL = {
     "--play": "default",
     "--status": "auto",
@@ -110,12 +116,7 @@ def run(
     fast: bool = Option(
         False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
     ),
-    output: list[str] = Option(
-        [],
-        metavar="KIND[:ADDRESS]",
-        rich_help_panel=OUTPUT,
-        help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
-    ),
+    output: list[str] = OUTPUTS,
     record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
     ),
@@ -320,6 +321,7 @@ def demo(
         metavar="[[HOST:]PORT]",
         help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
     ),
+    output: list[str] = OUTPUTS,
     no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
     json: bool = JSON,
 ) -> None:
@@ -333,6 +335,7 @@ def demo(
         duration_s=duration,
         fast=fast or seeds is not None,
         overwrite=overwrite,
+        outputs=tuple(output),
     )
     check_names(options)
     served = not (no_view or options.fast or json)

@@ -37,8 +37,8 @@ LIVE_LINK_PORT: Final = 11111
 SUBJECT: Final = "sfms-robot"  # as Unreal lists it
 LARGEST_PACKET: Final = 1400  # bytes, so that no network cuts it in two
 _EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
-_DAY_S: Final = 86_400
 _RATE: Final = 50  # of Live Link
+_DAY: Final = 86_400 * _RATE  # frames
 
 
 class UdpOutput(Output):
@@ -187,12 +187,15 @@ class LiveLinkOutput(UdpOutput):
         name = SUBJECT.encode()
         self._head = b"\x06" + 2 * (struct.pack(">i", len(name)) + name)  # device and subject
         self._midnight_s: float | None = None  # of `time.monotonic`
+        self._number = 0
 
     def packets(self, frame: OutputFrame, now_s: float) -> Sequence[bytes]:
         if self._midnight_s is None:
             here = time.localtime()
             self._midnight_s = now_s - (here.tm_hour * 60 + here.tm_min) * 60 - here.tm_sec
-        number, part = divmod((now_s - self._midnight_s) % _DAY_S * _RATE, 1.0)
+        due = round((now_s - self._midnight_s) * _RATE)
+        # One after the other: by the clock alone, a frame that is a little late would skip a number.
+        self._number = self._number + 1 if abs(self._number + 1 - due) < _RATE / 2 else due
         eyes = [each for turn, tilt in eye_directions(frame.motion).tolist() for each in (turn, tilt, 0.0)]
         values = np.array([*frame.motion[_ORDER], *eyes], ">f4").tobytes()
-        return [self._head + struct.pack(">ifiiB", int(number), part, _RATE, 1, len(values) // 4) + values]
+        return [self._head + struct.pack(">ifiiB", self._number % _DAY, 0.0, _RATE, 1, len(values) // 4) + values]

@@ -20,7 +20,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -169,8 +169,20 @@ class OutputSender:
             **self._counts,
             "frames_per_s": round(self._window[2], 1) if state == "sending" else 0.0,
             "problem": self._problem,
-            **self.output.statistics(),
+            **self._asked(self.output.statistics),
         }
+
+    def close(self) -> None:
+        """Disconnect the output."""
+        self._asked(self.output.close)
+
+    def _asked(self, method: Callable[[], Mapping[str, Any] | None]) -> Mapping[str, Any]:
+        """Return what a method of the output gives, nothing where it raises."""
+        try:
+            return method() or {}
+        except Exception:  # of a plug-in: any
+            logger.info("output %s raised", self.name, exc_info=True)
+            return {}
 
     def _phase(self, state: str, ending: bool) -> Phase:
         if state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
@@ -208,7 +220,7 @@ class OutputSender:
             self._counts["losses"] += 1
             logger.warning("output %s: %s; it is tried again, the run continues", self.name, self._problem)
         self.lost, self.shown = True, None
-        self.output.close()
+        self.close()
         self._retry_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, PAUSES_S[1])
 
@@ -270,12 +282,12 @@ class OutputThread(Observer):
         while not self._closing.wait(max(0.0, due_s - time.monotonic())):
             now_s = time.monotonic()
             self.sender.step(self.frame(), now_s)
-            due_s = max(due_s + period_s, now_s)  # what is late is left out
+            due_s = max(due_s + period_s, now_s + period_s / 2)  # after a late frame the others are not made up for
         last_s, frame = time.monotonic() + LAST_S, self.frame()
         while not self.sender.settled and (now_s := time.monotonic()) < last_s:
             self.sender.step(frame, now_s, ending=True)
             time.sleep(max(0.0, now_s + period_s - time.monotonic()))
-        self.sender.output.close()
+        self.sender.close()
 
 
 class Outputs(Observer):

@@ -345,14 +345,14 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopS
     """End a halt: held joints ease in from their present angles, the others from those they return at."""
     parts.bus.resume(parts.retargeter.joints)
     every = np.ones_like(state.released)
-    back = state.released & [joint not in parts.ignored for joint in parts.retargeter.joints]
+    back = state.released & np.array([joint not in parts.ignored for joint in parts.retargeter.joints], np.bool_)
     return replace(_eased_in_from(parts, log, state.goals_rad, every, state, now_s), released=back, stands=False)
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: LoopState, now_s: float) -> LoopState:
     """Ease in joints that were away again from their present angles, as at the start."""
     joints = parts.retargeter.joints
-    back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
+    back = np.array([joint in readings and readings[joint].rejoined for joint in joints], np.bool_)
     if not back.any():
         return state
     stands_rad = state.goals_rad.copy()  # also for a servo without a position

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
 from sfms_robot.app.options import RunOptions
+from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError, PortError
@@ -24,13 +26,14 @@ LIVE = RunOptions(head="none", audio="none", duration_s=4.0)
 
 def refused(**options):
     with pytest.raises((ConfigError, PortError)) as found:
-        run(RunOptions(**{"head": "none", "audio": "none", "duration_s": 1.0, **options}))
+        run(replace(LIVE, **options))
     assert "\n" not in str(found.value)
     return str(found.value)
 
 
-def test_a_run_without_servos_is_a_run_with_no_joints():
-    report = run(NONE)
+def test_a_run_without_servos_is_a_run_with_no_joints(tmp_path):
+    report = run(replace(NONE, record=tmp_path))
+    assert read_recording(tmp_path).joints == () and len(read_recording(tmp_path).motion) == report["ticks"]
     assert (report["exit"], report["frames"], report["tick"]["target_hz"]) == ("done", 50, 50)
     assert report["joints"] == {} == report["wire"] and report["outputs"] == []
     assert report["limits"]["violations"] == 0 and "listening" in report["states"]["seconds"]
@@ -54,22 +57,22 @@ def test_no_servos_need_no_port_and_are_known_to_runs_alone():
         load_head("none")
 
 
+READS = "--face live-link:0.0.0.0:1234,flip=yaw"
+
+
 @pytest.mark.parametrize(
-    ("options", "line"),
+    ("outputs", "more", "line"),
     [
-        ({"outputs": ("vcm",)}, "--output vcm: expected KIND or KIND:ADDRESS (valid: json, vmc, vmc-single"),
-        ({"outputs": ("vmc:1:2:3",)}, "--output vmc:1:2:3: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got"),
-        ({"outputs": ("vmc", "vmc:39539")}, "--output vmc:39539: 127.0.0.1:39539 gets vmc already"),
-        ({"outputs": ("vmc",), "fast": True}, "--output vmc: what is shown elsewhere takes real time"),
-        ({"outputs": ("vmc",), "face": "vmc"}, "--output vmc:127.0.0.1:39539: --face vmc reads what is sent there"),
-        (
-            {"outputs": ("live-link:localhost:1234",), "face": "live-link:0.0.0.0:1234,flip=yaw"},
-            "--output live-link:localhost:1234: --face live-link:0.0.0.0:1234,flip=yaw reads what is sent there",
-        ),
+        ("vcm", {}, "--output vcm: expected KIND or KIND:ADDRESS (valid: json, vmc, vmc-single"),
+        ("vmc:1:2:3", {}, "--output vmc:1:2:3: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got"),
+        ("vmc vmc:39539", {}, "--output vmc:39539: 127.0.0.1:39539 gets vmc already"),
+        ("vmc", {"fast": True}, "--output vmc: what is shown elsewhere takes real time"),
+        ("vmc", {"face": "vmc"}, "--output vmc:127.0.0.1:39539: --face vmc reads what is sent there"),
+        ("live-link:localhost:1234", {"face": READS[7:]}, f"--output live-link:localhost:1234: {READS} reads what is"),
     ],
 )
-def test_outputs_that_cannot_be_are_refused_before_anything_is_opened(options, line):
-    assert refused(**options).startswith(line)
+def test_outputs_that_cannot_be_are_refused_before_anything_is_opened(outputs, more, line):
+    assert refused(outputs=tuple(outputs.split()), **more).startswith(line)
 
 
 def test_a_json_port_that_is_taken_ends_the_run_before_it_begins():
@@ -132,7 +135,7 @@ def free_port():
 @pytest.mark.realtime
 def test_readers_of_two_outputs_see_the_face_of_the_run_and_a_halt_makes_it_neutral(caplog):
     with Readers() as readers:
-        options = RunOptions(**{**vars(LIVE), "outputs": readers.outputs})
+        options = replace(LIVE, outputs=readers.outputs)
         controls = RunControls(load_head("none", servos=False), options)
         motion = np.zeros(58, np.float32)
         motion[1], motion[6 + BLENDSHAPES.index("mouthSmileLeft")] = 0.3, 0.5
@@ -144,10 +147,13 @@ def test_readers_of_two_outputs_see_the_face_of_the_run_and_a_halt_makes_it_neut
                 if not self.shown and seen.time_s > 1.0:
                     self.shown = True
                     controls.puppet.show(motion, 2.0)
-                if seen.time_s > 2.6:
+                if 2.6 < seen.time_s < 3.7:
                     controls.halt.close("test")
+                elif seen.time_s > 3.7 and controls.halt.causes:
+                    controls.halt.resume("device")
 
         report = run(options, controls=controls, observers=[Program()])
+    assert report["states"]["changes"][3]["state"] == "starting"  # after the halt
     assert report["exit"] == "done" and [each["state"] for each in report["outputs"]] == ["sending", "sending"]
     smiles = [each["shapes"]["mouthSmileLeft"] for each in readers.frames]
     halted = [each["shapes"]["mouthSmileLeft"] for each in readers.frames if each["state"] == "halted"]
@@ -162,7 +168,7 @@ def test_readers_of_two_outputs_see_the_face_of_the_run_and_a_halt_makes_it_neut
 
 @pytest.mark.realtime
 def test_a_receiver_that_is_away_is_said_once_and_named_by_the_state(caplog):
-    report = run(RunOptions(**{**vars(LIVE), "duration_s": 3.0, "outputs": (f"vmc:{free_port()}",)}))
+    report = run(replace(LIVE, duration_s=3.0, outputs=(f"vmc:{free_port()}",)))
     (sent,) = report["outputs"]
     assert (report["exit"], sent["state"], sent["losses"]) == ("done", "lost", 1)
     assert [f"vmc:{sent['peer']}"] in [each["why"] for each in report["states"]["changes"]]

@@ -83,7 +83,7 @@ def test_our_decoder_reads_live_link_back(seed):
 def test_live_link_counts_frames_so_that_none_is_late_or_lost():
     output, decoder = LiveLinkOutput(), LiveLinkDecoder()
     for step in range(50):
-        decoder.decode(output.packets(face(step), 7.0 + step / 50)[0], step / 50)
+        decoder.decode(output.packets(face(step), 7.0 + step / 50 + 0.015 * (step % 2))[0], step / 50)
     assert {decoder.statistics()[key] for key in ("lost", "late", "doubled")} == {0}
 
 
@@ -130,16 +130,11 @@ def test_the_object_of_a_frame():
     nod = ListenerEvent("nod", 1.0, 0.5, 0.2, swings=2, probability=0.25)
     found = json.loads(json_of(OutputFrame(time_s=1.02, motion=motion, state="listening", events=(nod,))))
     assert list(found) == "t state pose shapes events yaw pitch ts source frame".split()
-    assert found["pose"] == pytest.approx(
-        {"roll": 0.1, "pitch": 0.2, "yaw": 0.3, "x": 0.01, "y": 0.02, "z": 0.03}, abs=1e-5
-    )
-    assert list(found["shapes"]) == list(BLENDSHAPES)
-    assert list(found["shapes"].values()) == pytest.approx(motion[SHAPES].tolist(), abs=1e-4)
+    assert list(found["pose"]) == ["roll", "pitch", "yaw", "x", "y", "z"] and list(found["shapes"]) == [*BLENDSHAPES]
+    assert [*found["pose"].values(), *found["shapes"].values()] == pytest.approx(motion.tolist(), abs=1e-4)
     assert (found["yaw"], found["pitch"]) == pytest.approx((math.degrees(0.3), math.degrees(0.2)), abs=1e-2)
     assert (found["t"], found["ts"], found["source"], found["frame"]) == (1.02, 1020, "sfms-robot", "base")
-    assert found["events"] == [
-        {"kind": "nod", "start_s": 1.0, "duration_s": 0.5, "size": 0.2, "swings": 2, "probability": 0.25}
-    ]
+    assert list(found["events"][0].values()) == ["nod", 1.0, 0.5, 0.2, 2, 0.25]
 
 
 @pytest.fixture

@@ -125,6 +125,7 @@ def test_a_lost_peer_is_reported_once_and_tried_with_growing_pauses(caplog):
     assert sender.lost and sender.statistics()["problem"] == "it is away"
     peer.trouble = None
     yaw = played(sender, looking(), 100.0, 2.0)
+    assert sender.statistics() == sender.statistics() | {"state": "sending", "frames": 100, "frames_per_s": HZ}
     assert yaw[0] == 0.0 and yaw[-1] == pytest.approx(0.4) and not sender.lost
     assert [(each.levelname, each.message) for each in caplog.records] == [
         ("WARNING", "output kept:here: it is away; it is tried again, the run continues"),
@@ -150,11 +151,18 @@ def test_any_error_of_a_plug_in_is_a_loss(caplog):
     assert "output kept:here: ZeroDivisionError: division by zero;" in caplog.text and peer.closed == 1
 
 
-def test_statistics_count_frames_a_second():
-    sender = OutputSender(Peer())
-    played(sender, looking(), 0.0, 3.1)
-    figures = sender.statistics()
-    assert figures["frames_per_s"] == HZ and figures["frames"] == 155 and figures["state"] == "sending"
+def test_a_plug_in_that_raises_elsewhere_ends_nothing():
+    class Broken(Peer):
+        def statistics(self):
+            raise ValueError("no figures")
+
+        close = statistics
+
+    sender = OutputSender(Broken())
+    sender.output.trouble = OSError("gone")
+    sender.step(looking(), 0.0)
+    sender.close()
+    assert sender.statistics()["state"] == "lost"
 
 
 def test_a_thread_hands_over_the_newest_tick_and_the_events_that_have_begun():
@@ -181,25 +189,17 @@ def test_outputs_connect_send_and_end_in_threads_of_their_own():
     assert {each["kind"] for each in outputs.statistics()} == {"kept"}
 
 
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("", ("127.0.0.1", 7)),
-        ("9000", ("127.0.0.1", 9000)),
-        (":9000", ("127.0.0.1", 9000)),
-        ("robot.local", ("robot.local", 7)),
-        ("10.0.0.2:9000", ("10.0.0.2", 9000)),
-        ("[::1]:9000", ("::1", 9000)),
-        ("[fe80::1]", ("fe80::1", 7)),
-    ],
-)
-def test_addresses(text, address):
-    assert parse_address("vmc", text, 7) == address
+ADDRESSES = {
+    "": ("127.0.0.1", 7), "9000": ("127.0.0.1", 9000), ":9000": ("127.0.0.1", 9000), "robot.local": ("robot.local", 7),
+    "10.0.0.2:9000": ("10.0.0.2", 9000), "[::1]:9000": ("::1", 9000), "[fe80::1]": ("fe80::1", 7),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "text", [":", "host:", "::1", "[::1", "[]:9", "host:0", ":65536", "a b:9", "http://h:9", "h:x"]
-)
+def test_addresses():
+    assert {text: parse_address("vmc", text, 7) for text in ADDRESSES} == ADDRESSES
+
+
+@pytest.mark.parametrize("text", ": host: ::1 [::1 []:9 host:0 :65536 a,b@c:9 http://h:9 h:x".split())
 def test_what_is_not_an_address_is_refused_in_one_line(text):
     with pytest.raises(ConfigError, match=r"^--output vmc:.*: expected HOST:PORT, HOST or :PORT .*, got '.*'$"):
         parse_address("vmc", text, 7)

@@ -204,7 +204,7 @@ def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
             return body["time_s"], np.array(
                 [(each["goal_rad"], each["present_rad"], each["age_s"], each["fault"] is not None) for each in servos],
                 np.float32,
-            )
+            ).reshape(-1, 4)
         case "/speaker":
             jaw_rad = np.array(body["jaw_rad"] or [None] * 3, np.float32)
             sound, said = (body[key] and _pcm16(body[key]) for key in ("audio_pcm16", "agent_audio_pcm16"))
