@@ -292,7 +292,7 @@ def _as_ros2(topic: str, time_s: float, body: Mapping[str, Any], text: bytes) ->
     yield ROS2_TOPICS[topic], ros2.to_cdr(ros2.STRING, {"data": text.decode()})
     head = {"header": ros2.header(max(0.0, time_s), "head")}
     match topic:
-        case "/joints":
+        case "/joints" if body["joints"]:
             found = [
                 each["goal_rad"] if (at := each["present_rad"]) is None else at for each in body["joints"].values()
             ]
