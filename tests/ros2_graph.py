@@ -29,5 +29,9 @@ def serving(endpoint):
 
 
 def until(true):
-    while not true():
-        threading.Event().wait(0.001)
+    """Wait until it is true; messages of two sessions take some milliseconds. Fails after some 20 s."""
+    for _ in range(4000):
+        if true():
+            return
+        threading.Event().wait(0.005)
+    raise AssertionError("nothing came")
