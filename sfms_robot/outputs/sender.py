@@ -195,7 +195,7 @@ class OutputSender:
         except Exception as error:  # of a plug-in: any
             self._lose(error, now_s)
             return None
-        self._opened_s, self._window = now_s, (now_s, self._counts["frames"], 0.0)
+        self._opened_s, self._window = now_s, (now_s, self._counts["frames"] + 1, 0.0)  # the first frame begins it
         return self._shaper.start(now_s)
 
     def _sent(self, now_s: float) -> None:
