@@ -6,7 +6,7 @@ Parts are put together in `app`; all code that runs in time takes `now_s` as an 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
@@ -329,6 +329,8 @@ class Output(Protocol):
         rate_hz: of `send`.
         moves: a machine moves: it holds its pose in a halt. An avatar goes neutral.
         limits: by channel of motion; the others pass unchanged.
+        look_at: set by the run; turns head and eyes to x, y, z [m] where the peer asks for that, from any thread.
+            Raises InputError.
     """
 
     kind: str
@@ -336,6 +338,7 @@ class Output(Protocol):
     rate_hz: float = 50.0
     moves: bool = False
     limits: Mapping[str, ChannelLimit] = {}
+    look_at: Callable[[float, float, float], object] | None = None
 
     def open(self) -> None:
         """Connect, and lead the peer to neutral: pose 0, blendshapes 0. Called again after a loss.

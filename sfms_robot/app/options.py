@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from sfms_robot.config import Calmness
     from sfms_robot.listeners.engine import EngineName
     from sfms_robot.listeners.remote import NamedFeed
+    from sfms_robot.runtime.recorder import RecordFormat
     from sfms_robot.viewer.page_process import PageProcess
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
+RECORD_FORMATS: Final[tuple[RecordFormat, ...]] = ("json", "ros2")
 PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
@@ -76,6 +78,7 @@ class RunOptions(HeadOptions):
     style: tuple[str, ...] = ()
     calmness: Calmness | None = None
     record: Path | None = None
+    record_format: RecordFormat = "json"
     overwrite: bool = False
     dry_run: bool = False
     halt_on: str | None = None
@@ -133,6 +136,13 @@ def engine_named(name: str) -> EngineName:
     """Return the engine of that name. Raises ConfigError."""
     if name not in ENGINES:
         raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    return name
+
+
+def record_format_named(name: str) -> RecordFormat:
+    """Return the format of a recording of that name. Raises ConfigError."""
+    if name not in RECORD_FORMATS:
+        raise ConfigError(f"--record-format: expected one of {', '.join(RECORD_FORMATS)}, got {name!r}")
     return name
 
 

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
 Document = Callable[[], Mapping[str, Any]]
@@ -212,7 +213,7 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
-        sinks = _outputs(options, stack)
+        sinks = _outputs(options, controls, stack)
         server = None
         if options.status is not None:  # a port that is in use is found before a listener is loaded
             from sfms_robot.viewer.web_server import status_server  # a web server: 50 ms
@@ -241,7 +242,9 @@ def run(
         recorder = None
         if options.record is not None:
             about = run_facts(opened.config, options)
-            recorder = Recorder(options.record, joints, "wait" if options.fast else "drop", about)
+            recorder = Recorder(
+                options.record, joints, "wait" if options.fast else "drop", about, record_format=options.record_format
+            )
             watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
             stack.enter_context(panel(controls))
@@ -299,17 +302,20 @@ def _check(options: RunOptions) -> None:
             raise ConfigError(f"--{flag} {value}: {why} takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
+    elif options.record_format != "json":
+        raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
 
 
-def _outputs(options: RunOptions, stack: ExitStack) -> list[Output]:
+def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> list[Output]:
     """Return the outputs, not connected yet; none in a dry run. Raises ConfigError, PortError."""
     if not options.outputs or options.dry_run:
         return []
     from sfms_robot.outputs.registry import open_outputs
 
-    sinks = open_outputs(options.outputs)
+    sinks = open_outputs(options.outputs, router=options.router)
     for sink in sinks:
         stack.callback(sink.close)
+        sink.look_at = partial(controls.puppet.look_at, seconds=LOOK_S)
     kind, argument = split_kind(options.face)
     if kind in ("vmc", "live-link"):
         from sfms_robot.sources.live_face import USUAL_PORTS, parse_endpoint, parse_face_argument
@@ -349,6 +355,7 @@ def _open(
             play=options.play,
             agent=controls.speech,
             visitor=controls.visitor,
+            router=options.router,
         )
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())

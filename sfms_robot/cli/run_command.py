@@ -54,16 +54,16 @@ def run(
         "default",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
-        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
+        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|ros2:TOPIC|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, the visitor of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
+        "yours, the visitor of the page, ROS 2, 'none'. Default: the microphone, with emulated servos a speaker.",
     ),
     face: str = Option(
         "auto",
         rich_help_panel=PERSON,
-        metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
+        metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|ros2:FACE_ID|FILE.csv|none|auto",
         help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, the "
-        "visitor of the page, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the shipped speaker's, else none.",
+        "visitor of the page, ROS 2, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the speaker's, else none.",
     ),
     agent_audio: str = Option(
         "none",
@@ -120,6 +120,12 @@ def run(
     record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
     ),
+    record_format: str = Option(
+        "json",
+        metavar="json|ros2",
+        rich_help_panel=OUTPUT,
+        help="Messages of the recording (MCAP): JSON, for Foxglove; those of ROS 2, for its tools and PlotJuggler too.",
+    ),
     overwrite: bool = Option(
         False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
     ),
@@ -155,7 +161,7 @@ def run(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
-        help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
+        help="zenoh's configuration (JSON5), for --fleet, --listener zenoh/NAME and ros2. Default: tcp/127.0.0.1:7447.",
     ),
     insecure: bool = Option(
         False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
@@ -189,7 +195,14 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.options import RunOptions, begin_listening, begin_page, check_names, engine_named
+    from sfms_robot.app.options import (
+        RunOptions,
+        begin_listening,
+        begin_page,
+        check_names,
+        engine_named,
+        record_format_named,
+    )
 
     calm = None
     if calmness or addressed != "sense":
@@ -214,6 +227,7 @@ def run(
         style=tuple(style),
         calmness=calm,
         record=record,
+        record_format=record_format_named(record_format),
         overwrite=overwrite,
         dry_run=dry_run,
         halt_on=halt_on,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from sfms_robot.endpoint import LOOPBACK, port_number
 from sfms_robot.errors import ConfigError
+from sfms_robot.network import LOCAL, Router
 from sfms_robot.plugins import plug_in, plugins
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
@@ -36,6 +37,7 @@ KINDS: Final[Mapping[str, EntryPoint]] = _ours(
     reachy_mini="reachy_mini:ReachyMini",
     reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
     furhat="furhat:Furhat",
+    ros2="ros2:Ros2Output",
 )
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
@@ -48,6 +50,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "reachy-mini": "reachy-mini[:HOST[:PORT]], 8000: Reachy Mini's daemon: head, body and antennas",
     "reachy-mini-overlay": "reachy-mini-overlay[:HOST[:PORT]], 8000: the same daemon, on top of the app that it runs",
     "furhat": "furhat[:HOST[:PORT]], 9000: Furhat's Realtime API: face, eyes and neck",
+    "ros2": "ros2[:DOMAIN][,humble], ROS_DOMAIN_ID or 0: a graph of ROS 2 (rmw_zenoh), without ROS installed",
 }
 
 
@@ -68,22 +71,27 @@ def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = N
             raise ConfigError(f"--output {value}: expected KIND or KIND:ADDRESS (valid: {', '.join(kinds)})")
 
 
-def open_output(value: str, others: Iterable[EntryPoint] | None = None) -> Output:
-    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError."""
+def open_output(value: str, others: Iterable[EntryPoint] | None = None, router: Router = LOCAL) -> Output:
+    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError.
+
+    router: of ROS 2.
+    """
     check_outputs([value], others)
     kind, _, address = value.partition(":")
     entry = output_kinds(others)[kind]
-    output: Output = plug_in(entry, address)
+    output: Output = plug_in(entry, address, router) if kind == "ros2" else plug_in(entry, address)
     if not callable(getattr(output, "send", None)):
         raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
     return output
 
 
-def open_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> list[Output]:
+def open_outputs(
+    values: Sequence[str], others: Iterable[EntryPoint] | None = None, router: Router = LOCAL
+) -> list[Output]:
     """Return the outputs of a run, in order. Raises ConfigError, also for two that reach one program."""
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
-        output = open_output(value, others)
+        output = open_output(value, others, router)
         to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
         if to in opened:
             raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")

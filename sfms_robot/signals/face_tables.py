@@ -268,13 +268,19 @@ SHAPES_OF_UNIT: Final[Mapping[int, tuple[str, ...]]] = {
     16: _both("mouthLowerDown"),  # lower lip depressor
     17: ("mouthShrugLower",),  # chin raiser
     18: ("mouthPucker",),  # lip pucker
+    19: ("tongueOut",),  # tongue show
     20: _both("mouthStretch"),  # lip stretcher
     22: ("mouthFunnel",),  # lip funneler
     24: _both("mouthPress"),  # lip pressor
     26: ("jawOpen",),  # jaw drop
     28: ("mouthRollLower", "mouthRollUpper"),  # lip suck
+    29: ("jawForward",),  # jaw thrust
     43: _both("eyeBlink"),  # eyes closed
     45: _both("eyeBlink"),  # blink
+    61: ("eyeLookOutLeft", "eyeLookInRight"),  # eyes turn left, the person's own
+    62: ("eyeLookInLeft", "eyeLookOutRight"),  # eyes turn right
+    63: _both("eyeLookUp"),  # eyes up
+    64: _both("eyeLookDown"),  # eyes down
 }
 
 

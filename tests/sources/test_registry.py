@@ -130,7 +130,7 @@ def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     for flag, choices in (
-        ("audio", "mic, push, browser, FILE.wav"),
+        ("audio", "mic, push, browser, ros2, FILE.wav"),
         ("face", "live-link, vmc, webcam, push"),
         ("agent_audio", "device, tcp, FILE.wav"),
     ):

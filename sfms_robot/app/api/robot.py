@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 from sfms_robot.app.api.servos import Background, Driven, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, RunOptions
+from sfms_robot.app.options import SIM, RunOptions, record_format_named
 from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError
@@ -57,6 +57,7 @@ class Robot(Driven):
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
         seed: of everything that is drawn at random.
         record: folder for the recording; `overwrite` for one that has a recording already.
+        record_format: "json", or "ros2" for tools of ROS.
         yes: hobby servos may jump when they come on.
         without: joints that are left alone.
         intensity, style: of regions, as in `knobs`.
@@ -81,6 +82,7 @@ class Robot(Driven):
         fast: bool = False,
         seed: int = 0,
         record: Path | str | None = None,
+        record_format: str = "json",
         overwrite: bool = False,
         yes: bool = False,
         without: Sequence[str] = (),
@@ -117,6 +119,7 @@ class Robot(Driven):
             style=_turned(style),
             calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
             record=None if record is None else Path(record),
+            record_format=record_format_named(record_format),
             overwrite=overwrite,
             outputs=tuple(outputs),
         )
