@@ -6,10 +6,11 @@ import json
 from contextlib import asynccontextmanager
 
 import pytest
-from noted import NotedRobot, Stopped
+from noted import NOD, NotedRobot, Stopped
 from websockets.asyncio.server import serve
 
 import sfms_robot as sr
+from sfms_robot.agents import events
 from sfms_robot.agents.openai_realtime import DELTAS, RATE_HZ, RealtimeHead, converse
 
 PIECE = bytes([1, 0]) * 2400  # 0.1 s
@@ -152,3 +153,32 @@ def test_a_server_that_refuses_or_breaks_off_is_one_line(talk, key, line):
 def test_an_address_without_a_server_is_one_line(url, line):
     with pytest.raises(sr.RobotError, match=line):
         asyncio.run(converse(url, NotedRobot(), microphone([])))
+
+
+def test_events_come_in_the_event_loop_until_it_is_left():
+    robot = NotedRobot()
+
+    async def first():
+        found = events(robot, "nod", "mm_hm")
+        waiting = asyncio.create_task(anext(found))
+        while len(robot.callbacks) < 2:
+            await asyncio.sleep(0)
+        await asyncio.to_thread(robot.decide, NOD)
+        event = await waiting
+        await found.aclose()
+        return event
+
+    assert asyncio.run(first()) == NOD
+    robot.decide(NOD)  # the loop has ended: nothing happens
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_running_head_speaks_an_answer_and_hushes(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    with sr.Robot("reachy_mini") as robot:
+        head = RealtimeHead(robot)
+        for event, speaks in ((delta(bytes([0, 40, 0, 200]) * 120_000), True), (STARTED, False)):
+            head.received(event)
+            assert any((robot.state == "speaking") is speaks or robot.wait(0.02) for _ in range(500))
+    assert robot.report()["limits"]["violations"] == 0
