@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import signal
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, Final
@@ -18,7 +20,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from sfms_robot import ConfigError, PortError, RobotError
-from sfms_robot.errors import optional
+from sfms_robot.errors import INTERRUPTED, optional
 
 with optional("sfms-robot mcp"):
     from mcp.server import MCPServer
@@ -168,5 +170,11 @@ def server(page: HeadPage) -> MCPServer:
 
 
 def serve(url: str = URL, token: str = "") -> None:
-    """Serve the tools on stdin and stdout until stdin ends. Raises ConfigError for an address that cannot be one."""
-    server(HeadPage(url, token)).run()
+    """Serve the tools on stdin and stdout until stdin ends, in the main thread.
+
+    Ctrl-C and SIGTERM end the process. Raises ConfigError for an address that cannot be one.
+    """
+    tools = server(HeadPage(url, token))
+    for number in (signal.SIGINT, signal.SIGTERM):  # a thread that waits for stdin cannot be interrupted
+        signal.signal(number, lambda *_: os._exit(INTERRUPTED))
+    tools.run()

@@ -2,8 +2,8 @@
 
     await converse("wss://api.openai.com/v1/realtime?model=gpt-realtime", robot, microphone, key=KEY)
 
-holds a whole conversation over a WebSocket. A program with a client of its own keeps it, and shows a `RealtimeHead`
-the events that it sends and receives, as dicts:
+holds a whole conversation over a WebSocket. A program that has a client already keeps it, and hands a
+`RealtimeHead` the events that it sends and receives, as dicts:
 
     client's event                       server's event                                     the head
     input_audio_buffer.append                                                               hears the person
@@ -39,7 +39,7 @@ Event = Mapping[str, Any]
 
 
 class RealtimeHead:
-    """What a head does with the events of a session. Opens nothing; one that cannot be used is left out and named.
+    """Reaction of a head to the events of a session. Opens nothing; an event that cannot be used is left out and named.
 
     Args:
         robot: a robot that is running.

@@ -5,7 +5,7 @@
 
 `ListeningHead` hands the robot the person's and the bot's sound that passes it, and pushes a `ListenerEventFrame`
 both ways for each event that the listener decides, before the servos move. Behind the output transport the bot's
-sound arrives as it is played; behind the text to speech it arrives a sentence at once, which the robot plays out by
+sound arrives while it is played; behind the text to speech it arrives a sentence at once, which the robot plays out by
 the clock. `HeadObserver` needs no place in the pipeline: it sees the frames of all transports.
 """
 

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import re
+import signal
 import subprocess
 import sys
 
@@ -90,6 +91,19 @@ def test_an_assistant_moves_a_running_head_and_halts_it(head):
 def test_a_wrong_token_is_one_line(head, token, line):
     failed, text = call("halt", HeadPage(head[0], token))
     assert failed and line in text and "\n" not in text
+
+
+@pytest.mark.realtime
+def test_ctrl_c_ends_it_while_it_waits_for_stdin():
+    here = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen(
+        [*MAIN, "mcp"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=here, text=True
+    ) as running:
+        running.stdin.write('{"jsonrpc": "2.0", "id": 1, "method": "ping"}\n')
+        running.stdin.flush()
+        assert running.stdout.readline().startswith("{")
+        running.send_signal(signal.SIGINT)
+        assert running.wait(30) == 130
 
 
 async def garbage(socket):
