@@ -57,7 +57,10 @@ class HeadLink:
 
     def hush(self) -> None:
         """Drop the speech that still waits."""
-        self._robot.hush()
+        try:
+            self._robot.hush()
+        except RobotError as error:  # this robot does not listen to programs
+            self.problem("speech", error)
 
     def on(self, kinds: Sequence[str], take: Callable[[ListenerEvent], object]) -> None:
         """Call `take` in the event loop with each event of `kinds`, from `open` until `close`.
@@ -124,6 +127,8 @@ def _mono(pcm: bytes, channels: int) -> bytes:
         return pcm
     if not isinstance(channels, int) or channels < 1:
         raise ConfigError(f"channels: expected a whole number of 1 or more, got {channels!r}")
+    if not isinstance(pcm, bytes | bytearray | memoryview):
+        raise ConfigError(f"pcm: expected bytes, got {type(pcm).__name__}")
     if len(pcm) % (_PCM16.itemsize * channels):
         raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples in {channels} channels")
     mixed: bytes = np.frombuffer(pcm, _PCM16).reshape(-1, channels).mean(axis=1).astype(_PCM16).tobytes()

@@ -62,6 +62,15 @@ def test_an_event_that_cannot_be_used_is_named_once(event, line, caplog):
     assert [record.message for record in caplog.records] == [f"realtime: {line} (said once)"]
 
 
+def test_a_robot_that_hears_another_source_is_named_and_the_agent_continues(caplog):
+    head = RealtimeHead(sr.Robot("reachy_mini", audio="katie"))
+    head.received(delta(PIECE))
+    assert head.received(STARTED)[1] is not None and head.robot_link.refused == {"speech": 2}
+    assert [record.message.split(";")[0] for record in caplog.records] == [
+        f'realtime: speech: {what}() needs audio="push" or "mic"' for what in ("say", "hush")
+    ]
+
+
 @asynccontextmanager
 async def served(talk, key=None):
     """Serve `talk(socket)` on loopback; yield the address."""
