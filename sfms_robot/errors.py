@@ -148,6 +148,9 @@ EXTRA_OF: Final[Mapping[str, str]] = {
     "onnxscript": "export",
     "transformers": "wav2vec2",
     "pyroomacoustics": "bench",
+    "pipecat": "pipecat",
+    "livekit": "livekit",
+    "mcp": "mcp",
 }
 
 

@@ -23,7 +23,8 @@ ALLOWED = {
     "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
     "app": BASE | PEERS | {"viewer", "emulator", "app"},
-    "cli": {"app", "config", "errors", "data", "cli", "lab"},
+    "agents": {"agents", "errors", *sfms_robot.__all__},  # the public API, as any program
+    "cli": {"app", "config", "errors", "data", "cli", "lab", "agents"},
     "lab": BASE | PEERS | {"viewer", "emulator", "app", "lab"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}

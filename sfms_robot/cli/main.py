@@ -45,6 +45,7 @@ for _name, _command in (
     ("demo", run_command.demo),
     ("run", run_command.run),
     ("serve", remote_command.serve),
+    ("mcp", remote_command.mcp),
     ("export", train_command.export),
     ("replay", run_command.replay),
     ("emulate", emulate_command.emulate),

@@ -134,6 +134,7 @@ NEEDS = {
     "head show face28 --urdf {tmp}/head.png": "vtkmodules",
     "run --listener zenoh/arig-small --duration 1": "zenoh",
     "run --face webcam --fast --duration 1": "mediapipe",
+    "mcp": "mcp",
 }
 
 
