@@ -9,6 +9,7 @@ CHECKED = if [ -z '$(PYTHON)' ] || ! $(PYTHON) -c '$(FITS)'; then \
 	echo "sfms-robot needs Python 3.11 to 3.14, found: $$($(or $(PYTHON),python3) --version 2>&1)" >&2; exit 2; fi
 INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIPECAT := .venv-pipecat
 PYTEST := $(BIN)/python -m pytest
 # A file of tests to a process. One process more than there are cores: many tests wait for servos and for children.
 WORKERS = $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
@@ -28,20 +29,28 @@ $(VENV)/.run: pyproject.toml
 	@$(CHECKED)
 	@echo 'Installing sfms-robot with its plots into $(VENV): about 520 MB, one to two minutes, once.'
 	@$(INSTALL) -e '.[plots]'
-	touch $@
+	@touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo 'Installing sfms-robot with the tools of developers into $(VENV): about 3 GB, some minutes, once.'
 	@$(INSTALL) -c constraints.txt -e '.[dev]'
-	touch $@ $(VENV)/.run
+	@touch $@ $(VENV)/.run
+
+# pipecat pins soxr 1.0, and our tests need 1.1.
+$(PIPECAT)/.installed: pyproject.toml constraints.txt
+	test -d $(PIPECAT) || $(PYTHON) -m venv $(PIPECAT)
+	$(PIPECAT)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pipecat]' \
+		'pytest>=8,<10' 'hypothesis>=6.100,<7'
+	@touch $@
 
 test: install
 	$(PYTEST) $(PARALLEL) -m "not realtime and not slow and $(TESTS)"
 	$(PYTEST) -m "realtime and not slow and $(TESTS)" $(REALTIME)
 
-test-all: install
+test-all: install $(PIPECAT)/.installed
 	$(PYTEST) $(PARALLEL) --all-tools --hypothesis-profile thorough --durations 40 -m "not realtime and $(TESTS)"
 	$(PYTEST) --all-tools --hypothesis-profile thorough --durations 20 -m "realtime and $(TESTS)" $(REALTIME)
+	$(PIPECAT)/bin/python -m pytest tests/agents/test_pipecat.py
 
 lint: install
 	$(BIN)/ruff check --no-cache .
@@ -52,4 +61,4 @@ bench: install
 	$(BIN)/sfms-robot bench --write docs/science/performance.md
 
 clean:
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) $(PIPECAT) build dist

@@ -1,6 +1,7 @@
 """A voice agent: sound in from your microphone or call, sound out to your loudspeaker, and a head that listens."""
 
 import sys
+import time
 
 import numpy as np
 import soundfile
@@ -26,9 +27,11 @@ heard = microphone(float(sys.argv[1]) if len(sys.argv) > 1 else 15.0)
 piece = round(RATE_HZ * PIECE_S)
 with sr.Robot("face28", port="sim", listener="sfms-small") as robot:
     robot.on("nod", lambda nod: robot.say(text_to_speech("mm-hm"), rate_hz=24_000))  # play it 40 ms later
+    begin_s = time.monotonic()
     for start in range(0, len(heard), piece):
         robot.hear(heard[start : start + piece], rate_hz=RATE_HZ)
-        if robot.wait(PIECE_S):  # your audio callback brings its own time
+        due_s = begin_s + (start + piece) / RATE_HZ  # by the clock, or it falls behind; an audio callback has its own
+        if robot.wait(due_s - time.monotonic()):
             break
 report = robot.report()
 print(report["frames"], "frames heard,", report["motion"])

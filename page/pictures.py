@@ -133,10 +133,11 @@ def take(name: str, page: Page, size: tuple[int, int], run: ServedRun, show, dar
 def heads(page: Page) -> None:
     """The robot's half of the stage, of each head at rest: one picture of nine."""
     page.look(DESKTOP)
-    sheet = Image.new("RGB", (3 * 300, 3 * 330), "white")
+    cells = []
     with robots() as address:
         page.driver.get(address)
-        for number, name in enumerate(HEADS):
+        page.until("!document.documentElement.classList.contains('early')")  # until then it has no captions
+        for name in HEADS:
             scene = scene_of(load_head(name))
             assert scene is not None
             pictures = page.ask("page.stage.pictures")
@@ -147,8 +148,12 @@ def heads(page: Page) -> None:
             page.until(f"page.stage.pictures > {pictures}")
             cell = Image.fromarray(page.picture("robot-cell").astype("uint8"))
             cell.thumbnail((300, 330))
-            sheet.paste(cell, (300 * (number % 3), 330 * (number // 3)))
+            cells.append(cell)
             print(name, flush=True)  # noqa: T201
+    wide, tall = cells[0].size
+    sheet = Image.new("RGB", (3 * wide, -(-len(cells) // 3) * tall), "white")
+    for number, cell in enumerate(cells):
+        sheet.paste(cell, (wide * (number % 3), tall * (number // 3)))
     png = io.BytesIO()
     sheet.save(png, "png")
     save(png.getvalue(), "heads")

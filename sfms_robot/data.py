@@ -9,6 +9,9 @@ from typing import Final, Literal
 from sfms_robot.errors import ConfigError, did_you_mean
 
 SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
+_ARCHIVES: Final = {b"PK\x03\x04": "zip", b"7z\xbc\xaf": "7z", b"Rar!": "rar", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
+
+NO_HEAD: Final = "none"  # the head without servos, which outputs alone show
 
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
@@ -32,6 +35,13 @@ def user_dir() -> Path:
     from platformdirs import user_config_path
 
     return user_config_path("sfms-robot", appauthor=False)
+
+
+def archive_kind(data: bytes) -> str | None:
+    """Return the kind of archive that a file's first 300 bytes or more show, or None."""
+    if data[257:262] == b"ustar":
+        return "tar"
+    return next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
 
 
 def shipped_names(folder: Path, marker: str) -> list[str]:

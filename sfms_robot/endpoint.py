@@ -12,6 +12,8 @@ import errno
 import hmac
 import ipaddress
 import socket
+import struct
+import sys
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -79,6 +81,30 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
     raise AssertionError("no port was tried")
 
 
+def leads_here(address: str, port: int) -> bool:
+    """Return whether HOST:PORT is this machine at `port`. Asks no name server."""
+    host, at = host_and_port(address) or ("", 0)
+    name = socket.gethostname()
+    named = host in ("localhost", name, f"{name}.local", "0.0.0.0", "::", *addresses_of_this_machine())
+    return at == port and (named or is_loopback(host))
+
+
+def connect(address: str) -> socket.socket:
+    """Return a connection to HOST:PORT, without Nagle's delay, or to a socket in the file system. Raises OSError."""
+    place = host_and_port(address)
+    if place is None:
+        connection = socket.socket(socket.AF_UNIX)
+        try:
+            connection.connect(address)
+        except OSError:
+            connection.close()
+            raise
+        return connection
+    connection = socket.create_connection(place)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
 def origin_problem(origin: str | None, host: str) -> str | None:
     """Return why a page may not connect; None where it may, and for clients that are not browsers (`origin` None).
 
@@ -132,3 +158,24 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(host)
     except ValueError:
         return None
+
+
+def addresses_of_this_machine() -> list[str]:
+    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
+    if sys.platform != "linux":
+        try:
+            found = socket.gethostbyname_ex(socket.gethostname())[2]
+        except OSError:
+            return []
+        return [address for address in found if not address.startswith("127.")]
+    import fcntl
+
+    addresses = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asked, 0x8915, struct.pack("256s", name.encode()[:15]))  # SIOCGIFADDR
+            except OSError:  # an interface without an address
+                continue
+            addresses.append(socket.inet_ntoa(answer[20:24]))
+    return [address for address in addresses if not address.startswith("127.")]

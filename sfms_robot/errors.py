@@ -5,6 +5,7 @@ RobotError                      base; `exit_code` is what the command line retur
 |   +-- MissingExtra     (2)    a feature needs an optional package that is not installed; names the pip install
 |   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
 +-- PortError            (3)    a port cannot be opened, or another program holds it
++-- OutputError          (3)    an output's peer is away, refuses, or answers in another way than it should
 +-- BusError             (4)    no servo of a bus answers; the bus cannot go on
 |   +-- TorqueError      (4)    torque could not be confirmed off; names the joints
 +-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
@@ -16,12 +17,15 @@ RobotError                      base; `exit_code` is what the command line retur
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
+NOTE: Final = 25  # level of a log line that informs: shown as a plain line. A WARNING is something to act on.
 
 
 class RobotError(Exception):
@@ -77,6 +81,12 @@ class InputError(ConfigError, ValueError):
 
 class PortError(RobotError):
     """A serial port cannot be opened. Example: no such device, no permission, held by another program."""
+
+    exit_code = 3
+
+
+class OutputError(RobotError):
+    """The peer of an output is away, refuses, or is something else. The run continues without it."""
 
     exit_code = 3
 
@@ -138,6 +148,9 @@ EXTRA_OF: Final[Mapping[str, str]] = {
     "onnxscript": "export",
     "transformers": "wav2vec2",
     "pyroomacoustics": "bench",
+    "pipecat": "pipecat",
+    "livekit": "livekit",
+    "mcp": "mcp",
 }
 
 
@@ -150,5 +163,27 @@ def optional(feature: str) -> Iterator[None]:
         package = (error.name or "").split(".")[0]
         if package not in EXTRA_OF:
             raise
-        install = f"pip install 'sfms-robot[{EXTRA_OF[package]}]'"
+        install = install_command(EXTRA_OF[package])
         raise MissingExtra(f"{feature} needs {package}, which is not installed: {install}") from error
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to this installation, to be typed in the present folder.
+
+    It names the pip of this Python: where `.venv` is not activated, plain `pip` is another one. In a checkout it
+    installs that, in place; else pip finds sfms-robot installed, and adds only what the extra needs.
+    """
+    from shutil import which
+
+    here, pip = Path.cwd(), "pip"
+    if Path(which("pip") or "").parent != Path(sys.executable).parent:
+        pip = f"{quote(_within(here, Path(sys.executable)))} -m pip"
+    checkout = Path(__file__).resolve().parent.parent
+    if (checkout / "pyproject.toml").is_file():
+        return f"{pip} install -e {quote(f'{_within(here, checkout)}[{extra}]')}"
+    return f"{pip} install {quote(f'sfms-robot[{extra}]')}"
+
+
+def _within(folder: Path, path: Path) -> str:
+    """Return `path`, relative to `folder` where it lies in it."""
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)

@@ -208,6 +208,8 @@ class ListenerEvent:
         probability, draw: that it would be decided at this instant, and the number in 0..1 that fell below it; None
             for what was not drawn.
         evidence: the largest terms of its log-odds, by name.
+        origin_s: `time.monotonic` at 0 of the clock that its times are on, that of the run's frames, where `Robot.on`
+            hands it over; in virtual time 0; None elsewhere.
     """
 
     kind: str
@@ -219,10 +221,16 @@ class ListenerEvent:
     probability: float | None = None
     draw: float | None = None
     evidence: Mapping[str, float] = field(default_factory=dict)
+    origin_s: float | None = None
 
     @property
     def end_s(self) -> float:
         return self.start_s + self.duration_s
+
+    @property
+    def starts_monotonic_s(self) -> float | None:
+        """`start_s` by `time.monotonic`, as `Robot.say(at_s=)` takes it; None without a run."""
+        return None if self.origin_s is None else self.origin_s + self.start_s
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,19 @@ on loopback nor encrypted needs `--insecure`.
 from __future__ import annotations
 
 import json
+import logging
+import os
 import re
+import secrets
+import struct
 import threading
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from sfms_robot.endpoint import is_loopback
-from sfms_robot.errors import ConfigError, PortError, optional
+from sfms_robot.endpoint import is_loopback, port_number
+from sfms_robot.errors import ConfigError, PortError, RobotError, optional
 
 if TYPE_CHECKING:
     import zenoh
@@ -30,6 +35,8 @@ AWAY_S: Final = 5.0  # without a router, after which that is reported
 SAFE: Final = ("tls", "quic", "unixsock-stream", "unixpipe", "serial", "vsock")  # encrypted, or not a network
 
 Role = Literal["serve", "call"]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,7 +60,7 @@ LOCAL: Final = Router()
 
 def check_zenoh() -> None:
     """Raise MissingExtra where zenoh is not installed."""
-    with optional("listening from another machine"):
+    with optional("a network of other machines, or of ROS 2,"):
         import zenoh  # noqa: F401
 
 
@@ -149,10 +156,12 @@ class Connection:
 
     Attributes:
         problem: why it cannot be opened; None as long as it may.
+
+    begin: called with the session in that thread, before others see it.
     """
 
-    def __init__(self, config: zenoh.Config) -> None:
-        self._config = config
+    def __init__(self, config: zenoh.Config, begin: Callable[[zenoh.Session], None] = lambda session: None) -> None:
+        self._config, self._begin = config, begin
         self._session: zenoh.Session | None = None
         self._changed = threading.Condition()
         self._closed = False
@@ -185,6 +194,7 @@ class Connection:
 
         try:
             session = zenoh.open(self._config)
+            self._begin(session)
         except zenoh.ZError as error:
             with self._changed:
                 self.problem = f"zenoh cannot connect: {_first_line(error)}"
@@ -202,3 +212,161 @@ def _first_line(error: BaseException) -> str:
     """Return the message of zenoh, without the places in its source."""
     text = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return text.partition(" at /")[0].rstrip(".")
+
+
+# --- ROS 2 ------------------------------------------------------------------------------------------------------------
+
+MOST_DOMAIN: Final = 232
+ROUTER_OF_ROS: Final = "ros2 run rmw_zenoh_cpp rmw_zenohd"
+_QOS: Final = "::,10:,:,:,,"  # all defaults: reliable, volatile, the last ten
+_SAID: Final = 6  # reasons that are logged, each once
+
+
+def ros_domain(text: str, flag: str) -> int:
+    """Return the domain that `text` gives, else ROS_DOMAIN_ID, else 0. Raises ConfigError."""
+    given = text or os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    domain = port_number(given)
+    if domain is None or domain > MOST_DOMAIN:
+        raise ConfigError(
+            f"{flag}: {'domain' if text else 'ROS_DOMAIN_ID'}: expected 0 to {MOST_DOMAIN}, got {given!r}"
+        )
+    return domain
+
+
+def ros_topic(text: str, flag: str) -> str:
+    """Return a topic with its leading slash. Raises ConfigError for a text that ROS does not take."""
+    topic = "/" + text.removeprefix("/")
+    if not re.fullmatch(r"(/\w+)+", topic, re.ASCII):
+        raise ConfigError(f"{flag}: expected a topic such as /audio (letters, digits, '_', '/'), got {text!r}")
+    return topic
+
+
+class Ros2Node:
+    """A node of ROS 2, by what its middleware rmw_zenoh sends (docs/design.md of github.com/ros2/rmw_zenoh).
+
+        message    DOMAIN/TOPIC/TYPE/HASH; attached: i64 number, i64 time in ns, u8 16, 16 bytes that name the sender
+        presence   @ros2_lv/DOMAIN/SESSION/NODE/ENTITY/NN|MP|MS/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]
+
+    TOPIC goes without its first slash in the former, and with % for each in the latter. TYPE/HASH is a "wire name"
+    here (`signals.ros2_messages`). Nothing is waited for; a router that is away is found again by zenoh.
+
+    Args:
+        name: of the node, and in logs.
+        sends, takes: wire name by topic, of what is published, and what is subscribed.
+        received: called in a thread of zenoh with topic, wire name and bytes of each message, of any type. What it
+            raises as RobotError is logged, each reason once.
+        limit_s: after which a router that is away ends the node; None: it is waited for.
+
+    Attributes:
+        counts: messages sent, received and refused.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        domain: int,
+        router: Router,
+        *,
+        sends: Mapping[str, str] | None = None,
+        takes: Mapping[str, str] | None = None,
+        received: Callable[[str, str, bytes], object] = lambda topic, wire, data: None,
+        limit_s: float | None = None,
+    ) -> None:
+        self.name, self.domain, self.where = name, domain, str(router)
+        self._sends, self._takes, self._received = dict(sends or {}), dict(takes or {}), received
+        self.counts = {"sent": 0, "received": 0, "refused": 0}
+        self._numbers = dict.fromkeys(self._sends, 0)
+        self._gid = b"\x10" + secrets.token_bytes(16)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._seen: set[tuple[str, str]] = set()  # topic and domain of publishers
+        self._said: set[str] = set()
+        self._kept: list[Any] = []  # what is declared, for as long as the node lives
+        config = session_config("call", router)
+        config.insert_json5("connect/timeout_ms", "-1" if limit_s is None else str(round(1e3 * limit_s)))
+        self._connection = Connection(config, self._declare)
+
+    def wait(self, limit_s: float) -> bool:
+        """Wait for a router; return whether there is one now. Raises PortError where none can be reached for good."""
+        self._connection.wait(limit_s)
+        return self.connected
+
+    @property
+    def connected(self) -> bool:
+        """True while the node is linked to a router."""
+        session = self._connection.session
+        return session is not None and bool(list(session.info.routers_zid()))
+
+    def matched(self, topic: str) -> bool:
+        """Return whether a topic of `sends` has a subscriber now."""
+        if (publisher := self._publishers.get(topic)) is None:
+            return False
+        return bool(getattr(publisher.matching_status, "matching", False))  # an object, though declared as bool
+
+    def publish(self, topic: str, data: bytes, time_ns: int) -> None:
+        """Send a message of one of `sends`; without a router it is dropped."""
+        if (publisher := self._publishers.get(topic)) is not None:
+            self._numbers[topic] += 1
+            self.counts["sent"] += 1
+            publisher.put(data, attachment=struct.pack("<qq", self._numbers[topic], time_ns) + self._gid)
+
+    def absence(self, topic: str) -> str:
+        """Return why nothing may have come of a topic of `takes`, and what to do, in one line."""
+        if not self.connected:
+            return f"no router at {self.where} ({ROUTER_OF_ROS}; another by --zenoh FILE)"
+        domains = {domain for seen, domain in self._seen.copy() if seen == topic}
+        if str(self.domain) in domains:
+            return f"{topic} has a publisher in domain {self.domain}, which sends nothing"
+        others = f"; one is in domain {', '.join(sorted(domains))} (,domain=N or ROS_DOMAIN_ID)" if domains else ""
+        return f"no publisher of {topic} in domain {self.domain}{others}"
+
+    def close(self) -> None:
+        """Leave the graph. Idempotent."""
+        self._connection.close()
+
+    def _declare(self, session: zenoh.Session) -> None:
+        """Make the node, its publishers and subscribers present."""
+        import zenoh
+
+        def token(kind: str, entity: int, *more: str) -> None:
+            self._kept.append(live.declare_token("/".join([*begin, str(entity), kind, "%", "%", self.name, *more])))
+
+        live, begin = session.liveliness(), ["@ros2_lv", str(self.domain), str(session.info.zid()), "0"]
+        token("NN", 0)
+        for entity, (topic, wire) in enumerate(self._sends.items(), 1):
+            token("MP", entity, topic.replace("/", "%"), wire, _QOS)
+            key = f"{self.domain}{topic}/{wire}"
+            drop = zenoh.CongestionControl.DROP
+            self._publishers[topic] = session.declare_publisher(key, congestion_control=drop)
+        for entity, (topic, wire) in enumerate(self._takes.items(), 1 + len(self._sends)):
+            mangled = topic.replace("/", "%")
+            token("MS", entity, mangled, wire, _QOS)
+            # Of any type and hash: a wrong one is worth a line.
+            self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", self._on_sample(topic)))
+            others = f"@ros2_lv/*/*/*/*/MP/*/*/*/{mangled}/**"
+            self._kept.append(live.declare_subscriber(others, self._on_presence(topic), history=True))
+
+    def _on_presence(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        import zenoh
+
+        def change(sample: zenoh.Sample) -> None:
+            known = topic, str(sample.key_expr).split("/")[1]
+            (self._seen.add if sample.kind == zenoh.SampleKind.PUT else self._seen.discard)(known)
+
+        return change
+
+    def _on_sample(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        def take(sample: zenoh.Sample) -> None:
+            self.counts["received"] += 1
+            try:
+                self._received(topic, "/".join(str(sample.key_expr).split("/")[-2:]), sample.payload.to_bytes())
+            except RobotError as error:
+                self.counts["refused"] += 1
+                self._say(topic, str(error))
+
+        return take
+
+    def _say(self, topic: str, reason: str) -> None:
+        key = topic + re.sub(r"[\d.]+", "", reason)
+        if key not in self._said and len(self._said) < _SAID:
+            self._said.add(key)
+            log.warning("%s: %s: left out: %s (said once)", self.name, topic, reason)

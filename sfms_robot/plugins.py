@@ -1,8 +1,8 @@
-"""Plug-ins of other packages: entry points of the groups `sfms_robot.listeners`, `.sources` and `.buses`.
+"""Plug-ins of other packages: entry points of the groups `sfms_robot.listeners`, `.sources`, `.outputs` and `.buses`.
 
-An entry of the first two names a callable that takes the text behind the colon of NAME:ARGUMENT ("" without one) and
-returns a `ports.Listener` or a source; an entry of the third names a `servo.families.BusFamily`. They are imported only
-where they are used. Shipped names and folders go first.
+An entry of the first three names a callable that takes the text behind the colon of NAME:ARGUMENT ("" without one) and
+returns a `ports.Listener`, a source or a `ports.Output`; an entry of the last names a `servo.families.BusFamily`. They
+are imported only where they are used. Shipped names and folders go first.
 
 A plug-in that fails is a ConfigError of one line for the user who named it. For all others it is left out.
 """

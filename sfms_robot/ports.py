@@ -6,14 +6,14 @@ Parts are put together in `app`; all code that runs in time takes `now_s` as an 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles, Floats, Plan, Reading, Sighting, SpeakerFrame
+from sfms_robot.frames import Doubles, Floats, ListenerEvent, Plan, Reading, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
 STOP_S: Final = 0.5  # that `Bus.stop` takes at most
@@ -274,6 +274,9 @@ class Tick:
         readings: freshest reading per joint.
         state, why: of the run, see docs/safety.md; `why` names lost parts, or the causes of a halt.
         written_s: loop time at which the goals were on the wire; None where it was not measured.
+        origin_s: loop time 0 in seconds of `time.monotonic`, in virtual time of the virtual clock; None on the way to
+            rest.
+        busy: this computer is late, and by how much, in words; None: it is not.
     """
 
     time_s: float
@@ -283,6 +286,78 @@ class Tick:
     state: str = "starting"
     why: tuple[str, ...] = ()
     written_s: float | None = None
+    origin_s: float | None = None
+    busy: str | None = None
+
+
+class ChannelLimit(NamedTuple):
+    """Range of a channel of motion [rad, m, or 0..1], and its highest speed [1/s] and acceleration [1/s^2]."""
+
+    low: float
+    high: float
+    speed: float
+    acceleration: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputFrame:
+    """A frame of motion for an output, at one instant.
+
+    Attributes:
+        time_s: loop time.
+        motion: (58,) pose and blendshapes, eased and limited already.
+        state: of the run, see docs/safety.md.
+        events: those that have begun since the frame before.
+        goals_rad, joints: (J,) goals of the servos and their names; empty with `--head none`.
+    """
+
+    time_s: float
+    motion: Floats
+    state: str = "starting"
+    events: tuple[ListenerEvent, ...] = ()
+    goals_rad: Doubles = field(default_factory=lambda: np.zeros(0))
+    joints: tuple[str, ...] = ()
+
+
+class Output(Protocol):
+    """A head that takes a face or a pose: an avatar, a robot with a daemon. One thread calls it.
+
+    A subclass has to define what has no value here. Constructing one connects to nothing.
+
+    Attributes:
+        kind: of `--output`. peer: the address, or what else tells two outputs of one kind apart.
+        rate_hz: of `send`.
+        moves: a machine moves: it holds its pose in a halt. An avatar goes neutral.
+        limits: by channel of motion; the others pass unchanged.
+        look_at: set by the run; turns head and eyes to x, y, z [m] where the peer asks for that, from any thread.
+            Raises InputError.
+    """
+
+    kind: str
+    peer: str
+    rate_hz: float = 50.0
+    moves: bool = False
+    limits: Mapping[str, ChannelLimit] = {}
+    look_at: Callable[[float, float, float], object] | None = None
+
+    def open(self) -> None:
+        """Connect, and lead the peer to neutral: pose 0, blendshapes 0. Called again after a loss.
+
+        May block up to 2 s. Raises OutputError in one line, or OSError.
+        """
+        ...
+
+    def send(self, frame: OutputFrame, now_s: float) -> None:
+        """Send a frame; `now_s`: of `time.monotonic`. Raises OutputError, OSError when the peer is lost."""
+        ...
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return figures for the report. From any thread."""
+        return {}
+
+    def close(self) -> None:
+        """Disconnect; also after `open` or `send` raised. Idempotent."""
+        return
 
 
 class Clock(Protocol):

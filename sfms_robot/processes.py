@@ -179,10 +179,9 @@ def _messages(pipe: IO[bytes]) -> Iterator[Any]:
 class PipeWriter:
     """The writing end of a pipe, for threads that must not wait. All methods may be called from any thread.
 
-    A message is written by the thread that hands it over where the pipe has room: some microseconds, and no switch to
-    another thread in the middle of a tick. Of several threads one writes, and finds what the others have added; none
-    waits for another. When the pipe is full, another thread waits until it has room. Messages that cannot be
-    written since the other process has ended are dropped.
+    A message is written by the thread that hands it over where the pipe has room: some microseconds, without a switch
+    to another thread. Of several threads one writes, and finds what the others have added; none waits for another. When
+    the pipe is full, another thread waits until it has room. Messages to a process that has ended are dropped.
 
     Args:
         pipe: closed when all that was sent is written, after `close`.
@@ -256,7 +255,8 @@ class PipeWriter:
             self._wake.wait()
             self._wake.clear()
             while self._full:
-                select.select([], [self._pipe], [], _FULL_S)
+                (room := select.poll()).register(self._pipe, select.POLLOUT)  # a descriptor of any number
+                room.poll(1e3 * _FULL_S)
                 self._full = False
                 self._write_all()
             if not _NON_BLOCKING:
@@ -340,7 +340,7 @@ class Supervised:
     def enter(self, phase: str) -> None:
         """Note that the child has reached a phase."""
         if phase == "running" and self._failed:
-            log.warning("%s: running again", self._name)
+            log.info("%s: running again", self._name)
         self.phase, self.phase_s, self._silent_s = phase, 0.0, 0.0
 
     def check(self, now_s: float, alive: bool, failure: str | None = None) -> None:

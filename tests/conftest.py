@@ -15,6 +15,7 @@ os.environ.update(ONE_THREAD)  # before numpy and torch are loaded, here and in 
 import pytest
 from ended import Ended
 from hypothesis import settings
+from ros2_graph import client, free_endpoint, serving
 
 from sfms_robot.cli.main import main
 from sfms_robot.data import head_names
@@ -68,6 +69,15 @@ def pytest_sessionfinish(session):
     if missing := sorted({reason for reason in reasons if reason.startswith(MISSING)}):
         reporter.write_line(f"--all-tools: {'; '.join(missing)}", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture
+def router(tmp_path):
+    """Return a router of zenoh that runs, as a graph of ROS 2 has one."""
+    pytest.importorskip("zenoh", reason="needs the extra [ros2]")
+    endpoint = free_endpoint()
+    with serving(endpoint):
+        yield client(tmp_path, endpoint)
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,10 @@ from sfms_robot.runtime.recorder import Recorder
 JOINTS = ("neck_pitch", "jaw", "brow")
 
 
-def record(folder, seconds=2.0, voice=True):
+def record(folder, seconds=2.0, voice=True, record_format="json"):
     """A run at 100 Hz: the speaker talks in the first half."""
-    recorder = Recorder(folder, JOINTS, when_full="wait", about={"head": "face28", "seed": "3"})
+    about = {"head": "face28", "seed": "3"}
+    recorder = Recorder(folder, JOINTS, when_full="wait", about=about, record_format=record_format)
     rng = np.random.default_rng(0)
     for n in range(round(seconds * 100)):
         time_s = n / 100

@@ -15,14 +15,16 @@ BASE = {
     *("errors", "frames", "ports", "signals", "data", "config", "ranges", "endpoint", "network", "plugins"),
     "processes",
 }
-PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "runtime"}
+PEERS = {"sources", "listeners", "retarget", "motion", "servo", "face", "outputs", "runtime"}
 ALLOWED = {
     **{layer: BASE | {layer} for layer in BASE | PEERS},
     "runtime": BASE | {"runtime", "motion", "retarget"},  # the loop calls both at every tick
+    "outputs": BASE | {"outputs", "motion"},  # a machine that is moved passes the same limiter as joints
     "viewer": BASE | {"viewer", "face"},
     "emulator": BASE | {"emulator", "servo"},
     "app": BASE | PEERS | {"viewer", "emulator", "app"},
-    "cli": {"app", "config", "errors", "data", "cli", "lab"},
+    "agents": {"agents", "errors", *sfms_robot.__all__},  # the public API, as any program
+    "cli": {"app", "config", "errors", "data", "cli", "lab", "agents"},
     "lab": BASE | PEERS | {"viewer", "emulator", "app", "lab"},
 }
 SERVO_PARTS_FOR_THE_EMULATOR = {"codecs", "registers"}

@@ -175,6 +175,13 @@ def test_a_listener_that_is_served_and_a_fleet_stay_here(watched):
 
 
 @pytest.mark.slow
+def test_the_tools_of_an_assistant_stay_here(watched):
+    pytest.importorskip("mcp")
+    watched.run("mcp")  # until stdin ends
+    assert watched.strangers() == []
+
+
+@pytest.mark.slow
 def test_a_webcam_stays_here(watched):
     """MediaPipe's later releases contact their maker; those that are asked for do not."""
     cv2 = pytest.importorskip("cv2")

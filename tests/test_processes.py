@@ -295,6 +295,7 @@ def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
 
 
 def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_row_are_logged_once(caplog):
+    caplog.set_level(logging.INFO)
     limits = LIMITS["source"]
     watched, paused_s = Watched(limits), []
     for _ in range(2000):  # days without a camera

@@ -64,7 +64,7 @@ class Page {
 
   async #drawRobot(hello) {
     find('stage').classList.remove('no-robot');
-    find('robot-caption').textContent = hello.urdf_generic ? 'shown by the servos, on parts made from the joints; a URDF of this head goes under `urdf:` in its head.yaml' : 'shown by the servos';
+    find('robot-caption').textContent = hello.urdf_generic ? 'what its servos show, drawn from its joints (your own picture: `urdf:` in head.yaml)' : 'what its servos show';
     if (!this.stage) return;
     const complain = (problem) => this.notice(`The robot is not shown whole: ${problem}`);
     try {
@@ -92,7 +92,10 @@ class Page {
     on('controls', (controls) => { this.panels?.held(controls); if (controls.held === 'other') this.panels?.release(); });
     on('over', ({ report }) => this.#over(report.torque_unconfirmed ?? []));
     on('error', ({ error }) => this.notice(error, 6000));
-    connection.addEventListener('closed', () => this.ended || this.#state('no connection', 'trying again'));
+    connection.addEventListener('closed', () => {
+      if (this.ended) document.body.classList.add('gone'); // nothing is there to be worked
+      else this.#state('no connection', 'trying again');
+    });
   }
 
   #begin(hello) {
@@ -100,6 +103,7 @@ class Page {
     const same = this.hello?.urdf === hello.urdf && this.hello?.head === hello.head;
     this.hello = hello;
     this.ended = false;
+    document.body.classList.remove('gone');
     this.unconfirmed = {};
     this.notice('');
     this.panels?.release();
@@ -165,7 +169,7 @@ class Page {
     this.panels?.servos.show(status);
     const wire = status.latency_ms?.frame_to_wire?.p50 ?? status.latency_ms?.p50;
     const trip = this.connection.roundTripMs;
-    find('latency').textContent = [wire ? `to the wire ${wire < 1000 ? `${wire.toFixed(0)} ms` : `${(wire / 1000).toFixed(1)} s`}` : '', trip ? `page ${trip.toFixed(0)} ms` : ''].filter(Boolean).join(' · ');
+    find('latency').textContent = [wire ? `moves after ${wire < 1000 ? `${wire.toFixed(0)} ms` : `${(wire / 1000).toFixed(1)} s`}` : '', trip ? `this page is ${trip.toFixed(0)} ms away` : ''].filter(Boolean).join(' · ');
   }
 
   #over(unconfirmed) {
@@ -173,6 +177,7 @@ class Page {
     this.unconfirmed = Object.fromEntries(unconfirmed.map((name) => [name, 'not confirmed off']));
     if (names) this.notice(`Torque is NOT confirmed off: ${names}. Switch off the supply before you touch the head.`);
     this.ended = true;
+    find('latency').textContent = '';
     find('halt').hidden = true;
     if (names) this.#state('fault', `torque is not confirmed off: ${names}`);
     else this.#state('ended', this.hello.replay ? 'this is a recording' : 'the run has ended');

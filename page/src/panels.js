@@ -57,7 +57,7 @@ function heldPanel(hello, connection) {
   const show = ({ held, needs_token: needsToken }) => {
     give.hidden = held !== 'you';
     enter.hidden = !needsToken;
-    text.textContent = { you: 'You have the controls.', other: 'Somebody else has the controls; anybody may halt.' }[held] ?? '';
+    text.textContent = { you: 'You have the controls.', other: 'Another visitor has the controls; every visitor may halt.' }[held] ?? '';
     element.hidden = !text.textContent && enter.hidden;
   };
   show({ held: hello.controls, needs_token: hello.needs_token && !connection.allowed });
@@ -82,11 +82,11 @@ function listenerPanel(hello, connection) {
         make('div', { className: 'row' }, make('label', { className: 'row' }, 'Seed', seed),
           make('button', { type: 'button', onclick: () => again(+seed.value) }, 'Listen again'),
           make('button', { type: 'button', onclick: () => again(Math.random() * 1e6) }, 'Another')),
-        make('p', { className: 'quiet' }, 'Each of these begins the run anew, behind this page.'),
+        make('p', { className: 'quiet' }, 'Each of these starts the run again; this page stays.'),
       ]
     : [make('p', {}, `${hello.listener}, seed ${hello.seed}`)];
   const rates = Object.keys(RATES).filter((kind) => kind in (hello.people_per_minute ?? {})).map((kind) => rateSlider(kind, hello, connection));
-  return [...choices, ...(rates.length ? [make('h3', { style: 'margin:0;font-size:.95rem' }, 'Calmness, a minute'), ...rates] : [])];
+  return [...choices, ...(rates.length ? [make('h3', { style: 'margin:0;font-size:.95rem' }, 'How often a minute'), ...rates] : [])];
 }
 
 function rateSlider(kind, hello, connection) {
@@ -130,7 +130,7 @@ function facesPanel(hello, connection) {
       return row;
     })));
   const expressions = make('div', { className: 'row', role: 'group', 'aria-label': 'Expressions' },
-    ...Object.keys(hello.expressions).map((name) => make('button', { type: 'button', onclick: () => connection.send('expression', { name, seconds: EXPRESSION_S }) }, name)));
+    ...Object.keys(hello.expressions).map((name) => make('button', { type: 'button', onclick: () => connection.send('expression', { name, seconds: EXPRESSION_S }) }, name.replaceAll('_', ' '))));
   const release = () => confirm('Switch all torque off and end the run? A neck may fall.') && connection.send('release');
   const actions = make('div', { className: 'row' },
     make('button', { type: 'button', onclick: () => { letGo(); connection.send('neutral'); } }, 'Neutral'),
@@ -147,5 +147,5 @@ function knobsPanel(hello, connection) {
       changed: throttled((value) => connection.send('knobs', { [kind]: { [region]: value } }), 100),
     })),
   ];
-  return [...rows('intensity', 'Intensity', '0 nothing, 1 as mapped, 2 twice'), ...rows('style', 'Style', 'how small motion comes out')];
+  return [...rows('intensity', 'Intensity', 'how large the motion is: 0 none, 1 as designed, 2 twice as large'), ...rows('style', 'Style', 'how much of the small motion shows')];
 }

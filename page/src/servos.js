@@ -1,12 +1,12 @@
-// The table of servos: what each was asked, what it read, and how it is.
+// The table of servos: the goal of each, where it is, and how it is.
 
 import { make } from './dom.js';
 
 const HOT_C = 60;
 const COLUMNS = [ // a column of which no servo of this head tells anything is left out
-  ['asked °', (joint) => degrees(joint.goal_rad)],
-  ['read °', (joint) => degrees(joint.present_rad)],
-  ['age ms', (joint) => number(joint.age_s, 1000, 0)],
+  ['goal °', (joint) => degrees(joint.goal_rad)],
+  ['is at °', (joint) => degrees(joint.present_rad)],
+  ['ms ago', (joint) => number(joint.age_s, 1000, 0)],
   ['°C', (joint) => number(joint.temperature_C, 1, 0)],
   ['mA', (joint) => number(joint.current_mA, 1, 0)],
   ['load %', (joint) => number(joint.load_percent, 1, 0)],
@@ -53,9 +53,10 @@ export class ServoTable {
     const hottest = status.hottest;
     const tick = status.tick?.achieved_hz ?? status.tick?.hz;
     this.summary.textContent = [
-      tick ? `${tick.toFixed(0)} ticks a second` : '',
+      tick ? `${tick.toFixed(0)} goals a second` : '',
       hottest ? `warmest: ${hottest.joint}, ${hottest.temperature_C.toFixed(0)} °C` : '',
       `${Object.keys(faults).length || 'no'} fault${Object.keys(faults).length === 1 ? '' : 's'}`,
+      ...(status.outputs ?? []).map(({ kind, peer, state, frames_per_s: rate }) => `${kind} ${peer}: ${state === 'sending' ? `${rate.toFixed(0)} frames a second` : state}`),
     ].filter(Boolean).join(' · ');
   }
 }

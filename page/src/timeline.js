@@ -5,6 +5,10 @@ import { color } from './dom.js';
 export const SPAN_S = 20;
 const QUIET_DB = -62, LOUD_DB = -12;
 const MARKS = { nod: '↓', shake: '↔', tilt: '⟋', smile: '☺', laugh: '☺', blink: '–', gaze_shift: '→', brow_raise: '^', mm_hm: '♪' };
+const NAMES = { gaze_shift: 'looks away', brow_raise: 'raises brows', mm_hm: '“mm-hm”' };
+const REASONS = { log_rate: 'its usual rate', looked_at: 'is looked at', floor_mine: 'its own turn' };
+const reason = (name) => REASONS[name] ?? name.replace(/_s$/, '').replaceAll('_', ' ');
+const named = (kind) => NAMES[kind] ?? kind.replaceAll('_', ' ');
 const ROWS = [['voice', 0.23], ['events', 0.19], ['pose', 0.28], ['joint', 0.30]];
 const AT_MOST_MS = 80; // a curve that scrolls needs no more
 const LEFT_PX = 64, RIGHT_PX = 8, FOOT_PX = 16, LINE_PX = 12;
@@ -118,11 +122,11 @@ export class Timeline {
   }
 
   _events(pen, x, top, tall) {
-    this.#label(pen, 'decides', top + tall * 0.3);
+    this.#label(pen, 'events', top + tall * 0.3);
     const hazards = this.frames.filter((frame) => frame.h);
     if (hazards.length) {
       const most = Math.max(0.2, ...hazards.map((frame) => frame.h.nod ?? 0));
-      this.#label(pen, 'nod /s', top + tall * 0.82, 'pitch');
+      this.#label(pen, 'nod soon?', top + tall * 0.82, 'pitch');
       this.#line(pen, x, hazards, (frame) => frame.h.nod ?? 0, (v) => top + tall - (v / most) * tall * 0.75, 'pitch', 1, 0.7);
     }
     pen.textAlign = 'left';
@@ -136,12 +140,13 @@ export class Timeline {
       pen.fillRect(at, top, small ? 2 : Math.max(3, until - at), small ? 5 : 6);
       pen.globalAlpha = 1;
       if (small) continue;
-      const text = `${MARKS[event.event] ?? '·'} ${event.event.replaceAll('_', ' ')}`;
-      const line = ends[0] < at ? 0 : ends[1] < at ? 1 : -1;
+      const text = `${MARKS[event.event] ?? '·'} ${named(event.event)}`, wide = pen.measureText(text).width;
+      const begin = Math.min(at, pen.canvas.clientWidth - wide - 2); // whole at the right end too
+      const line = ends[0] < begin ? 0 : ends[1] < begin ? 1 : -1;
       if (line < 0) continue;
       pen.fillStyle = color('ink');
-      pen.fillText(text, at, top + 14 + 12 * line);
-      ends[line] = at + pen.measureText(text).width + 6;
+      pen.fillText(text, begin, top + 14 + 12 * line);
+      ends[line] = begin + wide + 6;
     }
   }
 
@@ -163,8 +168,8 @@ export class Timeline {
     const low = Math.min(...values), high = Math.max(...values);
     const middle = values.length ? (low + high) / 2 : 0, most = Math.max(0.03, (high - low) / 2 || 0);
     const y = (v) => top + tall / 2 - ((v - middle) / most) * (tall / 2 - 3);
-    this.#label(pen, 'asked', top + tall * 0.70, 'asked');
-    this.#label(pen, 'read', top + tall * 0.90, 'read');
+    this.#label(pen, 'goal', top + tall * 0.70, 'asked');
+    this.#label(pen, 'is at', top + tall * 0.90, 'read');
     this.#line(pen, x, this.frames, read, y, 'read', 2.2);
     this.#line(pen, x, this.frames, asked, y, 'asked', 1.2);
     const lines = wrapped(this.jointNames[chosen] ?? 'joint', (text) => pen.measureText(text).width, LEFT_PX - 6, MOST_LINES);
@@ -184,9 +189,14 @@ export class Timeline {
   }
 
   #scale(pen, x, most, top, tall) {
+    const text = `± ${((most * 180) / Math.PI).toFixed(most < 0.2 ? 1 : 0)}°`, wide = pen.measureText(text).width;
+    pen.fillStyle = color('panel'); // under it: a curve may run there
+    pen.globalAlpha = 0.85;
+    pen.fillRect(pen.canvas.clientWidth - RIGHT_PX - wide - 3, top + tall - 11, wide + 6, 14);
+    pen.globalAlpha = 1;
     pen.textAlign = 'right';
     pen.fillStyle = color('quiet');
-    pen.fillText(`± ${((most * 180) / Math.PI).toFixed(most < 0.2 ? 1 : 0)}°`, pen.canvas.clientWidth - RIGHT_PX, top + tall - 4);
+    pen.fillText(text, pen.canvas.clientWidth - RIGHT_PX, top + tall - 4);
   }
 
   #line(pen, x, frames, value, y, hue, wide, alpha = 1) {
@@ -227,8 +237,8 @@ export function wrapped(name, width, most, lines) {
 export function toldEvent(event, now_s) {
   const size = event.size < 0.7 && ['nod', 'shake', 'tilt', 'gaze_shift'].includes(event.event) ? `, ${((event.size * 180) / Math.PI).toFixed(0)}°` : '';
   const spoke = Object.entries(event.evidence ?? {}).sort((a, b) => Math.abs(b[1]) - Math.abs(a[1])).slice(0, 3);
-  const why = spoke.map(([name, weight]) => `${name.replaceAll('_', ' ')} ${weight > 0 ? '+' : ''}${weight.toFixed(1)}`).join(', ');
+  const why = spoke.map(([name, weight]) => `${reason(name)} ${weight > 0 ? '+' : ''}${weight.toFixed(1)}`).join(', ');
   const chance = event.probability ? ` · chance ${(100 * event.probability).toFixed(1)} %` : '';
   const ago = Math.max(0, now_s - event.at_s);
-  return `${event.event.replaceAll('_', ' ')}${size}, ${ago < 0.5 ? 'now' : `${ago.toFixed(0)} s ago`}${chance}${why ? ` · ${why}` : ''}`;
+  return `${named(event.event)}${size}, ${ago < 0.5 ? 'now' : `${ago.toFixed(0)} s ago`}${chance}${why ? ` · why: ${why}` : ''}`;
 }

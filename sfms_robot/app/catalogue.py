@@ -1,12 +1,18 @@
-"""Rows of the heads, listeners, recorded people, serial ports and sound devices at hand."""
+"""Rows of the heads, listeners, recorded people, serial ports and sound devices at hand; export of a listener."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
 
+from sfms_robot.app.output_paths import made_folder
+from sfms_robot.app.progress import bar
 from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
-from sfms_robot.data import data_dir, head_names, listener_names, speaker_names
+from sfms_robot.data import data_dir, find, head_names, listener_names, speaker_names
+from sfms_robot.errors import ConfigError, optional
+from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, read_weights, write_tensors
+from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.registry import shipped_speaker
 
@@ -62,6 +68,14 @@ def shipped_speakers() -> list[dict[str, Any]]:
     return rows
 
 
+def outputs() -> list[dict[str, Any]]:
+    """Return the rows of `output list`, those of other packages too. `name` begins the value for --output."""
+    return [
+        {"name": name, "description": DESCRIPTIONS.get(name, f"of package {entry.dist.name if entry.dist else '?'}")}
+        for name, entry in output_kinds().items()
+    ]
+
+
 def serial_ports() -> list[dict[str, Any]]:
     """Return the rows of `port list`. `name` is the value for --port."""
     return ports_data()
@@ -88,3 +102,27 @@ def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, 
         }
         for device in sound_devices.sound_devices(direction == "playing")
     ]
+
+
+# --- export -------------------------------------------------------------------------------------------------------
+
+
+def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None = None) -> list[Path]:
+    """Write the graphs of a listener, by shipped name or folder, below its folder or `out`, and return the files.
+
+    `int8`: also graphs with large layers in 8 bits. `weight_bits`: also the weights, stored in 8, 16 or 32 bits (see
+    `checkpoint.write_tensors`). Takes a minute. Raises ConfigError, MissingExtra, ModelError.
+    """
+    if weight_bits not in (None, *get_args(Bits)):
+        raise ConfigError(f"--weight-bits {weight_bits}: must be 8, 16 or 32")
+    folder = find("listeners", name, "config.yaml")
+    target = folder if out is None else made_folder(out, "--out")
+    weights = None if weight_bits is None else read_weights(folder / WEIGHTS)
+    with optional("sfms-robot export"):
+        from sfms_robot.listeners.torch_engine import export
+    with bar(f"exporting {name}") as moved:
+        files = export(folder, target, int8, moved)
+    if weights is not None:
+        write_tensors(target / WEIGHTS, weights, cast("Bits", weight_bits))
+        files = [*files, target / WEIGHTS]
+    return files

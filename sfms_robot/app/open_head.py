@@ -21,15 +21,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.wiring import Opened, calibration_of, devices, firmware_maps, open_wires, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_head
 from sfms_robot.config.check import check_registers
 from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
+from sfms_robot.data import NO_HEAD
 from sfms_robot.emulator.launch import Chain
-from sfms_robot.errors import ConfigError, PortError, ServoError
+from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.frames import Doubles
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.calibration import Calibration
@@ -41,7 +42,7 @@ from sfms_robot.runtime.clock import RealClock, VirtualClock
 from sfms_robot.runtime.safety import HeatGuard
 from sfms_robot.servo.bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
-from sfms_robot.servo.discovery import access_problem
+from sfms_robot.servo.discovery import check_device
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.policy import BusServo, tells_current, torque_register
 from sfms_robot.servo.port import Port
@@ -51,6 +52,7 @@ from sfms_robot.servo.stored_settings import JointNeeds, home_ticks
 log = logging.getLogger(__name__)
 
 _REVERSED: Final = 1  # bit of the drive mode: the direction in which ticks rise
+NO_BUS_HZ: Final = 50.0  # rate of the loop of a head without servos
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,16 +96,23 @@ class OpenHead:
         return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
 
 
+def doctor_command(head: str, port: str) -> str:
+    """Return the command that corrects what the servos of a head store, as it can be typed."""
+    return f"sfms-robot doctor --port {quote(port)} --head {quote(head)} --fix"
+
+
 def fastest_hz(head: Head) -> float:
     """Return the rate of the head's fastest bus."""
-    return max(bus.rate_hz for bus in head.buses.values())
+    return max((bus.rate_hz for bus in head.buses.values()), default=NO_BUS_HZ)
 
 
 def prepare_head(options: HeadOptions) -> Head:
     """Check a head and its ports before anything is opened; return the head. Raises ConfigError, PortError."""
     if options.fast and options.port != SIM:
         raise ConfigError(f"--port {options.port!r}: --fast needs emulated servos, time is virtual (sim)")
-    head = load_head(options.head)
+    head = load_head(options.head, servos=not isinstance(options, RunOptions))
+    if not head.joints and options.port != SIM:
+        raise ConfigError(f"--port {options.port!r}: --head {NO_HEAD} has no servos: leave it out")
     for joint in options.without:
         if joint not in head.joints:
             raise ConfigError(
@@ -118,8 +127,7 @@ def prepare_head(options: HeadOptions) -> Head:
             f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
         )
     for device in where.values():
-        if problem := access_problem(device):
-            raise PortError(f"{device}: {problem}")
+        check_device(device)
     return head
 
 
@@ -139,7 +147,7 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         head = calibrated_head(options.head, options.port, clock, kept)
         motion = build_motion(head, fastest_hz(head))
         opened = stack.enter_context(open_wires(head, options))
-        doctor = f"sfms-robot doctor --port {options.port} --head {quote(options.head)} --fix"
+        doctor = doctor_command(options.head, options.port)
         confirmed = options.confirmed
         bus = build_bus(head, opened, clock, confirmed=confirmed, without=options.without, doctor=doctor, kept=kept)
         stack.callback(bus.close)
@@ -161,7 +169,9 @@ def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -
 
     Raises ConfigError, PortError.
     """
-    head = load_head(name)
+    head = load_head(name, servos=False)  # `prepare_head` has judged it
+    if not head.joints:
+        return head
     overlay, sha256 = load_overlay(head), head_hash(name)
     if port == SIM:
         layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
@@ -239,7 +249,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     if len(neck := retargeter.neck_columns):
         leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
     safety = [head.safety_of(joint) for joint in head.joints]
-    holds = np.array([each.halt == "hold" for each in safety])
+    holds = np.array([each.halt == "hold" for each in safety], np.bool_)
     holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
     return Motion(
         timeline=PlanTimeline(1.0 / rate_hz),
@@ -331,6 +341,8 @@ def build_one(
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
+        if not where.virtual:  # a busy computer would trip it, and no servo is in danger
+            config = config.model_copy(update={"watchdog_ms": 0})
     return family.build(
         name,
         servos,

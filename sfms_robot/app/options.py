@@ -14,21 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sfms_robot.data import find
-from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.data import NO_HEAD, find
+from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router
 from sfms_robot.plugins import listener_folder
-from sfms_robot.servo.discovery import access_problem, is_address
+from sfms_robot.servo.discovery import AUTO, check_device
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
     from sfms_robot.listeners.engine import EngineName
     from sfms_robot.listeners.remote import NamedFeed
+    from sfms_robot.runtime.recorder import RecordFormat
     from sfms_robot.viewer.page_process import PageProcess
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
+RECORD_FORMATS: Final[tuple[RecordFormat, ...]] = ("json", "ros2")
 PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
@@ -38,7 +40,7 @@ class HeadOptions:
     """A head and its servos.
 
     Attributes:
-        head: shipped name, or a folder with a head.yaml.
+        head: shipped name, or a folder with a head.yaml; of a run also "none": no servos.
         port: "sim", "auto", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
         fast: virtual time; needs emulated servos.
         yes: hobby servos may jump when they come on.
@@ -59,7 +61,10 @@ class HeadOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(HeadOptions):
-    """The options of `sfms-robot run`; None where a default depends on other options."""
+    """The options of `sfms-robot run`; None where a default depends on other options.
+
+    `outputs`: KIND or KIND:ADDRESS each, see `outputs.registry`.
+    """
 
     listener: str = "sfms-small"
     audio: str = "default"
@@ -73,6 +78,7 @@ class RunOptions(HeadOptions):
     style: tuple[str, ...] = ()
     calmness: Calmness | None = None
     record: Path | None = None
+    record_format: RecordFormat = "json"
     overwrite: bool = False
     dry_run: bool = False
     halt_on: str | None = None
@@ -82,6 +88,7 @@ class RunOptions(HeadOptions):
     zenoh: Path | None = None
     insecure: bool = False
     packages: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
 
     @property
     def confirmed(self) -> bool:
@@ -107,7 +114,12 @@ def check_names(options: RunOptions) -> None:
 
     Raises ConfigError, PortError.
     """
-    find("heads", options.head, "head.yaml")
+    if options.head != NO_HEAD:
+        find("heads", options.head, "head.yaml")
+    if options.outputs:
+        from sfms_robot.outputs.registry import check_outputs
+
+        check_outputs(options.outputs)
     listener_folder(options.listener)
     check_source(options.audio, options.face, options.agent_audio, play=options.play)
     if options.status is not None:
@@ -116,14 +128,21 @@ def check_names(options: RunOptions) -> None:
         status_server(options.status).close()
     for part in options.port.split(","):
         device = part.rpartition("=")[2]
-        if (device.startswith("/") or is_address(device)) and (problem := access_problem(device)):
-            raise PortError(f"--port {device}: {problem}")
+        if device not in ("", SIM, AUTO):
+            check_device(device, "--port ")
 
 
 def engine_named(name: str) -> EngineName:
     """Return the engine of that name. Raises ConfigError."""
     if name not in ENGINES:
         raise ConfigError(f"--engine: expected one of {', '.join(ENGINES)}, got {name!r}")
+    return name
+
+
+def record_format_named(name: str) -> RecordFormat:
+    """Return the format of a recording of that name. Raises ConfigError."""
+    if name not in RECORD_FORMATS:
+        raise ConfigError(f"--record-format: expected one of {', '.join(RECORD_FORMATS)}, got {name!r}")
     return name
 
 

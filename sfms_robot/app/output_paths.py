@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -22,6 +23,8 @@ def checked_file(file: Path, option: str) -> Path:
         raise ConfigError(f"{option} {file}: cannot be written: is a folder")
     if not file.parent.is_dir():
         raise ConfigError(f"{option} {file}: cannot be written: no folder {file.parent}")
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise ConfigError(f"{option} {file}: cannot be written: no permission")
     return file
 
 

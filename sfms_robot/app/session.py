@@ -21,15 +21,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.listen.knobs import LiveKnobs, turned
-from sfms_robot.app.listen.report import Drove, OutletObserver, figures_so_far, limitation, run_facts, run_report
+from sfms_robot.app.listen.report import (
+    Drove,
+    OutletObserver,
+    event_watch,
+    figures_so_far,
+    limitation,
+    run_facts,
+    run_report,
+)
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
 from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.config import Calmness, Head, parse
-from sfms_robot.errors import ConfigError, RobotError, TorqueError
+from sfms_robot.endpoint import leads_here
+from sfms_robot.errors import NOTE, ConfigError, RobotError, TorqueError
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Observer, PlanFeed, Source, Timeline
+from sfms_robot.ports import Observer, Output, PlanFeed, Source, Timeline
 from sfms_robot.processes import realtime_priority
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
@@ -44,11 +53,13 @@ from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
 
 if TYPE_CHECKING:
+    from sfms_robot.outputs.sender import Outputs
     from sfms_robot.sources.net_person import PageVisitor
     from sfms_robot.sources.push import Spoken
 
 logger = logging.getLogger(__name__)
 
+LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
 Document = Callable[[], Mapping[str, Any]]
@@ -202,26 +213,38 @@ def run(
             stack.enter_context(halt_signals(halt))
         if options.halt_on is not None:
             stack.enter_context(halt_switch(options.halt_on, halt))
+        sinks = _outputs(options, controls, stack)
         server = None
         if options.status is not None:  # a port that is in use is found before a listener is loaded
             from sfms_robot.viewer.web_server import status_server  # a web server: 50 ms
 
             server = stack.enter_context(closing(status_server(options.status)))
-            logger.warning("status: %s%s", server.url, server.note)
+            logger.log(NOTE, "status: %s%s", server.url, server.note)
             server.begin(RunStatus((), facts).document)
         opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:
             return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
         log, joints = run_log(opened), list(opened.config.joints)
+        outputs = None
+        if sinks:
+            from sfms_robot.outputs.sender import Outputs
+
+            outputs = stack.enter_context(closing(Outputs(sinks, joints)))
+            more = partial(_with_outputs, more, outputs)
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
         figures = partial(_figures, opened, log, person, feed, knobs, more)
         status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
         controls.document = status.document
         watchers: list[Observer] = [status, *observers]
+        if outputs is not None:
+            log.reported = outputs.names
+            watchers += [outputs, stack.enter_context(closing(event_watch(outputs.event)))]
         recorder = None
         if options.record is not None:
             about = run_facts(opened.config, options)
-            recorder = Recorder(options.record, joints, "wait" if options.fast else "drop", about)
+            recorder = Recorder(
+                options.record, joints, "wait" if options.fast else "drop", about, record_format=options.record_format
+            )
             watchers.append(stack.enter_context(closing(recorder)))
         if panel is not None:
             stack.enter_context(panel(controls))
@@ -241,12 +264,15 @@ def run(
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
         overlay = controls.puppet.overlay
         parts = run_parts(
-            opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played
-        )
+            opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played,
+            missing=(lambda: outputs.missing) if outputs else tuple,
+        )  # fmt: skip
         drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
         status.ended(log.states[-1][1])
+        if outputs is not None:
+            outputs.close()
         report = run_report(opened, drove, feed, facts["listener"], options.seed)
-        report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
+        report |= {"source": dict(person.statistics()), "limitation": limited, "outputs": [], **more()}
         report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
             recorder.close()
@@ -270,11 +296,42 @@ def _check(options: RunOptions) -> None:
         ("audio", options.hears, split_kind(options.hears)[0] == "mic", "what a microphone hears"),
         ("play", options.play, options.play is not None, "what a loudspeaker plays"),
         ("listener", options.listener, options.listener.startswith(REMOTE), "another machine"),
+        ("output", " ".join(options.outputs), bool(options.outputs), "what is shown elsewhere"),
     ):
         if options.fast and excluded:
             raise ConfigError(f"--{flag} {value}: {why} takes real time, --fast has none")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
+    elif options.record_format != "json":
+        raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
+
+
+def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> list[Output]:
+    """Return the outputs, not connected yet; none in a dry run. Raises ConfigError, PortError."""
+    if not options.outputs or options.dry_run:
+        return []
+    from sfms_robot.outputs.registry import open_outputs
+
+    sinks = open_outputs(options.outputs, router=options.router)
+    for sink in sinks:
+        stack.callback(sink.close)
+        sink.look_at = partial(controls.puppet.look_at, seconds=LOOK_S)
+    kind, argument = split_kind(options.face)
+    if kind in ("vmc", "live-link"):
+        from sfms_robot.sources.live_face import USUAL_PORTS, parse_endpoint, parse_face_argument
+
+        port = parse_endpoint(kind, parse_face_argument(kind, argument)[0], USUAL_PORTS[kind])[1]
+        for sink in sinks:
+            if sink.kind.startswith(("vmc", "live-link")) and leads_here(sink.peer, port):
+                raise ConfigError(
+                    f"--output {sink.kind}:{sink.peer}: --face {options.face} reads what is sent there: the head "
+                    "would listen to itself (choose another port)"
+                )
+    return sinks
+
+
+def _with_outputs(more: Callable[[], Mapping[str, Any]], outputs: Outputs) -> dict[str, Any]:
+    return {**more(), "outputs": outputs.statistics()}
 
 
 def _open(
@@ -298,6 +355,7 @@ def _open(
             play=options.play,
             agent=controls.speech,
             visitor=controls.visitor,
+            router=options.router,
         )
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())
@@ -309,7 +367,7 @@ def _open(
         wait_loaded()
     if isinstance(feed, ListenerProcess):  # a listener of this machine gets the hop that the head needs
         tick_s = 1.0 / opened.rate_hz
-        feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max()) + tick_s, tick_s)
+        feed.choose_hop_by(lambda: person.latency_s, float(opened.motion.leads_s.max(initial=0.0)) + tick_s, tick_s)
     return opened, person, feed
 
 

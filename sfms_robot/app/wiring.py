@@ -14,7 +14,8 @@ from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
 from sfms_robot.config.head import StoredRegisters, load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.errors import ConfigError
+from sfms_robot.endpoint import connect
+from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
@@ -23,6 +24,8 @@ from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
 _NEW: Final = StoredRegisters()
+_PATIENCE_S: Final = 1.0  # the longest that a port waits for an emulator in real time
+_CHUNK: Final = 4096
 HANGING: Final = 0.3  # fraction of the way from rest to its lower end, where nothing pulls hard
 BEYOND_RAD: Final = radians(2.0)  # how far a stop lies outside the range of the head's file
 
@@ -41,7 +44,7 @@ def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
         if options.port != SIM:
             yield devices(head, options.port)
             return
-        chains = plugged_in(options.head, head)
+        chains = plugged_in(options.head, head) if head.joints else {}
         yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
 
 
@@ -51,7 +54,90 @@ def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Po
         return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
     if where.virtual:
         return partial(VirtualTimePort, where.device, where.control, bus.baud, clock)
-    return partial(SerialPort, where.device, bus.baud, clock)
+    return partial(EmulatedPort, where.device, where.control, bus.baud, clock)
+
+
+class EmulatedPort(SerialPort):
+    """A port to emulated servos in real time. A silence is one only if the emulator confirms it.
+
+    The emulator shares the computer's processors, so an answer may be late although its servo is there. When no byte
+    came by a deadline, the port asks the emulator, on its control socket, for the number of bytes that it has sent, and
+    waits for those that are missing. Meanwhile the port's clock stands still: what is late is this computer.
+    """
+
+    def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
+        self._late_s = 0.0
+        self._written = self._got = 0
+        self._settled = True  # the emulator has confirmed that nothing is to come
+        self._owed = 0  # answers of the emulator that have not come
+        try:
+            self._control = connect(control)
+        except OSError as error:
+            raise PortError(f"{control}: no emulator answers there: {error}") from error
+        self._ask()  # it counts bytes from here on
+        try:
+            super().__init__(device, baud, clock)
+        except BaseException:
+            self._control.close()
+            raise
+
+    def write(self, data: bytes) -> None:
+        self._settled = False
+        super().write(data)
+        self._written += len(data)
+
+    def read(self, n: int, deadline_s: float) -> bytes:
+        data = super().read(n, deadline_s)
+        if not data and not self._settled:
+            began_s = self.now_s()
+            data = self._late_bytes(n)
+            self._late_s += self.now_s() - began_s
+        self._got += len(data)
+        return data
+
+    def discard_input(self) -> None:
+        while data := SerialPort.read(self, _CHUNK, 0.0):  # counted, as a reset of the driver would not
+            self._got += len(data)
+
+    def now_s(self) -> float:
+        return self._clock.now_s() - self._late_s
+
+    def wait_until(self, time_s: float) -> None:
+        self._clock.wait_until(time_s + self._late_s)
+
+    def close(self) -> None:
+        super().close()
+        self._control.close()
+
+    def _late_bytes(self, n: int) -> bytes:
+        """Return bytes that the emulator has sent and that were not read; empty if there are none."""
+        sent = self._ask()
+        self._settled = sent is not None and sent <= self._got
+        if sent is None or self._settled:
+            return b""
+        data = SerialPort.read(self, n, self.now_s() + _PATIENCE_S)
+        if not data:  # lost: a terminal that is full takes no more
+            self._got, self._settled = sent, True
+        return data
+
+    def _ask(self) -> int | None:
+        """Return the bytes that the emulator has sent so far; None if it does not answer in time."""
+        answers = b""
+        try:
+            self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
+            while self._owed:
+                self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
+            self._control.settimeout(_PATIENCE_S)
+            self._control.sendall(b"quiet %d\n" % self._written)
+            self._owed = 1
+            while not answers.endswith(b"\n"):
+                if not (part := self._control.recv(_CHUNK)):
+                    return None  # it is gone, which the device shows
+                answers += part
+            self._owed = 0
+            return int(answers.removeprefix(b"quiet "))
+        except (OSError, ValueError):
+            return None
 
 
 def firmware_maps(joints: Mapping[str, Joint]) -> dict[str, FirmwareMap]:

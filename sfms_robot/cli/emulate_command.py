@@ -1,4 +1,4 @@
-"""`sfms-robot emulate`: serve emulated servos behind a pseudo terminal."""
+"""`sfms-robot emulate`: serve emulated servos behind a pseudo terminal, or a TCP port where there is none."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, cell, print_rows, say, show
+from sfms_robot.cli.show import JSON, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
 
 PACKAGES = Option(
@@ -25,11 +25,13 @@ app = Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_ar
 listener = Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = Typer(help="Recorded people: list.", no_args_is_help=True)
 port = Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
+output = Typer(help="Outputs, heads that take a face or a pose: list.", no_args_is_help=True)
 
 
 @listener.callback()
 @speaker.callback()
 @port.callback()
+@output.callback()
 def _group() -> None: ...
 
 
@@ -47,6 +49,14 @@ def list_speakers(json: bool = JSON) -> None:
     from sfms_robot.app.catalogue import shipped_speakers
 
     show({"version": 1, "speakers": shipped_speakers()}, json)
+
+
+@output.command("list")
+def list_outputs(json: bool = JSON) -> None:
+    """Kinds of --output, with the address that each takes; those of installed packages too."""
+    from sfms_robot.app.catalogue import outputs
+
+    show({"version": 1, "outputs": outputs()}, json)
 
 
 @port.command("list")
@@ -107,9 +117,9 @@ def _print_check(checked: Mapping[str, Any]) -> None:
     """Print the verdict, the problems and remarks, one line each; without problems, the table of the joints."""
     problems, remarks = checked["problems"], checked["remarks"]
     found = ((problems, "problem"), (remarks, "remark"))
-    counted = [f"{len(each)} {name}{'s' * (len(each) > 1)}" for each, name in found if each]
+    numbers = [counted(len(each), name) for each, name in found if each]
     verdict = "not fit to run" if problems else "fit to run"
-    say(f"{checked['name']}: {', '.join([verdict, *counted])}", "bold red" if problems else "bold")
+    say(f"{checked['name']}: {', '.join([verdict, *numbers])}", "bold red" if problems else "bold")
     for line in (*problems, *remarks):
         say(line, "red" if problems else "")
     if problems:
@@ -127,8 +137,8 @@ def _print_check(checked: Mapping[str, Any]) -> None:
     over = [row["joint"] for row in checked["joints"] if max(row["speed"], row["jerk"]) > 1]
     print_rows(rows, f"{checked['name']} on {checked['seconds']:.0f} s of recorded faces")
     say(
-        "used: share of the range. clipped: of the time, at an end that is not rest. speed, jerk: of the limit, the "
-        "99th percentile of what the faces ask.",
+        "used: the part of the range that these faces need. clipped: the part of the time at an end of it that is not "
+        "rest. speed, jerk: what the fastest hundredth of the motion needs, of the limit; over 100 % is slowed down.",
         "dim",
     )
     if over:
@@ -140,10 +150,10 @@ def _print_check(checked: Mapping[str, Any]) -> None:
         reach = cell([f"{axis} {low:g}..{high:g} {unit[axis]}" for axis, (low, high) in neck["reach"].items()])
         share = "no" if neck["reached"] is None else f"{neck['reached']:.1%} of the"
         say(f"neck, one axis at a time: {reach}; {share} recorded poses in reach")
-    say(f"cannot show: {cell(checked['blind_channels'], 'none')}")
+    say(f"parts of a face that it cannot show: {cell(checked['blind_channels'], 'none')}")
     if checked["limitation"] is not None:
         say(f"the listener: {checked['limitation']}")
-    say(f"not driven: {cell(checked['dead_joints'], 'none')}")
+    say(f"joints that no face moves: {cell(checked['dead_joints'], 'none')}")
     if checked["calibrate_first"]:
         say("calibrate first: until then it moves 20 % of its travel at 0.3 of its speed on real servos")
 
@@ -226,9 +236,11 @@ def pose(
 ) -> None:
     """Move one expression or channel under the head's limits, hold it, and go back to rest."""
     from sfms_robot.app.head.pose import pose_head
+    from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
-    posed = pose_head(HeadOptions(head=name, port=port, fast=fast, yes=yes), face, hold)
+    options = HeadOptions(head=name, port=port, fast=fast, yes=yes)
+    posed = pose_head(options, face, hold, None if json else live_panel)
     show(posed, json, heading="{head} on {port}: {face}, {exit}")
 
 
@@ -253,14 +265,19 @@ def fit(
     """
     from sfms_robot.app.head.fit import babble as move
     from sfms_robot.app.head.fit import fit_head, see_virtual_face
+    from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
-    fitted = partial(
-        show,
-        json=json,
-        heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
-        note="rms in joint units (1 = half the range), on held-out frames",
-    )
+    def fitted(learnt: Mapping[str, Any]) -> None:
+        practice = "; practice on emulated servos: no run uses this file" if learnt["practice"] else ""
+        show(
+            learnt,
+            json,
+            heading="{head}: {frames} frames, tracker {delay_s} s late; rms {before} -> {after}, written to {file}",
+            keys=("joints",),
+            note=f"rms in joint units (1 = half the range), on held-out frames{practice}",
+        )
+
     if babble == (recording is not None):
         raise ConfigError("head fit: give one of --recording DIR and --babble")
     if recording is not None:
@@ -271,10 +288,10 @@ def fit(
     with tempfile.TemporaryDirectory() as spare:
         folder = record if record is not None else Path(spare)
         servos = HeadOptions(head=name, port=port, fast=port == "sim", yes=yes)
-        report = move(servos, folder, minutes=minutes, seed=seed)
+        report = move(servos, folder, minutes=minutes, seed=seed, panel=None if json else live_panel)
         if port == "sim" and report["exit"] == "done":
             see_virtual_face(name, folder)
-            fitted(fit_head(name, folder, practice=True))
+            fitted(fit_head(name, folder))
             return
     seconds = round(report["duration_s"], 1)
     moved = {"head": report["head"], "exit": report["exit"], "seconds": seconds, "record": str(record)}

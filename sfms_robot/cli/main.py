@@ -27,7 +27,7 @@ from sfms_robot.cli import (
     train_command,
 )
 from sfms_robot.cli.show import print_json
-from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, optional
+from sfms_robot.errors import INTERRUPTED, NOTE, ConfigError, RobotError, optional
 
 NAME = "sfms-robot"
 UNEXPECTED = 1
@@ -45,6 +45,7 @@ for _name, _command in (
     ("demo", run_command.demo),
     ("run", run_command.run),
     ("serve", remote_command.serve),
+    ("mcp", remote_command.mcp),
     ("export", train_command.export),
     ("replay", run_command.replay),
     ("emulate", emulate_command.emulate),
@@ -58,6 +59,7 @@ for _name, _group in (
     ("listener", head_command.listener),
     ("speaker", head_command.speaker),
     ("port", head_command.port),
+    ("output", head_command.output),
     ("servo", servo_command.app),
     ("data", train_command.data_app),
     ("train", train_command.app),
@@ -77,9 +79,17 @@ def _common(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
     verbose: bool = typer.Option(False, "--verbose", "-v", help="Log more, to stderr. Also after a command."),
 ) -> None:
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s"
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines())
+    logging.basicConfig(level=logging.INFO if verbose else NOTE, handlers=[handler])
+
+
+class _Lines(logging.Formatter):
+    """Lines with their level in front; a note is a plain line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = super().format(record)
+        return line if record.levelno == NOTE else f"{record.levelname}: {line}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

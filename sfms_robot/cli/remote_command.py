@@ -155,3 +155,16 @@ def serve(
     )
     if json:
         print_json(figures)
+
+
+# --- mcp --------------------------------------------------------------------------------------------------------------
+
+
+def mcp(
+    url: str = Option("ws://127.0.0.1:8780", metavar="ws://HOST:PORT", help="The page of a run with --view."),
+    token: str = Option("", help="Printed by the run, where its page is bound beyond loopback."),
+) -> None:
+    """Serve a running head to an assistant as MCP tools, on stdin and stdout: show, look_at, halt, status, ..."""
+    from sfms_robot.agents.mcp import serve as serve_tools
+
+    serve_tools(url, token)

@@ -11,13 +11,19 @@ from typing import Any
 from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
-from sfms_robot.cli.show import JSON, cell, print_report, say, show
+from sfms_robot.cli.show import JSON, cell, counted, print_report, say, show
 from sfms_robot.data import head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods, beside a mean of 4.4
 HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
+OUTPUTS = Option(
+    [],
+    metavar="KIND[:ADDRESS]",
+    rich_help_panel=OUTPUT,
+    help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
+)
 OPTIONAL = {
     "--play": "default",
     "--status": "auto",
@@ -27,7 +33,10 @@ OPTIONAL = {
 
 def run(
     head: str = Option(
-        "face28", autocompletion=head_names, rich_help_panel=HEAD, help="Shipped head, or a folder with a head.yaml."
+        "face28",
+        autocompletion=head_names,
+        rich_help_panel=HEAD,
+        help="Shipped head, or a folder with a head.yaml; 'none': no servos, --output alone.",
     ),
     port: str = Option(
         "sim",
@@ -45,16 +54,16 @@ def run(
         "default",
         autocompletion=speaker_names,
         rich_help_panel=PERSON,
-        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|none",
+        metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|ros2:TOPIC|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, the visitor of the page, 'none'. Default: the microphone, with emulated servos a shipped speaker.",
+        "yours, the visitor of the page, ROS 2, 'none'. Default: the microphone, with emulated servos a speaker.",
     ),
     face: str = Option(
         "auto",
         rich_help_panel=PERSON,
-        metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|FILE.csv|none|auto",
-        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, "
-        "the visitor of the page, a recording (.csv, .csv.gz), 'none'; 'auto': the shipped speaker's own, else none.",
+        metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|ros2:FACE_ID|FILE.csv|none|auto",
+        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, the "
+        "visitor of the page, ROS 2, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the speaker's, else none.",
     ),
     agent_audio: str = Option(
         "none",
@@ -107,8 +116,15 @@ def run(
     fast: bool = Option(
         False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
     ),
+    output: list[str] = OUTPUTS,
     record: Path | None = Option(
         None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
+    ),
+    record_format: str = Option(
+        "json",
+        metavar="json|ros2",
+        rich_help_panel=OUTPUT,
+        help="Messages of the recording (MCAP): JSON, for Foxglove; those of ROS 2, for its tools and PlotJuggler too.",
     ),
     overwrite: bool = Option(
         False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
@@ -145,7 +161,7 @@ def run(
         None,
         metavar="FILE",
         rich_help_panel=OUTPUT,
-        help="zenoh's configuration (JSON5), for --fleet and --listener zenoh/NAME. Default: tcp/127.0.0.1:7447.",
+        help="zenoh's configuration (JSON5), for --fleet, --listener zenoh/NAME and ros2. Default: tcp/127.0.0.1:7447.",
     ),
     insecure: bool = Option(
         False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
@@ -179,7 +195,14 @@ def run(
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
-    from sfms_robot.app.options import RunOptions, begin_listening, begin_page, check_names, engine_named
+    from sfms_robot.app.options import (
+        RunOptions,
+        begin_listening,
+        begin_page,
+        check_names,
+        engine_named,
+        record_format_named,
+    )
 
     calm = None
     if calmness or addressed != "sense":
@@ -204,6 +227,7 @@ def run(
         style=tuple(style),
         calmness=calm,
         record=record,
+        record_format=record_format_named(record_format),
         overwrite=overwrite,
         dry_run=dry_run,
         halt_on=halt_on,
@@ -213,6 +237,7 @@ def run(
         zenoh=zenoh,
         insecure=insecure,
         packages=tuple(packages),
+        outputs=tuple(output),
     )
     check_names(options)
     if check:
@@ -246,24 +271,35 @@ def _print_run(report: Mapping[str, Any]) -> None:
     """Print the report of a run on one screen."""
     motion, limits, bus = report["motion"], report["limits"], report["bus"]
     tick, latency, step = report["tick"], report["latency_ms"], report["listener_step_ms"]
-    rate = f"in virtual time, {tick['target_hz']:g} a second"
+    rate = f"{tick['target_hz']:g} a second, in virtual time"
     if tick["achieved_hz"] is not None:
-        rate = f"at {tick['achieved_hz']:.4g} Hz of {tick['target_hz']:g}, {tick['late']} late, jitter p99 "
-        rate += f"{cell(tick['jitter_ms']['p99'])} ms"
+        rate = f"{tick['achieved_hz']:.4g} a second of {tick['target_hz']:g}, {tick['late']} late"
+    answer = [
+        f"{latency[key]['p50']:.0f} ms after {what}"
+        for key, what in (("frame_to_wire", "each picture or sound of the person"), ("speech_to_wire", "speech begins"))
+        if latency[key]["p50"] is not None
+    ]
+    planned = f", a plan takes {step['p50']:.0f} ms, 1 of 100 {step['p99']:.0f} ms or more" if step["p50"] else ""
     facts = {
-        "face": f"{motion['nods']} nods, {motion['blinks']} blinks, {motion['smiles']} smiles",
-        "ticks": f"{report['ticks']} {rate}",
-        "latency": f"frame to wire p50 {cell(latency['frame_to_wire']['p50'])} ms, "
-        f"speech to wire p50 {cell(latency['speech_to_wire']['p50'])} ms",
-        "listener": f"{report['listener']}, a plan in p50 {cell(step['p50'])} ms, p99 {cell(step['p99'])} ms",
-        "limits": f"{limits['violations']} violations, {limits['clamped']} samples held back",
-        "bus": f"{bus['writes']} writes, {bus['reads']} reads, {bus['errors']} errors, "
-        f"silent: {cell(bus['silent'], 'none')}",
+        "showed": ", ".join(counted(motion[f"{kind}s"], kind) for kind in ("nod", "blink", "smile")),
+        "goals to the servos": f"{report['ticks']}, {rate}",
+        "moves": f"{cell(answer)} (half of the times sooner)" if answer else "in virtual time, where nothing is late",
+        "listener": f"{report['listener']}{planned}",
+        "limits": f"exceeded {limits['violations']} times; {limits['clamped']} goals were slowed down to stay within",
     }
+    if "writes" in bus:  # not without servos
+        facts["servos"] = (
+            f"{bus['writes']} times written, {bus['reads']} times read, {bus['errors']} errors, "
+            f"silent: {cell(bus['silent'], 'none')}"
+        )
     if "recording" in report:
         kept = report["recording"]
         problem = kept["trouble"] or (f"{kept['dropped']} messages dropped" if kept["dropped"] else "")
         facts["recording"] = f"{kept['bytes'] * 1e-6:.1f} MB" + (f", INCOMPLETE: {problem}" if problem else "")
+    for sent in report["outputs"]:
+        facts[f"{sent['kind']}:{sent['peer']}"] = f"{sent['frames']} frames, {sent['losses']} losses" + (
+            f", away at the end: {sent['problem']}" if sent["state"] == "lost" else ""
+        )
     if report["torque_unconfirmed"]:
         facts["torque"] = f"NOT confirmed off: {cell(report['torque_unconfirmed'])}"
     say(f"{report['head']} listened for {report['duration_s']:g} s ({report['exit']})", "bold")
@@ -281,7 +317,7 @@ def demo(
     duration: float | None = Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
     fast: bool = Option(False, "--fast", help="Virtual time: as fast as it goes."),
     out: Path | None = Option(
-        None, metavar="DIR", help="Where recording and pictures go; default: sfms-demo, sfms-demo-2, ..."
+        None, metavar="DIR", help="Where recording and pictures go; default: runs/demo, runs/demo-2, ..."
     ),
     overwrite: bool = Option(False, "--overwrite", help="Replace the recording that --out holds."),
     seeds: int | None = Option(
@@ -292,10 +328,11 @@ def demo(
         metavar="[[HOST:]PORT]",
         help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
     ),
+    output: list[str] = OUTPUTS,
     no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
     json: bool = JSON,
 ) -> None:
-    """A recorded person talks, an emulated head listens; a page shows it, or two pictures without a visitor."""
+    """A recorded person talks, an emulated head listens: on a page while it has visitors, else in two pictures."""
     from sfms_robot.app.options import RunOptions, begin_page, check_names
 
     options = RunOptions(
@@ -305,6 +342,7 @@ def demo(
         duration_s=duration,
         fast=fast or seeds is not None,
         overwrite=overwrite,
+        outputs=tuple(output),
     )
     check_names(options)
     served = not (no_view or options.fast or json)
@@ -337,8 +375,9 @@ def _print_demo(found: Mapping[str, Any]) -> None:
 
 def _line(seen: Mapping[str, Any]) -> str:
     return (
-        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): {seen['nods']} nods, "
-        f"{seen['blinks']} blinks, {seen['smiles']} smiles, {seen['neck_travel_deg']:.0f} degrees of neck travel"
+        f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): "
+        f"{', '.join(counted(seen[f'{kind}s'], kind) for kind in ('nod', 'blink', 'smile'))}; "
+        f"the neck turned {seen['neck_travel_deg']:.0f} degrees in all"
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, print_json, print_rows, show
+from sfms_robot.cli.show import JSON, counted, print_json, print_rows, show
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -76,15 +76,13 @@ def scan(
     ids: str | None = Option(None, "--ids", help="Ask these one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
-    from sfms_robot.app.servo.serial_line import protocol_hint
-    from sfms_robot.app.servo.single_servo import scan as look
+    from sfms_robot.app.servo.single_servo import scan_all
 
     asked = _parsed(ids) if ids is not None else None
     with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
-        hint = protocol_hint(wire)
-        rows = [] if hint else [seen.row() for seen in look(wire, asked, progress)]
-        where = wire.port.name
-    title = f"{len(rows)} servo{'s' * (len(rows) != 1)} on {where}{f': {hint}' if hint else ''}"
+        found, hint = scan_all(wire, asked, progress)
+        rows, where = [seen.row() for seen in found], wire.port.name
+    title = f"{counted(len(rows), 'servo')} on {where}{f': {hint}' if hint else ''}"
     _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
 
 
@@ -92,13 +90,15 @@ def scan(
 @on_wire
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
+    from sfms_robot.app.progress import tracked
+
     rows: list[dict[str, Any]] = []
     with on.open() as wire:
-        for servo in _parsed(ids):
+        for servo in tracked(_parsed(ids), "asking"):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
-                unknown = dict.fromkeys(("model", "model_number", "firmware", "baud"))
+                unknown = dict.fromkeys(("model", "model_number", "firmware", "firmware_minor", "baud", "family"))
                 rows.append({"id": servo, **unknown, "note": "", "answers": False})
     _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):
@@ -140,7 +140,7 @@ def monitor(
         else:
             from sfms_robot.cli.show_servo import live
 
-            live(seen, f"{len(servos)} servo{'s' * (len(servos) != 1)} on {wire.port.name}")
+            live(seen, f"{counted(len(servos), 'servo')} on {wire.port.name}")
     if on.json:
         print_json({"samples": taken})
 
@@ -419,6 +419,6 @@ def _for_people(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.cli.show_servo import bar
+    from sfms_robot.app.progress import bar
 
     return bar(text, hidden)

@@ -30,6 +30,7 @@ _WORDS = {
     "blind": "cannot show",
     "current_mA": "mA",
     "firmware": "fw",
+    "firmware_minor": "minor",
     "load_percent": "load %",
     "missing": "to calibrate first (until then 20 % of the travel, 0.3 of the speed)",
     "model_number": "number",
@@ -37,6 +38,7 @@ _WORDS = {
     "position_deg": "deg",
     "position_rad": "rad",
     "return_delay_us": "delay us",
+    "speaker_frames": "frames of the person (40 ms)",
     "temperature_degC": "degC",
     "torque_unconfirmed": "torque not confirmed off",
     "voltage_V": "V",
@@ -182,6 +184,11 @@ def cell(value: object, missing: str = "-") -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1 else f"{round(value, 3):g}"
     return str(value)
+
+
+def counted(number: float, name: str) -> str:
+    """Return "1 nod" or "2 nods"."""
+    return f"{number} {name}{'s' * (number != 1)}"
 
 
 def _nested(value: object) -> str:

@@ -1,23 +1,22 @@
-"""The live view and progress bar of the servo tools, and the doctor's report. Imported when something is printed."""
+"""The live view of the servo tools, and the doctor's report. Imported when something is printed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from sfms_robot.cli.show import print_rows, say, screen, table_of
+from sfms_robot.cli.show import counted, print_rows, say, screen, table_of
 
 _COLUMNS = (
     "id",
     "joint",
     "model",
     "firmware",
+    "firmware_minor",
     "baud",
     "voltage_V",
     "temperature_degC",
@@ -43,23 +42,6 @@ def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
         print_rows(rows, title)
 
 
-@contextmanager
-def bar(text: str, hidden: bool) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr where that is a terminal; yield the function that moves it."""
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn(text),
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %  {task.description}"),
-        console=console,
-        transient=True,
-        disable=hidden or not console.is_terminal,
-    )
-    with progress:
-        task = progress.add_task("", total=None)
-        yield lambda done, total, what: progress.update(task, completed=done, total=total, description=what)
-
-
 def print_doctor(report: Mapping[str, Any]) -> None:
     """Print adapter, servos, budget, findings and verdict of every bus."""
     for bus in report["buses"]:
@@ -79,7 +61,7 @@ def print_doctor(report: Mapping[str, Any]) -> None:
             say(bus["udev_rule"], "cyan")
         counts = bus["counts"]
         verdict = "not fit to run" if counts["error"] else "fit to run"
-        numbers = [f"{number} {name}{'s' if number != 1 else ''}" for name, number in counts.items()]
+        numbers = [counted(number, name) for name, number in counts.items()]
         say(f"{verdict}: {', '.join(numbers)}", "bold red" if counts["error"] else "bold green")
 
 
@@ -94,12 +76,19 @@ def _print_adapter(adapter: Mapping[str, Any]) -> None:
 def _print_budget(bus: Mapping[str, Any]) -> None:
     budget = bus["budget"]
     say(
-        f"One tick of {budget['servos']} servos at {budget['baud']} baud; wanted {bus['rate_hz']:g} Hz; "
-        f"return delay {budget['return_delay_us']:g} us, adapter {budget['latency_ms']:g} ms"
+        f"One turn of the loop with {budget['servos']} servos at {budget['baud']} baud; wanted {bus['rate_hz']:g} a "
+        f"second; a servo answers {budget['return_delay_us']:g} us late, the adapter {budget['latency_ms']:g} ms"
     )
     tried = {True: "works here", False: "does not work here", None: "not tried"}[bus["fast_sync_read"]]
-    names = {"write_only": "goals", "plain": "goals, and all read", "fast": f"the same by fast sync read ({tried})"}
+    names = {
+        "write_only": "goals sent",
+        "plain": "and each servo read",
+        "fast": f"and all read in one answer ({tried})",
+    }
     costs = [(name, budget[key]) for key, name in names.items() if budget[key]]
     print_rows(
-        [{"on the wire": name, "bytes": cost["bytes"], "ms": cost["ms"], "Hz": cost["hz"]} for name, cost in costs]
+        [
+            {"on the wire": name, "bytes": cost["bytes"], "ms": cost["ms"], "turns a second": cost["hz"]}
+            for name, cost in costs
+        ]
     )

@@ -338,7 +338,7 @@ def export(
     They hold no weights: trained again for the same configuration, a listener needs no new ones. In 8 bits weights take
     a quarter of the room; every engine computes with them as real numbers.
     """
-    from sfms_robot.app.graph_export import export_listener
+    from sfms_robot.app.catalogue import export_listener
 
     files = export_listener(listener, out, int8, weight_bits)
 

@@ -24,7 +24,7 @@ from sfms_robot.config.joint import (
     Safety,
 )
 from sfms_robot.config.kinematics import Kinematics, Triple
-from sfms_robot.data import find
+from sfms_robot.data import NO_HEAD, find
 from sfms_robot.frames import LATERAL_POSE, Doubles
 
 VERSION: Final = 1  # of a head's file
@@ -198,8 +198,13 @@ class Head(Model):
         return self.limits[self.joints[joint].limits]
 
 
-def load_head(name: str) -> Head:
-    """Return a head by shipped name or folder. Raises ConfigError."""
+def load_head(name: str, *, servos: bool = True) -> Head:
+    """Return a head by shipped name or folder. Raises ConfigError.
+
+    `servos` False: also the one without any, `NO_HEAD`.
+    """
+    if name == NO_HEAD and not servos:
+        return Head.model_construct(name=NO_HEAD, description="No servos", buses={}, limits={}, joints={})
     folder = find("heads", name, "head.yaml")
     head = load(Head, folder / "head.yaml")
     head._folder = folder

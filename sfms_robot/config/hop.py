@@ -85,15 +85,17 @@ class Latencies:
         short_s, p50_s, p95_s = self.lead_s - self.left_s(hop), self.p50_s(hop), self.p95_s(hop)
         if short_s > _EPS_S:
             cut_ms = min(short_s, self.lead_s) * 1e3
-            lost.append(f"the longest lead of {self.lead_s * 1e3:.0f} ms is {cut_ms:.0f} ms shorter")
+            lost.append(f"the slowest joint moves up to {cut_ms:.0f} ms late")
         if p50_s > P50_S + _EPS_S or p95_s > P95_S + _EPS_S:
             lost.append(
-                f"a sound is answered after {p50_s * 1e3:.0f} ms, p95 {p95_s * 1e3:.0f} ms"
-                f" (wanted: {P50_S * 1e3:.0f}, {P95_S * 1e3:.0f})"
+                f"a sound is answered after {p50_s * 1e3:.0f} ms, 1 of 20 after {p95_s * 1e3:.0f} ms or more"
+                f" (wanted: {P50_S * 1e3:.0f} and {P95_S * 1e3:.0f})"
             )
         if not self.keeps_up(hop):
             p50_ms, p99_ms, hop_ms = self.step_p50_s * 1e3, self.step_p99_s * 1e3, hop * FRAME_S * 1e3
-            lost.append(f"a plan takes {p50_ms:.0f}, p99 {p99_ms:.0f}, of a hop's {hop_ms:.0f} ms")
+            lost.append(
+                f"a plan takes {p50_ms:.0f} ms, 1 of 100 {p99_ms:.0f} ms or more, and is needed every {hop_ms:.0f} ms"
+            )
         return lost
 
     def keeps_up(self, hop: int) -> bool:

@@ -178,6 +178,13 @@ def load_overlay(head: Head, file: Path | None = None) -> Overlay:
     return overlay
 
 
+def check_writable(file: Path) -> Path:
+    """Return the file of an overlay, its folder made. Raises ConfigError where it cannot be written, now not later."""
+    _replace(probe := file.with_name(f".{file.name}.try"), "")
+    probe.unlink()
+    return file
+
+
 def save_overlay(overlay: Overlay, file: Path) -> None:
     """Write an overlay whole or not at all. Raises ConfigError."""
     plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)

@@ -1,13 +1,18 @@
-"""The process of an emulated chain: a pseudo terminal for the host, and a control socket.
+"""The process of an emulated chain: a pseudo terminal or a TCP port for the host, and a control socket.
+
+Pseudo terminals and sockets in the file system are Linux's; elsewhere both are TCP ports of loopback. Only sockets are
+waited for with `select` there: Windows takes nothing else, so a thread reads the pipe to the parent.
 
 Started by `launch`, which sends a description and receives where the chain is, or the ConfigError that refuses it. The
 process ends on SIGTERM, or when the pipe to its parent does.
 
-In real time bytes are answered when the wire says. In virtual time they wait in the terminal until a client of the
+In real time bytes are answered when the wire says. In virtual time they wait in the device until a client of the
 control socket says how many there are and what time it is. Control requests and answers are one line each:
 
     sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
                                                  due by UNTIL; what came by SECONDS for bytes before FROM is lost
+    quiet BYTES                      quiet LENGTH  take BYTES in total and send what is due: LENGTH bytes in total,
+                                                 both since the client's first such request
     time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
@@ -18,13 +23,12 @@ control socket says how many there are and what time it is. Control requests and
     inject SPEC                      ok          a fault (see `faults`), from now on unless it says
     clear                            ok          no more faults
     supply VOLTS                     ok          of all servos
-    hangup | return                  ok          the adapter is unplugged, or plugged in again: same link, new terminal
+    hangup | return                  ok          the adapter is unplugged, or plugged in again: same name, new device
     stats | stamps | faults          json {...}  counts; the last replies, due and sent; faults that last or are to come
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import select
@@ -35,16 +39,17 @@ import struct
 import sys
 import tempfile
 import time
-import tty
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.pulse_boards import MaestroBoard, Ssc32Board
 from sfms_robot.emulator.servo_chains import Dynamixel2Chain, Protocol1Chain
+from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import ConfigError
 from sfms_robot.processes import ParentPipe, realtime_priority
 from sfms_robot.servo.registers import Table
@@ -65,41 +70,111 @@ _KINDS: Final[Mapping[tuple[str, int | None], Any]] = {  # family, protocol
 
 
 class PseudoTerminal:
-    """The open pty that the chain sits behind.
+    """The open pty that the chain sits behind, on Linux.
 
-    `link` is a symbolic link to it, replaced when it is opened and removed when it is closed: the name stays when the
+    `name` is a symbolic link to it, replaced when it is opened and removed when it is closed: the name stays when the
     adapter is hung up and comes back.
     """
 
     def __init__(self, link: str) -> None:
-        self.link = link
-        self.fd, self._slave = os.openpty()  # the slave stays open, so that hosts may come and go
+        import tty
+
+        self.name = link
+        self._fd, self._slave = os.openpty()  # the slave stays open, so that hosts may come and go
         tty.setraw(self._slave)
-        os.set_blocking(self.fd, False)
-        self.path = os.ttyname(self._slave)
+        os.set_blocking(self._fd, False)
+        self._path = os.ttyname(self._slave)
         beside = f"{link}.new"
         if os.path.lexists(beside):
             os.unlink(beside)
-        os.symlink(self.path, beside)
+        os.symlink(self._path, beside)
         os.replace(beside, link)
+
+    def watched(self) -> list[Any]:
+        """Return what is readable when there is something to `take`."""
+        return [self._fd]
+
+    def take(self, count: int, patience_s: float) -> bytes:
+        """Return 1 to `count` bytes of hosts as soon as there are any; empty if none came within `patience_s`."""
+        return os.read(self._fd, count) if select.select([self._fd], [], [], patience_s)[0] else b""
 
     def baud(self) -> int:
         """Return the baud rate that the host has set."""
-        raw = fcntl.ioctl(self.fd, _TCGETS2, bytes(_TERMIOS2.size))
+        import fcntl
+
+        raw = fcntl.ioctl(self._fd, _TCGETS2, bytes(_TERMIOS2.size))
         return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
 
     def send(self, data: bytes, patience_s: float) -> None:
         """Write the bytes that the terminal takes within `patience_s`; the rest is lost, as on a wire."""
         view = memoryview(data)
-        while view and select.select([], [self.fd], [], patience_s)[1]:
-            view = view[os.write(self.fd, view) :]
+        while view and select.select([], [self._fd], [], patience_s)[1]:
+            view = view[os.write(self._fd, view) :]
 
     def close(self) -> None:
         """Close the device, and remove the link unless it points to another one by now."""
-        if os.path.islink(self.link) and os.readlink(self.link) == self.path:
-            os.unlink(self.link)
-        os.close(self.fd)
+        if os.path.islink(self.name) and os.readlink(self.name) == self._path:
+            os.unlink(self.name)
+        os.close(self._fd)
         os.close(self._slave)
+
+
+class NetworkPort:
+    """The TCP port of loopback that the chain sits behind where there is no pty; methods as of `PseudoTerminal`.
+
+    It does not carry the rate of the host: the line has one rate, as a serial server's has. Several hosts may be
+    connected; answers go to the one that wrote last.
+
+    Args:
+        name: its address when it was open before, so that it comes back under that.
+    """
+
+    def __init__(self, baud: int, name: str | None = None) -> None:
+        self._baud = baud
+        self._listener = socket.create_server((LOOPBACK, int(name.rpartition(":")[2]) if name else 0))
+        self.name = f"socket://{LOOPBACK}:{self._listener.getsockname()[1]}"
+        self._hosts: list[socket.socket] = []  # the one that wrote last is the last
+
+    def watched(self) -> list[Any]:
+        return [self._listener, *self._hosts]
+
+    def take(self, count: int, patience_s: float) -> bytes:
+        while ready := select.select(self.watched(), [], [], patience_s)[0]:
+            host = ready[-1]
+            if host is self._listener:
+                host = self._listener.accept()[0]
+                host.setblocking(False)
+                host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._hosts.append(host)
+                continue
+            try:
+                data: bytes = host.recv(count)
+            except OSError:
+                data = b""
+            self._hosts.remove(host)
+            if data:
+                self._hosts.append(host)
+                return data
+            host.close()  # it has left
+        return b""
+
+    def baud(self) -> int:
+        return self._baud
+
+    def send(self, data: bytes, patience_s: float) -> None:
+        view = memoryview(data)
+        try:
+            while view and self._hosts and select.select([], self._hosts[-1:], [], patience_s)[1]:
+                view = view[self._hosts[-1].send(view) :]
+        except OSError:
+            return  # it has left, which `take` sees next
+
+    def close(self) -> None:
+        for each in self.watched():
+            each.close()
+
+
+Device = PseudoTerminal | NetworkPort
 
 
 @dataclass
@@ -110,6 +185,7 @@ class _Client:
     buffer: bytearray = field(default_factory=bytearray)
     taken: int = 0
     wanted_from: int = 0
+    since: tuple[int, int] | None = None  # bytes that the wire had received and sent at its first `quiet`
 
     def reply(self, answer: str) -> None:
         try:
@@ -119,41 +195,45 @@ class _Client:
 
 
 class Server:
-    """Moves bytes between the terminal, the control socket and the wire."""
+    """Moves bytes between the device, the control socket and the wire.
 
-    def __init__(self, wire: EmulatedWire, virtual: bool, folder: str, link: str) -> None:
+    Args:
+        plug_in: opens the device, under the name that it had before.
+        control: the bound socket that takes requests. It is closed with the rest.
+    """
+
+    def __init__(
+        self, wire: EmulatedWire, virtual: bool, plug_in: Callable[[str | None], Device], control: socket.socket
+    ) -> None:
         self._wire = wire
         self._virtual = virtual
-        self._terminal: PseudoTerminal | None = PseudoTerminal(link)
-        self._link = link
-        self.control = os.path.join(folder, "control")
-        self._listener = socket.socket(socket.AF_UNIX)
-        self._listener.bind(self.control)
+        self._plug_in = plug_in
+        self._device: Device | None = plug_in(None)
+        self.device = self._device.name
+        self._listener = control
         self._listener.listen()
-        self._clients: dict[int, _Client] = {}
+        self._clients: dict[socket.socket, _Client] = {}
         self._start_s = time.monotonic()
         self._now_s = 0.0
         self._idled_s = 0.0
 
-    def run(self, parent: int) -> None:
-        """Serve until the pipe `parent` (a file descriptor) ends."""
-        listener = self._listener.fileno()
+    def run(self, ended: socket.socket) -> None:
+        """Serve until `ended` can be read."""
         while True:
-            watched = [parent, listener, *self._clients]
-            if self._terminal is not None and not self._virtual:
-                watched.append(self._terminal.fd)
+            watched: list[Any] = [ended, self._listener, *self._clients]
+            if self._device is not None and not self._virtual:
+                watched += self._device.watched()
             patience_s = None if self._virtual else min(max(0.0, self._wire.next_s - self._now()), _IDLE_S)
-            for fd in select.select(watched, [], [], patience_s)[0]:
-                if self._terminal is not None and fd == self._terminal.fd:
-                    self._wire.receive(os.read(fd, _CHUNK), self._terminal.baud(), self._now())
-                elif fd == listener:
-                    connection, _ = self._listener.accept()
-                    self._clients[connection.fileno()] = _Client(connection)
-                elif fd == parent:
-                    if not os.read(parent, _CHUNK):
-                        return
-                elif fd in self._clients:
-                    self._serve(self._clients[fd])
+            for each in select.select(watched, [], [], patience_s)[0]:
+                if each is ended:
+                    return
+                if each is self._listener:
+                    connection = self._listener.accept()[0]
+                    self._clients[connection] = _Client(connection)
+                elif each in self._clients:
+                    self._serve(self._clients[each])
+                elif self._device is not None and (data := self._device.take(_CHUNK, 0.0)):
+                    self._wire.receive(data, self._device.baud(), self._now())
             if not self._virtual:
                 self._deliver()
 
@@ -169,18 +249,18 @@ class Server:
             self._idled_s = self._now_s
             self._wire.idle(self._now_s)
         outs = self._wire.take(self._now_s)
-        if outs and self._terminal is not None:
-            self._terminal.send(b"".join(out.data for out in outs), 0.0)
+        if outs and self._device is not None:
+            self._device.send(b"".join(out.data for out in outs), 0.0)
             self._wire.sent(outs, self._now())
 
     def _advance(self, now_s: float) -> None:
         """Move the wire on, then hang up or come back as it says."""
         self._wire.advance(now_s)
-        if self._wire.hung and self._terminal is not None:
-            self._terminal.close()
-            self._terminal = None
-        elif not self._wire.hung and self._terminal is None:
-            self._terminal = PseudoTerminal(self._link)
+        if self._wire.hung and self._device is not None:
+            self._device.close()
+            self._device = None
+        elif not self._wire.hung and self._device is None:
+            self._device = self._plug_in(self.device)
 
     # --- control ------------------------------------------------------------------------------------------------
 
@@ -196,6 +276,8 @@ class Server:
             try:
                 if words[0] == "sync":
                     self._sync(client, int(words[1]), int(words[2]), *map(float, words[3:5]))
+                elif words[0] == "quiet":
+                    client.reply(self._quiet(client, int(words[1])))
                 else:
                     client.reply(self._command(words))
             except (ValueError, IndexError, TypeError):
@@ -203,24 +285,24 @@ class Server:
             except ConfigError as error:
                 client.reply(f"error {error}")
         if not data:
-            del self._clients[client.connection.fileno()]
+            del self._clients[client.connection]
             client.connection.close()
 
     def _sync(self, client: _Client, count: int, wanted_from: int, now_s: float, until_s: float | None = None) -> None:
         self._now_s = now_s
         self._advance(now_s)
-        terminal = self._terminal
-        if terminal is None:
+        device = self._device
+        if device is None:
             client.reply("error the adapter is unplugged")
             return
         data = bytearray()
         while client.taken + len(data) < count:
-            if not select.select([terminal.fd], [], [], _PATIENCE_S)[0]:
+            if not (more := device.take(count - client.taken - len(data), _PATIENCE_S)):
                 break
-            data += os.read(terminal.fd, count - client.taken - len(data))
+            data += more
         unwanted = max(0, wanted_from - client.taken)
         client.taken += len(data)
-        baud = terminal.baud()
+        baud = device.baud()
         if unwanted:
             self._wire.receive(bytes(data[:unwanted]), baud, now_s)
         if wanted_from > client.wanted_from:
@@ -231,8 +313,20 @@ class Server:
         outs = self._wire.take(now_s if until_s is None else max(now_s, until_s), all_but_late=until_s is None)
         reply = b"".join(out.data for out in outs)
         client.reply(f"ack {len(reply)}")
-        terminal.send(reply, _PATIENCE_S)
+        device.send(reply, _PATIENCE_S)
         self._wire.sent(outs, None)
+
+    def _quiet(self, client: _Client, count: int) -> str:
+        """Take the bytes that a client has written, and send all that is due: a silence after that is the servos'."""
+        if client.since is None:
+            client.since = self._wire.traffic
+        received, sent = client.since
+        while self._device is not None and self._wire.traffic[0] - received < count:
+            if not (data := self._device.take(_CHUNK, _PATIENCE_S)):
+                break
+            self._wire.receive(data, self._device.baud(), self._now())
+        self._deliver()
+        return f"quiet {self._wire.traffic[1] - sent}"
 
     def _command(self, words: list[str]) -> str:
         """Carry out any other request; return the answer. Raises ValueError for a number that cannot be read."""
@@ -268,12 +362,11 @@ class Server:
         return "ok"
 
     def close(self) -> None:
-        """Close the terminal, the control socket and all connections to it."""
-        for client in self._clients.values():
-            client.connection.close()
-        self._listener.close()
-        if self._terminal is not None:
-            self._terminal.close()
+        """Close the device, the control socket and all connections to it."""
+        for connection in (*self._clients, self._listener):
+            connection.close()
+        if self._device is not None:
+            self._device.close()
 
 
 def _to_servo(servo: Any, name: str, value: list[str], now_s: float) -> str:
@@ -319,6 +412,17 @@ def _wire(description: Mapping[str, Any]) -> EmulatedWire:
     return EmulatedWire(devices, description["timing"], faults, description["seed"])
 
 
+def _bound(description: Mapping[str, Any], folder: str) -> tuple[socket.socket, str, Callable[[str | None], Device]]:
+    """Return the control socket, its address, and the function that opens the device."""
+    if description["transport"] == "tcp":
+        control = socket.create_server((LOOPBACK, 0))
+        return control, f"{LOOPBACK}:{control.getsockname()[1]}", partial(NetworkPort, description["servos"][0]["baud"])
+    control, place = socket.socket(socket.AF_UNIX), os.path.join(folder, "control")
+    control.bind(place)
+    link = description["link"] or os.path.join(folder, "device")
+    return control, place, lambda name: PseudoTerminal(link)
+
+
 def main() -> None:
     """Read the description, report where the chain is, serve."""
     parent = ParentPipe()  # ignores Ctrl-C, which is for the host: it still has to stop its servos
@@ -329,13 +433,15 @@ def main() -> None:
     except ConfigError as error:
         parent.send(error)
         return
+    ended, over = socket.socketpair()
+    parent.forward(lambda message: None, over.close)
     folder = tempfile.mkdtemp(prefix="sfms-robot-")
-    link = description["link"] or os.path.join(folder, "device")
     try:
-        server = Server(wire, description["virtual"], folder, link)
+        control, place, plug_in = _bound(description, folder)
+        server = Server(wire, description["virtual"], plug_in, control)
         # A servo has a processor of its own: it answers in time whatever else this computer does.
         with closing(server), realtime_priority(wanted=not description["virtual"]) as priority:
-            parent.send({"device": link, "control": server.control, "folder": folder, "priority": priority})
-            server.run(parent.incoming.fileno())
+            parent.send({"device": server.device, "control": place, "folder": folder, "priority": priority})
+            server.run(ended)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -123,6 +123,11 @@ class EmulatedWire:
         found = (device.servo(servo_id) for device in self._devices)
         return next((servo for servo in found if servo is not None), None)
 
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """Bytes received and bytes sent so far."""
+        return self._counts["bytes_in"], self._counts["bytes_out"]
+
     def digest(self) -> tuple[str, int]:
         """Return SHA-256 and number of all bytes the host ever sent, at whatever baud."""
         return self._seen.hexdigest(), self._counts["bytes_in"]

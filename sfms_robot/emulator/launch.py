@@ -14,27 +14,42 @@ import json
 import os
 import queue
 import shutil
-import socket
+import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Literal, Self, cast
+from importlib import import_module
+from typing import Any, Final, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
 from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
+from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.processes import Child
 
 __all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
 
 BehindSilent = Literal["chain_break", "skip"]
+Transport = Literal["pty", "tcp"]
 
 READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
 PROMPT_DEADLINE_S = 0.005  # one with real-time priority
 
 _START_S = 20.0
 _CLOSE_S = 5.0
+
+
+def _usual() -> Transport:
+    """Return "pty" on Linux, where a terminal reports the rate that its host has set; elsewhere "tcp"."""
+    try:
+        return "pty" if sys.platform == "linux" and import_module("fcntl") and import_module("termios") else "tcp"
+    except ImportError:
+        return "tcp"
+
+
+TRANSPORT: Final = _usual()
+
 _refusal = partial(ConfigError.at, "emulated chain")
 _BOARD_SETTINGS = {"maestro": {"crc"}}  # stored in a board as a whole: "Enable CRC"
 
@@ -44,8 +59,9 @@ class Chain:
     """A running chain.
 
     Attributes:
-        device: Path of the serial device; it stays the same when the adapter is unplugged and comes back.
-        control: Path of the control socket.
+        device: Path of the serial device, or socket://HOST:PORT; it stays the same when the adapter is unplugged and
+            comes back.
+        control: Path of the control socket, or HOST:PORT.
         virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
         servos: what is plugged in.
         priority: "fifo" where it answers as promptly as hardware; else why not (`processes.realtime_priority`).
@@ -154,8 +170,7 @@ class Chain:
     def ask(self, request: str) -> str:
         """Send one line to the control socket and return the answer. Raises BusError when it is refused."""
         try:
-            with socket.socket(socket.AF_UNIX) as control:
-                control.connect(self.control)
+            with connect(self.control) as control:
                 control.sendall(request.encode() + b"\n")
                 answer = control.makefile().readline().strip()
         except OSError as error:
@@ -174,6 +189,7 @@ def launch(
     faults: Sequence[str] = (),
     seed: int = 0,
     link: str | None = None,
+    transport: Transport = TRANSPORT,
 ) -> Chain:
     """Start a chain and wait until it can be opened.
 
@@ -183,6 +199,7 @@ def launch(
         behind_silent: "chain_break" silences the ids behind a silent one in a sync read.
         faults: specs (see `emulator.faults`); `seed` of their random numbers.
         link: a symbolic link to the device, removed at the end.
+        transport: pseudo terminal, or TCP port of loopback, which has one rate: that of the first servo.
 
     Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
     link that is taken; BusError when the process does not start.
@@ -193,12 +210,15 @@ def launch(
     ]
     _check(servos, maps)
     if link is not None:
+        if transport == "tcp":
+            raise _refusal("link", link, "needs a pseudo terminal, which only Linux has: use the printed address")
         if os.path.exists(link) or (os.path.lexists(link) and not os.path.islink(link)):
             raise _refusal("link", link, "is already there")
         if not os.path.isdir(os.path.dirname(os.path.abspath(link))):
             raise _refusal("link", link, "lies in a folder that does not exist")
     description = {
         "virtual": virtual,
+        "transport": transport,
         "timing": timing,
         "behind_silent": behind_silent,
         "faults": list(faults),

@@ -180,7 +180,7 @@ def render_robots(
 ) -> None:
     """Draw scenes with joint values (U,), each with its name below if it has one, as one PNG.
 
-    Raises ConfigError for a mesh that cannot be read, MissingExtra without vtk.
+    A mesh that cannot be read is added to the scene's `left_out`. Raises MissingExtra without vtk.
     """
     vtk = load_vtk()
     rows, (wide, high), caption = -(-len(robots) // columns), size_px, 26 if any(name for name, *_ in robots) else 0
@@ -197,7 +197,7 @@ def render_robots(
 
 
 def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
-    """Add every visual in its place, three lights, and the camera before it. Raises ConfigError for a bad mesh.
+    """Add every visual in its place, three lights, and the camera before it.
 
     The camera stands where it sees all of the robot at rest, so pictures of one robot show how it moves.
     """
@@ -229,7 +229,10 @@ def _distance(bounds: Doubles, aspect: float) -> float:
 def _add_visuals(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
     places = scene.robot.link_places(dict(zip(scene.joints, values.tolist(), strict=True)))
     for visual in scene.robot.visuals:
-        renderer.AddActor(_visual_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
+        try:
+            renderer.AddActor(_visual_actor(vtk, visual, places[visual.link] @ visual.place, scene.meshes))
+        except ConfigError as error:
+            scene.leave_out(visual, str(error))
 
 
 def _visual_actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str, Path]) -> Any:

@@ -25,13 +25,14 @@ from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.data import data_dir, shipped_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.generic_robot import generic_urdf
-from sfms_robot.face.urdf import MOVING, Urdf, read_urdf
+from sfms_robot.face.urdf import MOVING, Urdf, Visual, read_urdf
 from sfms_robot.frames import POSE_CHANNELS, Doubles
 from sfms_robot.signals.rotations import rotation, seen_from
 
 URDF_FILE: Final = "robot.urdf"
 MESHES: Final = (".stl", ".obj", ".ply", ".dae")
 MOST_MESH_BYTES: Final = 64 * 2**20
+_LFS: Final = b"version https://git-lfs"
 _POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
 
 
@@ -52,10 +53,11 @@ class RobotScene:
     """A head as a URDF.
 
     Attributes:
-        urdf: the file. text: its content, of a generic picture that is no file.
+        urdf: the file. generic: it is made of the joints of a head that has none.
+        text: what the page shows in place of the file, None where that is the file itself.
         robot: what it holds, without the visuals of `left_out`.
         meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
-        left_out: one line for each mesh that may not be served or drawn.
+        left_out: one line for each part that is not drawn, or probably not meant so.
         joints: the URDF joints of `values`, in its order; mimic joints follow from them.
         follows: joint of the head -> the URDF joint that it moves.
         undriven: joints of the head that move nothing in the picture.
@@ -71,9 +73,10 @@ class RobotScene:
     ) -> None:
         """Read a URDF. Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it."""
         description = head.urdf or RobotDescription(file=URDF_FILE)
-        self.urdf, self.text, self.robot = urdf, text, read_urdf(urdf, text)
+        self.urdf, self.generic, self.robot = urdf, text is not None, read_urdf(urdf, text)
+        self.text = text or self.robot.text
         self.meshes: dict[str, Path] = {}
-        self.left_out: list[str] = []
+        self.left_out = list(self.robot.left_out)
         self._find_meshes(head.folder or Path(), description.packages, packages)
         self._names = tuple(head.joints)
         self._rest = np.array([joint.rest_rad for joint in head.joints.values()])
@@ -89,7 +92,7 @@ class RobotScene:
         if neck is not None and self._pose is not None and self._pose.joints:
             self.joints += self._pose.joints
             self.undriven = tuple(name for name in self.undriven if name not in neck.joints)
-        if not self.joints:
+        if not self.joints and self._names:
             ours, theirs = ", ".join(self._names), ", ".join(_free(self.robot)) or "none"
             raise ConfigError(
                 f"{urdf}: none of its joints ({theirs}) follows a joint of this head ({ours}): urdf.joints"
@@ -111,17 +114,19 @@ class RobotScene:
     def _find_meshes(self, own: Path, named: Mapping[str, str], folders: Sequence[str]) -> None:
         """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, from there on."""
         inside = [Path(os.path.realpath(each)) for each in (own, *map(Path, folders))]
-        visuals = []
+        packages = {folder.name: folder for folder in inside[1:]} | {name: own / path for name, path in named.items()}
         for visual in self.robot.visuals:
             if visual.shape == "mesh":
-                file = Path(os.path.realpath(_mesh_file(visual.mesh, self.urdf.parent, own, named)))
+                file = Path(os.path.realpath(_mesh_file(visual.mesh, self.urdf.parent, packages)))
                 if expected := mesh_problem(file, inside):
-                    where = f"{self.urdf}: link {visual.link}: mesh filename"
-                    self.left_out.append(f"{where}: expected {expected}, got {visual.mesh!r}")
-                    continue
-                self.meshes[visual.mesh] = file
-            visuals.append(visual)
-        self.robot = replace(self.robot, visuals=tuple(visuals))
+                    self.leave_out(visual, f"expected {expected}, got {visual.mesh!r}")
+                else:
+                    self.meshes[visual.mesh] = file
+
+    def leave_out(self, visual: Visual, problem: str) -> None:
+        """Take a mesh out of the picture, and name it in `left_out`."""
+        self.left_out.append(f"{self.urdf}: link {visual.link}: mesh filename: {problem}: not drawn")
+        self.robot = replace(self.robot, visuals=tuple(each for each in self.robot.visuals if each is not visual))
 
     def values(self, read_rad: Doubles) -> Doubles:
         """Return values (U,) of `joints` for angles (J,) in the head's order; one that is not finite keeps its last.
@@ -236,11 +241,18 @@ def mesh_problem(file: Path, folders: Sequence[Path]) -> str | None:
         return f"a file ({file} is not there; urdf.packages says where packages lie)"
     if file.suffix.lower() not in MESHES or file.stat().st_size > MOST_MESH_BYTES:
         return f"one of {', '.join(MESHES)}, of at most {MOST_MESH_BYTES >> 20} MiB"
+    with file.open("rb") as content:
+        if content.read(len(_LFS)) == _LFS:
+            return "a mesh, not a pointer of git-LFS (git lfs pull gets the file)"
     return None
 
 
-def _mesh_file(name: str, folder: Path, own: Path, packages: Mapping[str, str]) -> Path:
+def _mesh_file(name: str, folder: Path, packages: Mapping[str, Path]) -> Path:
+    """Return the file of a mesh; a package that is not in `packages` is beside `folder`, above it, or beside those."""
     if name.startswith("package://"):
         package, _, inside = name.removeprefix("package://").partition("/")
-        return own / packages.get(package, folder / package) / inside
+        above = (folder, *folder.absolute().parents)
+        around = (each if each.name == package else each / package for each in above)
+        found = packages.get(package) or next((each for each in around if each.is_dir()), folder / package)
+        return found / inside
     return folder / name.removeprefix("file://")

@@ -1,14 +1,18 @@
 """URDF files: links, joints and what is drawn of them; and where every link is for given joint values.
 
 What the format says is at http://wiki.ros.org/urdf/XML. Read: visuals (box, cylinder, sphere, mesh), materials with a
-colour, joints of every type but floating and planar, mimic. Not read: inertia, collision, transmissions, textures.
+colour, joints of every type (floating and planar ones stay at their origin), mimic. Not read: inertia, collision,
+transmissions, textures. A visual or a colour that cannot be drawn is left out and named; a link or a joint that cannot
+be read is an error, since places depend on it.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -22,9 +26,9 @@ from sfms_robot.signals.rotations import from_vector, rotation
 
 TURNING: Final = ("revolute", "continuous")
 MOVING: Final = (*TURNING, "prismatic")
-_TYPES: Final = (*MOVING, "fixed")
-_XACRO: Final = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
+_TYPES: Final = (*MOVING, "fixed", "floating", "planar")
 _GREY: Final = (0.7, 0.7, 0.7, 1.0)
+_MOST_NAMED: Final = 3
 _ROUND: Final = {"cylinder": ("radius", "length"), "sphere": ("radius",)}  # their sizes
 
 Color = tuple[float, float, float, float]
@@ -81,14 +85,22 @@ class JointElement:
         return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Urdf:
-    """A robot. `joints` by name, parents before children."""
+    """A robot.
+
+    Attributes:
+        joints: by name, parents before children.
+        left_out: one line for each visual or colour that is not drawn, and for angles that look like degrees.
+        text: the file without what is left out and without a namespace, where it had one of these; else None.
+    """
 
     name: str
     root: str
     joints: Mapping[str, JointElement]
     visuals: tuple[Visual, ...]
+    left_out: tuple[str, ...]
+    text: bytes | None
 
     def link_places(self, values: Mapping[str, float]) -> dict[str, Doubles]:
         """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; 0 where none is given."""
@@ -110,27 +122,63 @@ def read_urdf(file: Path, text: bytes | None = None) -> Urdf:
     Raises ConfigError of one line that names the file and the link or joint that is wrong.
     """
     try:
-        root = ElementTree.fromstring(file.read_bytes() if text is None else text)
+        data = file.read_bytes() if text is None else text
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
+    try:
+        parsed = list(ElementTree.iterparse(io.BytesIO(data), events=("start-ns", "start")))
     except ElementTree.ParseError as error:
-        raise ConfigError(f"{file}: not XML: {error}") from error
-    if any(str(element.tag).startswith(_XACRO) for element in root.iter()):
-        raise ConfigError(f"{file}: a xacro file: make a URDF of it (xacro {file.name} > robot.urdf)")
-    if root.tag != "robot":
-        raise ConfigError(f"{file}: not a URDF: its first element is <{root.tag}>, not <robot>")
-    return _UrdfReader(file, root).robot()
+        undeclared = "; it is a xacro file without xmlns:xacro" if b"<xacro:" in data else ""
+        raise ConfigError(f"{file}: not XML: {error}{undeclared}") from error
+    spaces = [space for event, space in parsed if event == "start-ns"]
+    root: Element = next(element for event, element in parsed if event == "start")
+    if found := _unresolved(root, {uri for prefix, uri in spaces if prefix == "xacro" or uri.endswith("xacro")}):
+        more = ", ..." if len(found) > _MOST_NAMED else ""
+        raise ConfigError(
+            f"{file}: expected a URDF, got a xacro file with {', '.join(found[:_MOST_NAMED])}{more}: make a URDF of it "
+            f"(xacro {file.name} > resolved.urdf)"
+        )
+    space, _, tag = root.tag.rpartition("}")
+    if tag != "robot":
+        raise ConfigError(f"{file}: not a URDF: its first element is <{tag}>, not <robot>")
+    for element in root.iter() if space else ():
+        element.tag = element.tag.removeprefix(f"{space}}}")
+    return _UrdfReader(file, root, bool(space)).robot()
+
+
+def _unresolved(root: Element, spaces: Collection[str]) -> list[str]:
+    """Return what of xacro is left in a file: elements of its namespaces, and attributes with ${...} or $(...)."""
+    found = []
+    for element in root.iter():
+        space, _, name = str(element.tag).removeprefix("{").rpartition("}")
+        found += [f"<xacro:{name}>"] if space in spaces else []
+        found += [value for value in element.attrib.values() if "${" in value or "$(" in value]
+    return list(dict.fromkeys(found))
 
 
 class _UrdfReader:
     """A reader of one file, whose errors name the file and the element."""
 
-    def __init__(self, file: Path, root: Element) -> None:
-        self._file, self._root = file, root
+    def __init__(self, file: Path, root: Element, changed: bool) -> None:
+        """`changed`: the elements differ from the file's already."""
+        self._file, self._root, self._changed = file, root, changed
+        self._left_out: list[str] = []
+        self._degrees: dict[str, str] = {}  # element with angles beyond a turn -> its angles
         self._colors: dict[str, Color] = {}
-        for material in root.iter("material"):
+        for material in list(root.iter("material")):
             if (color := material.find("color")) is not None:
-                self._colors[material.get("name", "")] = self._color(color)
+                with self._left_out_if_wrong(material, color, "drawn grey"):
+                    self._colors[material.get("name", "")] = self._color(material, color)
+
+    @contextmanager
+    def _left_out_if_wrong(self, parent: Element, element: Element, then: str) -> Iterator[None]:
+        """Name and remove an element that cannot be used."""
+        try:
+            yield
+        except ConfigError as error:
+            parent.remove(element)
+            self._left_out.append(f"{error}: {then}")
+            self._changed = True
 
     def robot(self) -> Urdf:
         links = [self._name(link) for link in self._root.findall("link")]
@@ -146,7 +194,20 @@ class _UrdfReader:
         for joint in ordered.values():
             self._check_mimic(joint, ordered)
         visuals = [v for link in self._root.findall("link") for v in self._visuals(link)]
-        return Urdf(self._root.get("name", self._file.stem), root, ordered, tuple(visuals))
+        if self._degrees:
+            where, angles = next(iter(self._degrees.items()))
+            count = f", in {len(self._degrees)} elements" if len(self._degrees) > 1 else ""
+            self._left_out.append(
+                f"{self._file}: {where}: rpy: expected radians, got {angles!r}{count} (degrees?): drawn as radians"
+            )
+        return Urdf(
+            name=self._root.get("name", self._file.stem),
+            root=root,
+            joints=ordered,
+            visuals=tuple(visuals),
+            left_out=tuple(self._left_out),
+            text=ElementTree.tostring(self._root) if self._changed else None,
+        )
 
     def _joint(self, element: Element, links: list[str]) -> JointElement:
         name, kind = self._name(element), element.get("type", "")
@@ -218,40 +279,48 @@ class _UrdfReader:
             seen.add(at.name)
 
     def _visuals(self, link: Element) -> list[Visual]:
-        found, name = [], self._name(link)
-        where = f"link {name}"
+        found: list[Visual] = []
         for visual in link.findall("visual"):
-            geometry = visual.find("geometry")
-            shape = None if geometry is None else next(iter(geometry), None)
-            if shape is None:
-                raise self._wrong("link", name, "has a visual without a geometry")
-            place, color = self._origin(visual, where), self._material(visual)
-            if shape.tag == "box":
-                size = self._floats(shape, "size", where, 3)
-            elif shape.tag == "mesh":
-                size = self._floats(shape, "scale", where, 3, (1.0, 1.0, 1.0))
-            elif shape.tag in _ROUND:
-                size = tuple(self._floats(shape, key, where)[0] for key in _ROUND[shape.tag])
-            else:
-                raise self._wrong("link", name, f"has the shape <{shape.tag}>, not box, cylinder, sphere or mesh")
-            mesh = shape.get("filename", "") if shape.tag == "mesh" else ""
-            found.append(Visual(link=name, place=place, shape=shape.tag, size=size, color=color, mesh=mesh))
+            with self._left_out_if_wrong(link, visual, "not drawn"):
+                found.append(self._visual(self._name(link), visual))
         return found
+
+    def _visual(self, name: str, visual: Element) -> Visual:
+        geometry, where = visual.find("geometry"), f"link {name}"
+        shape = None if geometry is None else next(iter(geometry), None)
+        if shape is None:
+            raise self._wrong("link", name, "has a visual without a geometry")
+        place, color = self._origin(visual, where), self._material(visual)
+        if shape.tag == "box":
+            size = self._floats(shape, "size", where, 3)
+        elif shape.tag == "mesh":
+            size = self._floats(shape, "scale", where, 3, (1.0, 1.0, 1.0))
+        elif shape.tag in _ROUND:
+            size = tuple(self._floats(shape, key, where)[0] for key in _ROUND[shape.tag])
+        else:
+            raise self._wrong("link", name, f"has the shape <{shape.tag}>, not box, cylinder, sphere or mesh")
+        mesh = shape.get("filename", "") if shape.tag == "mesh" else ""
+        return Visual(link=name, place=place, shape=shape.tag, size=size, color=color, mesh=mesh)
 
     def _material(self, visual: Element) -> Color:
         material = visual.find("material")
         if material is None:
             return _GREY
         color = material.find("color")
-        return self._colors.get(material.get("name", ""), _GREY) if color is None else self._color(color)
+        return self._colors.get(material.get("name", ""), _GREY) if color is None else self._color(material, color)
 
-    def _color(self, element: Element) -> Color:
-        red, green, blue, opacity = self._floats(element, "rgba", "a colour", 4)
+    def _color(self, material: Element, element: Element) -> Color:
+        if len((text := element.get("rgba", "")).split()) == 3:  # red, green and blue alone are opaque everywhere
+            element.set("rgba", f"{text} 1")
+        red, green, blue, opacity = self._floats(element, "rgba", f"material {material.get('name', '')}", 4)
         return red, green, blue, opacity
 
     def _origin(self, element: Element, where: str) -> Doubles:
         origin, out = element.find("origin"), np.eye(4)
-        out[:3, :3] = rotation(np.array(self._floats(origin, "rpy", where, 3, (0.0, 0.0, 0.0))))
+        angles = self._floats(origin, "rpy", where, 3, (0.0, 0.0, 0.0))
+        if max(map(abs, angles)) > math.tau:
+            self._degrees[where] = " ".join(f"{angle:g}" for angle in angles)
+        out[:3, :3] = rotation(np.array(angles))
         out[:3, 3] = self._floats(origin, "xyz", where, 3, (0.0, 0.0, 0.0))
         return out
 

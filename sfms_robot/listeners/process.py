@@ -140,6 +140,7 @@ class ListenerProcess:
             return
         self._pushed += 1
         self._send_hop()
+        self._lateness.gave(frame, now_s)
         dropped = self._supervised.child.offer(frame)
         self._skipped += dropped
         self._unanswered += 1 - dropped
@@ -245,7 +246,11 @@ class ListenerProcess:
         self._probed = probe
         self._supervised.child.send(self._choice.hop)
         if self._choice.given_up and (before is None or before.given_up is None):
-            log.warning("a plan every %d frames: %s", self._choice.hop, self._choice.given_up)
+            log.warning(
+                "this computer is slow for the listener, which plans every %d frames of 40 ms: %s",
+                self._choice.hop,
+                self._choice.given_up,
+            )
 
     def _review(self, now_s: float) -> None:
         """Choose a shorter hop where the one in force does not fit what is measured by now."""

@@ -234,14 +234,14 @@ class RemoteListener:
         self._joins += 1
         self._link.follow(welcome.stream)
         if self._joins > 1:
-            log.warning("%s%s listens again", PREFIX, self._name)
+            log.info("%s%s listens again", PREFIX, self._name)
 
     def _take(self, message: bytes, came_s: float) -> None:
         sent = parse_plan(message)
         if self._welcome is None:
             return
         if self._state == "hung":
-            log.warning("%s%s answers again", PREFIX, self._name)
+            log.info("%s%s answers again", PREFIX, self._name)
             self._state = "listening"
             self._buffer.restart(came_s)
         self._waiting_since_s = None

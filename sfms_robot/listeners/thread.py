@@ -23,6 +23,7 @@ from sfms_robot.signals.quantiles import Quantiles
 CLOSE_LIMIT_S: Final = 0.2
 HUNG_S: Final = LIMITS["listener"].hung_s
 LATE_S: Final = 1.0
+USUAL_S: Final = 0.1  # from the end of a frame until a microphone's sound is there
 MOST_WAITING: Final = FRAME_HZ // 2  # frames
 CATCH_UP: Final = 0.5  # frames by which fewer must wait after each, while it catches up: twice the person's pace
 
@@ -101,6 +102,8 @@ def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
 class Lateness:
     """A judge of plans: in time to be shown, or not. A listener on a slow computer answers, but always too late.
 
+    A plan that would be in time, had its frame come as soon as that of a microphone, is late by its source.
+
     Attributes:
         lasting: for `LATE_S` every plan has come after the time of its last frame. The first one in time ends it.
     """
@@ -108,16 +111,28 @@ class Lateness:
     def __init__(self) -> None:
         self.lasting = False
         self._since_s: float | None = None  # of the first late one in a row
+        self._given: deque[tuple[float, float]] = deque(maxlen=2 * FRAME_HZ)  # time of a frame, and how late it came
+        self._source_said = False
 
     def named(self, state: str) -> str:
         """Return "late" for a listening state whose plans are never in time, else `state`."""
         return "late" if self.lasting and state == "listening" else state
 
+    def gave(self, frame: SpeakerFrame, now_s: float) -> None:
+        """Note when the listener was given a frame."""
+        self._given.append((frame.time_s, now_s - frame.time_s))
+
     def came(self, plan: Plan, now_s: float) -> None:
         """Judge a plan that arrived at `now_s`, by the clock of its frames."""
-        if now_s <= plan.times_s[-1]:
+        given_s = next((late_s for time_s, late_s in reversed(self._given) if time_s <= plan.made_at_s + 1e-6), 0.0)
+        by_source_s = max(0.0, given_s - USUAL_S)
+        if now_s <= plan.times_s[-1] + by_source_s:
+            if now_s > plan.times_s[-1] and not self._source_said:
+                text = "plans come too late: sound reaches the listener %.0f ms late, by its source (said once)"
+                log.warning(text, given_s * 1e3)
+                self._source_said = True
             if self.lasting:
-                log.warning("the listener's plans are in time again")
+                log.info("the listener's plans are in time again")
             self.lasting, self._since_s = False, None
             return
         self._since_s = now_s if self._since_s is None else self._since_s
@@ -149,6 +164,7 @@ class ListenerThread:
         if not self._unanswered:
             self._since_s = now_s
         self._unanswered += 1
+        self._lateness.gave(frame, now_s)
         self._inbox.put(frame)
 
     def calm(self, calmness: Calmness) -> None:
@@ -180,7 +196,7 @@ class ListenerThread:
             log.warning("the listener has not answered for %.1f s; the run continues", silent_s)
             self._state = "hung"
         elif not hung and self._state == "hung":
-            log.warning("the listener answers again")
+            log.info("the listener answers again")
             self._state = "listening"
         return plans
 

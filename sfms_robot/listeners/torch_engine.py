@@ -13,7 +13,7 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from inspect import signature
 from pathlib import Path
 from typing import Any, Final
@@ -130,9 +130,12 @@ def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
 #        their content, which `engine` hands to the session (`_written`).
 
 
-def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
+def export(
+    folder: Path, out: Path, int8: bool = False, moved: Callable[[float, float, str], object] = lambda *_: None
+) -> list[Path]:
     """Write the graphs of a listener's folder below `out` and return the files. Takes half a minute to two.
 
+    `moved`: is called before each graph with the number made, the number in all, and its name.
     `int8`: a second graph of each network has its large layers in 8 bits. SFMS, whose layers are small, has none.
 
     Raises ConfigError, MissingExtra, and ModelError where `out` cannot be written.
@@ -155,10 +158,11 @@ def export(folder: Path, out: Path, int8: bool = False) -> list[Path]:
     if int8 and isinstance(model, ArigModel) and large_layers(model):
         models[".int8"] = in_integers(model)
     graphs: dict[str, Any] = {}
-    for suffix, each in models.items():
-        for name, network in networks_of(each).items():
-            with torch.no_grad():
-                graphs[name + suffix] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
+    wanted = [(suffix, *each) for suffix, one in models.items() for each in networks_of(one).items()]
+    for suffix, name, network in wanted:
+        moved(len(graphs), len(wanted), f"graph {name}{suffix}")
+        with torch.no_grad():
+            graphs[name + suffix] = _graph(network.eval(), recorder.examples[name], several=name != ONE_STREAM)
     state: dict[str, Tensor] = model.state_dict()
     known: dict[str, Any] = {}
     files: list[Path] = []

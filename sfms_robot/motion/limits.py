@@ -85,6 +85,11 @@ def curve_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: 
     return np.asarray(np.maximum.reduce([v / speed, np.sqrt(a / acceleration), np.cbrt(j / jerk)]).clip(GENTLE_S))
 
 
+def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:
+    """Return angle, speed and acceleration (3, J) at `here` from three samples (J,) one period apart."""
+    return np.stack([here, (ahead - before) / (2 * period_s), (ahead - 2 * here + before) / period_s**2])
+
+
 class Recovery(NamedTuple):
     """The curves by which joints that were found outside their own ranges come in, (J,) each.
 
@@ -230,7 +235,7 @@ class JerkLimiter:
         Returns angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
         """
         before = state.motion.T.tolist()
-        after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).T
+        after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).reshape(-1, 3).T
         # Rounding may have left the range in force by an ulp.
         reach = self._own.reaching(state.motion[0])
         np.clip(after[0], reach.low, reach.high, out=after[0])

@@ -64,7 +64,7 @@ class Units:
         rest = np.array([joint.rest_rad for joint in joints])
         up = np.array([joint.max_rad for joint in joints]) - rest
         down = rest - np.array([joint.min_rad for joint in joints])
-        in_rad = np.array([joint.unit == "rad" for joint in joints])
+        in_rad = np.array([joint.unit == "rad" for joint in joints], np.bool_)
         return cls(
             rest=rest,
             up=np.where(in_rad | (up <= 0), 1.0, up),
@@ -88,7 +88,7 @@ class ChannelMapping:
 
     Attributes:
         joints: names, in the order of the head's file.
-        blind_channels: channels that no drive follows.
+        blind_channels: channels that no drive follows; none of a head without joints, which outputs alone show.
         dead_joints: joints without a drive.
     """
 
@@ -106,7 +106,7 @@ class ChannelMapping:
         self._at_least = np.array([each.at_least for each in head.couplings])
         self._moving = [[self.joints.index(name) for name in each.moving] for each in head.couplings]
         followed = set[str]().union(*(tree.channels() for tree in trees.values() if tree))
-        self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if name not in followed)
+        self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if trees and name not in followed)
         self.dead_joints: Sequence[str] = tuple(name for name, tree in trees.items() if tree is None)
         self._knobs = self.knobs()
 
@@ -260,12 +260,13 @@ class _Shape:
     def of(cls, nodes: Sequence[Expression]) -> _Shape:
         count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum, until it is scaled
         dead = np.array([node.dead_band for node in nodes]) * count
-        gains = np.array([node.gains for node in nodes])
+        gains = np.array([node.gains for node in nodes]).reshape(-1, 2)
         gains /= np.where([node.curve is None for node in nodes], count, 1.0)[:, None]
         gained = bool((gains != 1).any())
         offset = np.array([node.offset for node in nodes])
         limit = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
-        low, high = np.array([node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]).T
+        ends = [node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]
+        low, high = np.array(ends).reshape(-1, 2).T
         clamped = bool(np.isfinite(low).any())
         return cls(
             dead_band=dead if dead.any() else None,
@@ -328,7 +329,7 @@ class Program:
         """Compile plain expressions, without shared ones; None gives 0."""
         forest: list[Tree] = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
         levels: list[_Level] = []
-        for _ in range(max(_depth(tree) for _, tree in forest)):
+        for _ in range(max((_depth(tree) for _, tree in forest), default=0)):
             level, forest = _level(forest)
             levels.insert(0, level)
         nodes = [leaf for _, leaf in forest]

@@ -28,6 +28,7 @@ from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Doubles, Floats
 from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
+from sfms_robot.signals.spaces import channel_of, motion_of
 
 RISE_S: Final = 0.25  # listener -> face
 CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows
@@ -220,10 +221,9 @@ def _channels(face: Floats | Mapping[str, float]) -> tuple[Doubles, Bools]:
     """Return values (58,) and which of them are requested (58,) bool."""
     which = np.ones(MOTION_DIM, bool)
     if isinstance(face, Mapping):
-        if unknown := sorted(set(face) - set(CHANNELS)):
-            raise InputError(f"show: {unknown[0]!r} is not a channel ({', '.join(CHANNELS)})")
-        which = np.array([name in face for name in CHANNELS])
-        values = np.array([face.get(name, 0.0) for name in CHANNELS], np.float64)
+        values = motion_of(face, "show").astype(np.float64)
+        named = {channel_of(name) for name in face}
+        which = np.array([name in named for name in CHANNELS])
     else:
         values = np.asarray(face, np.float64)
     if values.shape != (MOTION_DIM,):

@@ -6,6 +6,7 @@ missed altogether are skipped, never chased: catching up would mean moving the h
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,11 @@ from typing import Any, Final
 
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Clock, Listener
+
+BUSY_S: Final = 0.04  # a tick that is this late shows: a frame of the face
+SHOWN_S: Final = 2.0  # after its last late tick an incident is over
+LOGGED_EVERY_S: Final = 60.0
+log = logging.getLogger(__name__)
 
 _SAME: Final = 1e-6  # of a period: a clock this close to a tick is at it
 # Statistics of a feed whose steps have no duration and that leaves nothing out.
@@ -75,6 +81,38 @@ def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTim
         index += skipped
         yield TickTime(index / rate_hz, late_s - skipped / rate_hz, skipped)
         index += 1
+
+
+class TickPace:
+    """A judge of the loop's lateness: late ticks close together are one incident, with a log line and a name.
+
+    Attributes:
+        busy: what the page shows during an incident; None: there is none.
+    """
+
+    def __init__(self) -> None:
+        self.busy: str | None = None
+        self._worst_s = 0.0
+        self._last_s = self._logged_s = -math.inf
+        self._unlogged = 0
+
+    def judge(self, time_s: float, late_s: float, worked_s: float) -> None:
+        """Judge a tick that began `late_s` behind; the loop computed for `worked_s` in the tick before it."""
+        if late_s < BUSY_S:
+            if self.busy is not None and time_s - self._last_s > SHOWN_S:
+                self.busy, self._worst_s = None, 0.0
+            return
+        begins, self._last_s = self.busy is None, time_s
+        if late_s > self._worst_s:
+            self._worst_s, self.busy = late_s, f"too busy for {late_s * 1e3:.0f} ms"
+        if time_s - self._logged_s < LOGGED_EVERY_S:
+            self._unlogged += begins
+            return
+        cause = "its own work takes too long" if worked_s > late_s / 2 else "other programs use its processors"
+        again = f" ({self._unlogged} times more since the last message)" if self._unlogged else ""
+        text = "this computer was too busy for %.0f ms: %s; the head moves late, no servo is at fault%s"
+        log.warning(text, late_s * 1e3, cause, again)
+        self._logged_s, self._unlogged = time_s, 0
 
 
 class InlineFeed:

@@ -21,6 +21,7 @@ import os
 import re
 import select
 import signal
+import socket
 import stat
 import struct
 import threading
@@ -249,8 +250,9 @@ def _watching(
 
     `active` is called before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
     """
-    ours, theirs = os.pipe()  # readable once it is over
-    watched, period_s = ([ours], FILE_PERIOD_S) if fd is None else ([ours, fd], None)
+    ours, theirs = socket.socketpair()  # readable once it is over; Windows waits for no pipe
+    watched: list[Any] = [ours] if fd is None else [ours, fd]
+    period_s = FILE_PERIOD_S if fd is None else None
 
     def work() -> None:
         try:
@@ -268,9 +270,9 @@ def _watching(
     try:
         yield
     finally:
-        os.close(theirs)
+        theirs.close()
         thread.join(JOIN_S)
-        os.close(ours)
+        ours.close()
         del latch.switches[name]
 
 

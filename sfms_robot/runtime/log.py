@@ -7,6 +7,7 @@ channels.
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.audit import CommandAudit
-from sfms_robot.runtime.clock import TickTime
+from sfms_robot.runtime.clock import TickPace, TickTime
 from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
@@ -77,7 +78,10 @@ class EventCounter:
 
     def total(self) -> int:
         """Return the events so far, with the unfinished block. Blocks while it is searched."""
-        return self._submit(len(self._values)).result()
+        try:
+            return self._submit(len(self._values)).result()
+        except RuntimeError:  # the interpreter ends: its workers have done all they had, and take no more
+            return self._count(np.array(self._values), self._before, len(self._values), False)
 
     def _submit(self, last: int, whole: bool = False) -> Future[int]:
         block = (np.array(self._values), self._before, last, whole)
@@ -110,6 +114,7 @@ class RunLog:
     ticks: int = 0
     late: int = 0
     skipped: int = 0
+    pace: TickPace = field(default_factory=TickPace)
     frames: int = 0
     judged_frames: int = 0  # whose attention is known
     attentive_frames: int = 0
@@ -123,12 +128,14 @@ class RunLog:
     state: Any = None  # of the loop at its end, with the counters of timeline and limiter
     torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
     detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
+    reported: Sequence[str] = ()  # lost parts that log their own loss
     states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
     state_s: dict[str, float] = field(default_factory=dict)
     _low_rad: Doubles = field(init=False)  # (J,), as the two below
     _high_rad: Doubles = field(init=False)
     _travel_rad: Doubles = field(init=False)
     _last_rad: Doubles | None = None
+    _worked_s: float = 0.0  # by the loop's thread so far
     _waiting: deque[Plan] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _speech_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _counters: dict[str, EventCounter] = field(default_factory=dict)
@@ -157,13 +164,16 @@ class RunLog:
 
     def entered(self, state: RunState, now_s: float) -> None:
         """Record the run's state from `now_s` on."""
+        before: tuple[str, ...] = ()
         if self.states:
-            since_s, before = self.states[-1]
-            self.state_s[before.name] = self.state_s.get(before.name, 0.0) + now_s - since_s
-            if before.name == "halted" and state.name == "starting":
-                logger.warning("halt released")
+            since_s, last = self.states[-1]
+            before = last.why
+            self.state_s[last.name] = self.state_s.get(last.name, 0.0) + now_s - since_s
+            if last.name == "halted" and state.name == "starting":
+                logger.info("halt released")
         self.states.append((now_s, state))
-        level = logging.WARNING if state.why else logging.INFO
+        reported = {"listener", *self.joints, *self.reported}  # each by a line of its own, which has the reason
+        level = logging.WARNING if set(state.why) - reported - set(before) else logging.INFO
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
 
     def ended(self, now_s: float, error: Exception | None) -> None:
@@ -209,6 +219,8 @@ class RunLog:
         self.ticks += 1
         self.late += late_s > LATE_SHARE * self.period_s
         self.late_ms.add(late_s * 1e3)
+        before_s, self._worked_s = self._worked_s, time.thread_time()
+        self.pace.judge(tick.time_s, late_s, self._worked_s - before_s)
         self.skipped += tick.skipped
         self.audited = self.audit.step(goals_rad, asked_rad, self.audited)
         if self._last_rad is None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
-from sfms_robot.motion.limits import JerkLimiter, LimiterState
+from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
 from sfms_robot.runtime.clock import tick_times
@@ -54,6 +54,7 @@ class Parts:
         holds: (J,) joints that keep their torque when halted; None: no joint does.
         heat: temperature derating; None disables it.
         ignored: joints whose faults are known and accepted.
+        missing: called at every tick for names of further lost parts.
     """
 
     source: Source
@@ -73,6 +74,7 @@ class Parts:
     holds: NDArray[np.bool_] | None = None
     heat: HeatGuard | None = None
     ignored: frozenset[str] = frozenset()
+    missing: Callable[[], Sequence[str]] = tuple
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,12 +162,13 @@ def drive(
                         state=state.run.name,
                         why=state.run.why,
                         written_s=written_s,
+                        origin_s=clock.origin_s + start_s,
+                        busy=log.pace.busy,
                     )
                 )
         finally:
             state = _ending(log, clock.now_s() - start_s, state)
             if not parts.halt.causes:  # a head that was halted moves no more
-                way = tick_times(clock, rate_hz, start_s)
                 seen = partial(_seen_on_the_way, observers, state)
                 come_to_rest(
                     parts.bus,
@@ -173,7 +176,7 @@ def drive(
                     state.limiter,
                     from_rad=state.here_rad,
                     rest_rad=parts.rest_rad,
-                    ticks=way,
+                    ticks=tick_times(clock, rate_hz, start_s),
                     log=log,
                     seen=seen,
                 )
@@ -230,8 +233,9 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
     """Return the state with the state of the run from here on."""
     presence = state.presence
-    lost = (*parts.source.missing, *(("listener",) if parts.feed.lost else ()), *state.lost_joints)
-    eased_in = bool(now_s - state.since_s.max() >= EASE_S)
+    listener = ("listener",) if parts.feed.lost else ()
+    lost = (*parts.source.missing, *listener, *parts.missing(), *state.lost_joints)
+    eased_in = bool(now_s - state.since_s.max(initial=0.0) >= EASE_S)
     halted, released = parts.halt.causes, state.released
     if not halted and state.run.name == "halted" and not state.stands:
         halted = state.run.why  # it ends when the head stands, not before
@@ -341,14 +345,14 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopS
     """End a halt: held joints ease in from their present angles, the others from those they return at."""
     parts.bus.resume(parts.retargeter.joints)
     every = np.ones_like(state.released)
-    back = state.released & [joint not in parts.ignored for joint in parts.retargeter.joints]
+    back = state.released & np.array([joint not in parts.ignored for joint in parts.retargeter.joints], np.bool_)
     return replace(_eased_in_from(parts, log, state.goals_rad, every, state, now_s), released=back, stands=False)
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: LoopState, now_s: float) -> LoopState:
     """Ease in joints that were away again from their present angles, as at the start."""
     joints = parts.retargeter.joints
-    back = np.array([joint in readings and readings[joint].rejoined for joint in joints])
+    back = np.array([joint in readings and readings[joint].rejoined for joint in joints], np.bool_)
     if not back.any():
         return state
     stands_rad = state.goals_rad.copy()  # also for a servo without a position
@@ -400,8 +404,3 @@ def _is_lost(reading: Reading) -> bool:
 def _due(now_s: float, period_s: float, every_s: float) -> bool:
     """Return whether this is the first tick of a new `every_s`."""
     return math.floor(now_s / every_s + 1e-9) != math.floor((now_s - period_s) / every_s + 1e-9)
-
-
-def difference(before: Doubles, here: Doubles, ahead: Doubles, period_s: float) -> Doubles:
-    """Return angle, speed and acceleration (3, J) at `here` from three samples (J,) one period apart."""
-    return np.stack([here, (ahead - before) / (2 * period_s), (ahead - 2 * here + before) / period_s**2])

@@ -11,13 +11,14 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, Doubles, ListenerEvent, Plan
-from sfms_robot.ports import Observer
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.signals.events import MOTION_EVENTS
 
 log = logging.getLogger(__name__)
@@ -94,6 +95,7 @@ class EventWatch(Observer):
         self._plans: deque[Plan] = deque(maxlen=MOST_WAITING)
         self._changed = threading.Condition()
         self._closing = False
+        self._origin_s: float | None = None
         self._thread: threading.Thread | None = None
         self.detached: dict[str, str] = {}
 
@@ -106,6 +108,10 @@ class EventWatch(Observer):
             if self._thread is None and not self._closing:
                 self._thread = threading.Thread(target=self._work, name="events", daemon=True)
                 self._thread.start()
+
+    def tick(self, seen: Tick) -> None:
+        if seen.origin_s is not None:
+            self._origin_s = seen.origin_s
 
     def planned(self, plan: Plan) -> None:
         with self._changed:
@@ -133,7 +139,7 @@ class EventWatch(Observer):
                     return
                 plan = self._plans.popleft()
             for event in events.add(plan):
-                self._call(event)
+                self._call(replace(event, origin_s=self._origin_s))
 
     def _call(self, event: ListenerEvent) -> None:
         for entry in tuple(self._callbacks):

@@ -9,6 +9,9 @@ Topics: /speaker (25 Hz: sound, level, face, attention, place, and the robot's o
 (decisions with their evidence; of a listener without events, nods, blinks and smiles found in its plans), /face (per
 tick: the 58 requested channels), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: their
 other values), /state (when it changes).
+
+In the format "ros2" each of them is a std_msgs/String with the same JSON under /sfms_robot, and there are the topics of
+ROS's own types that `_typed` makes of it, all as CDR. Times are those of the run, from 0.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
@@ -41,6 +44,7 @@ from sfms_robot.signals.audio import energy_db
 RUN_FILE: Final = "run.mcap"
 REPORT_FILE: Final = "report.json"
 FullPolicy = Literal["drop", "wait"]
+RecordFormat = Literal["json", "ros2"]
 Message = tuple[str, float, dict[str, Any]]
 
 _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
@@ -102,6 +106,9 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
+ROS2_TOPICS: Final = {topic: f"/sfms_robot{topic}" for topic in _SCHEMAS} | {"/event": "/sfms_robot/events"}
+
+
 class Recorder(Observer):
     """Observer that writes a run to a folder.
 
@@ -116,8 +123,10 @@ class Recorder(Observer):
         when_full: FullPolicy = "drop",
         about: Mapping[str, str] | None = None,
         queue_length: int = _QUEUE_LENGTH,
+        record_format: RecordFormat = "json",
     ) -> None:
         self._joints = tuple(joints)
+        self._format = record_format
         self._wait = when_full == "wait"
         self._queue: queue.Queue[Tick | SpeakerFrame | Plan | None] = queue.Queue(queue_length)
         self._dropped = 0
@@ -185,15 +194,11 @@ class Recorder(Observer):
             self._file = _open(self._folder, part_name(self._parts))
             stack.callback(self._file.close)
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-            self._writer.start(profile="", library="sfms-robot")
+            self._writer.start(profile="" if self._format == "json" else "ros2", library="sfms-robot")
             self._writer.add_metadata("run", self._about)
             self._file.flush()
             stack.pop_all()
-        self._channels = {}
-        for topic, properties in _SCHEMAS.items():
-            schema = json.dumps({"type": "object", "properties": properties}).encode()
-            number = self._writer.register_schema(f"sfms_robot{topic.replace('/', '.')}", "jsonschema", schema)
-            self._channels[topic] = self._writer.register_channel(topic, "json", number)
+        self._channels = _json_channels(self._writer) if self._format == "json" else _ros2_channels(self._writer)
 
     def _end(self) -> None:
         self._attempt(self._writer.finish)
@@ -221,9 +226,11 @@ class Recorder(Observer):
         """Write the messages of a value; None: the last events."""
         for topic, time_s, body in self._news(math.inf) if value is None else self._messages(value):
             time_ns = max(0, round(time_s * 1e9))
-            self._writer.add_message(self._channels[topic], time_ns, orjson.dumps(body), time_ns)
-            self._written += 1
-            self._in_part += 1
+            text = orjson.dumps(body)
+            for name, data in [(topic, text)] if self._format == "json" else _as_ros2(topic, time_s, body, text):
+                self._writer.add_message(self._channels[name], time_ns, data, time_ns)
+                self._written += 1
+                self._in_part += 1
         if self._in_part >= PART_MESSAGES:
             self._end()
             self._begin()
@@ -253,7 +260,58 @@ class Recorder(Observer):
         if 0 <= now_s - self._searched_s < EVENTS_S:
             return []
         self._searched_s = now_s
-        return [("/event", event.start_s, asdict(event)) for event in self._events.news()]
+        return [("/event", event.start_s, _event_body(event)) for event in self._events.news()]
+
+
+def _json_channels(writer: Writer) -> dict[str, int]:
+    channels = {}
+    for topic, properties in _SCHEMAS.items():
+        schema = json.dumps({"type": "object", "properties": properties}).encode()
+        number = writer.register_schema(f"sfms_robot{topic.replace('/', '.')}", "jsonschema", schema)
+        channels[topic] = writer.register_channel(topic, "json", number)
+    return channels
+
+
+def _ros2_channels(writer: Writer) -> dict[str, int]:
+    from sfms_robot.signals import ros2_messages as ros2
+
+    kinds = {**dict.fromkeys(ROS2_TOPICS.values(), ros2.STRING), **ros2.TYPED_TOPICS, "/audio": ros2.AUDIO}
+    schemas = {
+        kind: writer.register_schema(kind, "ros2msg", ros2.schema_text(kind).encode()) for kind in set(kinds.values())
+    }
+    return {
+        topic: writer.register_channel(topic, "cdr", schemas[kind], {"topic_type_hash": ros2.type_hash(kind)})
+        for topic, kind in kinds.items()
+    }
+
+
+def _as_ros2(topic: str, time_s: float, body: Mapping[str, Any], text: bytes) -> Iterator[tuple[str, bytes]]:
+    """Yield the messages of ROS 2 that one of ours becomes: topic, CDR."""
+    from sfms_robot.signals import ros2_messages as ros2
+
+    yield ROS2_TOPICS[topic], ros2.to_cdr(ros2.STRING, {"data": text.decode()})
+    head = {"header": ros2.header(max(0.0, time_s), "head")}
+    match topic:
+        case "/joints" if body["joints"]:
+            found = [
+                each["goal_rad"] if (at := each["present_rad"]) is None else at for each in body["joints"].values()
+            ]
+            joints = head | {"name": list(body["joints"]), "position": found}
+            yield "/joint_states", ros2.to_cdr(ros2.JOINT_STATE, joints)
+        case "/face":
+            units = ros2.units_of(np.array([body[name] for name in CHANNELS], np.float32))
+            yield "/robot_face/action_units", ros2.to_cdr(ros2.ACTION_UNITS, head | units)
+            yield "/robot_face/expression", ros2.to_cdr(ros2.EXPRESSION, head | ros2.expression_of(units["intensity"]))
+        case "/speaker":
+            sound = {"data": base64.b64decode(body["audio_pcm16"])}
+            yield "/audio", ros2.to_cdr(ros2.AUDIO, head | {"audio": sound})
+        case "/state":
+            state = ros2.diagnostics(head["header"], body["state"], {"why": ", ".join(body["why"])})
+            yield "/diagnostics", ros2.to_cdr(ros2.DIAGNOSTICS, state)
+
+
+def _event_body(event: ListenerEvent) -> dict[str, Any]:
+    return {key: value for key, value in asdict(event).items() if key != "origin_s"}
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:

@@ -34,6 +34,7 @@ from sfms_robot.servo.registers import Table
 _CHUNK: Final = 4096
 _CURE: Final = "for this bus in the head's file, or change 'Enable CRC' in Pololu's Maestro Control Center"
 _CRC_TRIES: Final = 2  # the first may be spent on what the board still waits for
+TRIES: Final = 3  # of a question, each with and without what a board that has restarted needs
 _MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
 _SLOW_RAD_S: Final = 3.5  # a slow hobby servo under load: 0.3 s for 60 degrees
 _LONGEST_TRAVEL_S: Final = 0.7  # no joint delays `enable` for longer
@@ -118,8 +119,13 @@ class BoardStatus(NamedTuple):
     lasting: bool = False  # the fault is in the board, not only in the bytes it received
     went_home: bool = False  # it has switched its channels off, or to wherever its home is
 
+    @property
+    def garbled(self) -> bool:
+        """Return whether the board reports only that bytes to it were damaged."""
+        return self.went_home and not self.lasting
 
-class Output:
+
+class PulseOutput:
     """The state of one channel of a board.
 
     Attributes:
@@ -264,6 +270,34 @@ class Ssc32:
     def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
         """Return None."""
         return None
+
+
+def board_for(table: Table, crc: bool) -> Maestro | Ssc32:
+    """Return the protocol of a board. `crc`: what the head's file says of its setting."""
+    return Maestro(table, crc) if table.family == "maestro" else Ssc32()
+
+
+def answers(board: Maestro | Ssc32, wire: RateLimitedPort, tries: int = 2 * TRIES, restarted: bool = False) -> bool:
+    """Return whether the board answers. Blocks for `tries` answers; `restarted`: as in `status_request`, of the first.
+
+    The question clears the errors of a board, so one that reports damaged bytes every time does not read what is sent:
+    a board with another setting, or no board.
+    """
+    for _ in range(tries):
+        answer = wire.exchange(board.status_request(restarted), board.status_length)
+        status = None if answer is None else board.decode_status(answer)
+        if status is not None and not status.garbled:
+            return True
+        restarted = status is None and not restarted
+    return False
+
+
+def board_problem(table: Table, board: Maestro | Ssc32, wire: RateLimitedPort) -> str | None:
+    """Return why a head cannot run with what answers on a port, None if it can: the rule of run and doctor."""
+    there = answers(board, wire)
+    if misfit := board.misfit(wire.exchange, there):
+        return f"the {table.model} {misfit}"
+    return None if there else f"no {table.model} answers"
 
 
 def board_of(bus: str, servos: Sequence[BusServo]) -> Table:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig
-from sfms_robot.errors import BusError, PacketError, PortError, RobotError, ServoError
+from sfms_robot.errors import NOTE, BusError, PacketError, PortError, RobotError, ServoError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.ranges import Range
@@ -65,15 +65,16 @@ class Goals:
         self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
 
     def hold(self, index: int, angle_rad: float) -> None:
-        """Extend the range in force to the angle at which a servo holds, and warn if it is outside its own range."""
+        """Extend the range in force to the angle at which a servo holds, and say so if it is outside its own range."""
         self._last_rad[index], servo = angle_rad, self._servos[index]
         if not servo.min_rad <= angle_rad <= servo.max_rad:
             self._outside = True
             stands, low, high = np.degrees([angle_rad, servo.min_rad, servo.max_rad]).round(1)
-            log.warning(
-                "%s stands at %g deg, outside its limits %g..%g, as after hanging without torque: it is held "
-                "there and led in (one that hangs on nothing: `sfms-robot head calibrate`)",
-                servo, stands, low, high,
+            log.log(
+                NOTE,
+                "%s stands at %g deg, outside its limits %g..%g, and is moved back slowly: usual for a joint that hung "
+                "without torque (any other: %s)",
+                servo, stands, low, high, servo.calibrate,
             )  # fmt: skip
 
     def allows(self, index: int, goal_rad: float) -> bool:
@@ -259,7 +260,7 @@ class WireBus(ABC, Generic[L]):
             return
         self._tried_s = now_s
         if (link := self._open_again()) is not None:
-            log.warning("bus %r: %s is back", self.name, link.port.name)
+            log.info("bus %r: %s is back", self.name, link.port.name)
             self._counts["reconnects"] += 1
             self._returned(link, now_s)
 

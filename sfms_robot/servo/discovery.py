@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from sfms_robot.endpoint import host_and_port
 from sfms_robot.errors import ConfigError, PortError
 
 DEV: Final = Path("/dev")
@@ -25,6 +26,10 @@ AUTO: Final = "auto"
 NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs that can lead to servos
 
 _PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "ttyS*", "rfcomm*", "serial[0-9]")
+_TAKERS: Final = {  # daemons that look for their own devices on every USB port
+    "ModemManager": "sends modem commands to every port that is plugged in",
+    "brltty": "takes adapters with a CH340 or CP210x for a braille display, and their port vanishes",
+}
 _NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
 _NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # a bus and its device; addresses and paths do not begin so
 
@@ -162,6 +167,25 @@ def holders(path: str, proc: Path = PROC) -> list[Holder]:
     return found
 
 
+def rivals(path: str, proc: Path = PROC, sys: Path = SYS) -> list[tuple[str, str]]:
+    """Return what else uses a port, or takes it when it is plugged in: in words, with the command that frees it."""
+    name, found = os.path.basename(os.path.realpath(path)), []
+    if name in (_line(sys / "class" / "tty" / "console" / "active") or "").split():
+        fix = (
+            "sudo raspi-config nonint do_serial_cons 1, or take console= of it out of the kernel's command line; reboot"
+        )
+        found.append(("is a login console: the kernel writes its messages to it", fix))
+    for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
+        program, words = _line(folder / "comm"), _command(folder).split()
+        if program == "agetty" and name in words:
+            fix = f"sudo systemctl disable --now serial-getty@{name}"
+            found.append((f"serial-getty waits for a login on it (process {folder.name})", fix))
+        elif program in _TAKERS and name.startswith(("ttyUSB", "ttyACM")):
+            fix = f"sudo systemctl mask --now {program}"
+            found.append((f"{program} {_TAKERS[program]} (process {folder.name})", fix))
+    return found
+
+
 def is_address(device: str) -> bool:
     """Return whether a device is a URL, socket://, rfc2217:// and the like; all others are paths."""
     return "://" in device
@@ -176,7 +200,7 @@ def access_problem(path: str) -> str | None:
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
-        return "no such device"
+        return f"no such device{_meant(path)}"
     except OSError as error:
         return f"cannot be looked at: {error.strerror}"
     if stat.S_ISDIR(mode):
@@ -186,6 +210,28 @@ def access_problem(path: str) -> str | None:
     if not os.access(path, os.R_OK | os.W_OK):
         return "no permission to open it"
     return None
+
+
+def _meant(path: str) -> str:
+    """Return how to write what a path that does not exist was probably meant to be."""
+    if ":" in path and host_and_port(path) is not None:
+        return f"; the port of a serial server is written socket://{path}"
+    if path and (DEV / path).exists():
+        return f"; it is written {DEV / path}"
+    return "; COM ports are Windows'" if re.fullmatch(r"(?i)com\d+", path) else ""
+
+
+def check_device(device: str, flag: str = "") -> None:
+    """Raise PortError, with what to do, for what cannot be a serial port; nothing is opened. `flag`: in front of it."""
+    problem = access_problem(device)
+    if problem is None:
+        return
+    if problem.startswith("no permission"):
+        problem += f": sudo usermod -aG {group_of(device)} $USER, then log out and in again"
+    elif not is_address(device):
+        there = ", ".join(each.by_id or each.path for each in list_ports()) or "none"
+        problem += f" (serial ports here: {there})"
+    raise PortError(f"{flag}{device}: {problem}")
 
 
 def _address_problem(url: str) -> str | None:

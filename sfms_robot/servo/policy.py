@@ -37,6 +37,12 @@ class BusServo:
         return f"{self.joint} (id {self.id})"
 
     @property
+    def calibrate(self) -> str:
+        """Return the command that measures this joint, on the port and for the head of `doctor`."""
+        words = self.doctor.replace(" doctor ", " head calibrate ", 1).replace(" --head ", " ", 1)
+        return f"{words.removesuffix(' --fix')} --joint {self.joint}"
+
+    @property
     def nearest_to_zero_rad(self) -> float:
         """Return 0 rad, or the end of the range nearest to it."""
         return min(max(0.0, self.min_rad), self.max_rad)

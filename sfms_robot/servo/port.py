@@ -7,7 +7,7 @@ adapter can do is allowed. If the driver offers it, bytes are handed over withou
 What differs between operating systems about an open device (waiting, exclusive use, rates, RS-485 direction) is at the
 end of this file. `fcntl` and `termios` are imported if the system has them, so that the package imports everywhere.
 
-`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same pseudo terminal, but
+`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same device, but
 before a read the port sends the emulator, on a control socket, the number of bytes written so far and the time. The
 emulator takes exactly those bytes, moves its servos to that time, sends the length of its reply and writes it. So the
 result does not depend on scheduling, and a silence takes no real time.
@@ -25,9 +25,11 @@ import time
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
+from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, PortError
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import Holder, access_problem, holders, is_address
@@ -139,7 +141,7 @@ class SerialPort:
             _low_latency(self._serial)
             self.discard_input()
         except BaseException:
-            self._serial.close()
+            _shut(self._serial)
             raise
 
     def write(self, data: bytes) -> None:
@@ -150,7 +152,7 @@ class SerialPort:
 
     def read(self, n: int, deadline_s: float) -> bytes:
         try:
-            return self._io.read(n, max(0.0, deadline_s - self._clock.now_s()))
+            return self._io.read(n, max(0.0, deadline_s - self.now_s()))
         except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 
@@ -167,6 +169,8 @@ class SerialPort:
         self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
+        if _is_socket(self.name) and baud != self._serial.baudrate:
+            raise PortError(f"{self.name}: cannot change to {baud} baud: a socket:// port has the rate of its server")
         try:
             self._serial.baudrate = baud
         except (OSError, OverflowError, ValueError) as error:
@@ -175,15 +179,15 @@ class SerialPort:
             _check_baud(self._serial, self.name)
 
     def close(self) -> None:
-        self._serial.close()
+        _shut(self._serial)
 
 
 class VirtualTimePort:
-    """The pseudo terminal of an emulated chain, in virtual time."""
+    """The device of an emulated chain, in virtual time; `control`: address of its control socket."""
 
-    _WINDOW = 2048  # bytes under way at most: more than the terminal holds would block for ever
+    _WINDOW = 2048  # bytes under way at most: more than a terminal holds would block for ever
 
-    def __init__(self, device: str, control_path: str, baud: int, clock: Clock) -> None:
+    def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
         self.name = device
         self._clock = clock
         self._written = 0
@@ -191,18 +195,17 @@ class VirtualTimePort:
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
-        self._control = socket.socket(socket.AF_UNIX)
-        self._control.settimeout(_REPLY_TIMEOUT_S)
         try:
-            self._control.connect(control_path)
+            self._control = connect(control)
         except OSError as error:
-            self._control.close()
-            raise PortError(f"{control_path}: no emulator answers there: {error}") from error
+            raise PortError(f"{control}: no emulator answers there: {error}") from error
+        self._control.settimeout(_REPLY_TIMEOUT_S)
         try:
             self._serial = _open(device, baud)
         except BaseException:
             self._control.close()
             raise
+        self._io = serial_io(self._serial, device)
         self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
 
     def write(self, data: bytes) -> None:
@@ -248,7 +251,7 @@ class VirtualTimePort:
                 self._exchange(self._written_at_s)
             except BusError:
                 self._inbox.clear()  # the emulator is gone
-        self._serial.close()
+        _shut(self._serial)
         self._control.close()
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
@@ -263,13 +266,10 @@ class VirtualTimePort:
                     raise OSError("it closed its control socket")
                 line += part
             missing = int(line.removeprefix(b"ack "))
-            fd = self._serial.fileno()
             while missing > 0:
-                if not select.select([fd], [], [], _REPLY_TIMEOUT_S)[0]:
-                    raise OSError("the reply it announced does not come")
-                data = os.read(fd, missing)
+                data = self._io.read(missing, _REPLY_TIMEOUT_S)
                 if not data:
-                    raise OSError("end of file")
+                    raise OSError("the reply it announced does not come")
                 self._inbox += data
                 missing -= len(data)
         except (OSError, ValueError) as error:
@@ -292,16 +292,29 @@ def _open(device: str, baud: int) -> serial.Serial:
     except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
     try:
-        if scheme == "socket":  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
+        if _is_socket(device):  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
             with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         elif not scheme:
             _claim(port, device)
             _check_baud(port, device)
     except BaseException:
-        port.close()
+        _shut(port)
         raise
     return port
+
+
+def _is_socket(device: str) -> bool:
+    """Return whether it is plain TCP, which carries bytes and no settings."""
+    return device.startswith("socket://")
+
+
+def _shut(port: serial.Serial) -> None:
+    """Close a device. pyserial leaves the connection open where the other end has closed it first."""
+    connection = getattr(port, "_socket", None)
+    port.close()
+    if connection is not None:
+        connection.close()
 
 
 def _claim(port: serial.Serial, device: str) -> None:
@@ -360,17 +373,22 @@ class DescriptorIO:
     """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop.
 
     Like the two classes below it raises one of `DEVICE_ERRORS` if the device is gone.
+
+    Args:
+        connection: of a network port, which Windows waits for and reads in the same way.
     """
 
-    def __init__(self, port: serial.Serial) -> None:
+    def __init__(self, port: serial.Serial, connection: socket.socket | None = None) -> None:
         self._fd = port.fileno()
+        self._take = partial(os.read, self._fd) if connection is None else connection.recv
+        self._give = partial(os.write, self._fd) if connection is None else connection.send
 
     def write(self, data: bytes) -> None:
         """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
         rest = memoryview(data)
         while rest:
             try:
-                rest = rest[os.write(self._fd, rest) :]
+                rest = rest[self._give(rest) :]
             except BlockingIOError:
                 if not select.select([], [self._fd], [], WRITE_TIMEOUT_S)[1]:
                     raise OSError("it takes no more bytes") from None
@@ -378,7 +396,7 @@ class DescriptorIO:
     def read(self, n: int, timeout_s: float) -> bytes:
         """Return 1 to `n` bytes as soon as there are any; empty if none came in `timeout_s`."""
         ready, _, _ = select.select([self._fd], [], [], timeout_s)
-        data = os.read(self._fd, n) if ready else b""
+        data = self._take(n) if ready else b""
         if ready and not data:
             raise OSError("the device is gone")
         return data
@@ -440,9 +458,10 @@ def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> Des
         except (OSError, ValueError, NotImplementedError, AttributeError) as error:
             problem = "the driver of this device does not switch the direction (rts: this program does, by RTS)"
             raise PortError(f"{name}: rs485 = 'kernel': {problem}") from error
+    connection = port._socket if _is_socket(name) else None
     try:
-        has_descriptor = _termios is not None and port.fileno() >= 0
+        has_descriptor = connection is not None or (_termios is not None and port.fileno() >= 0)
     except OSError:  # io.UnsupportedOperation
         has_descriptor = False
-    io = DescriptorIO(port) if has_descriptor else PolledIO(port)
+    io = DescriptorIO(port, connection) if has_descriptor else PolledIO(port)
     return RtsDirection(io, port, name) if rs485 == "rts" else io

@@ -28,7 +28,16 @@ from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
 from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
-from sfms_robot.servo.boards import Maestro, Output, RateLimitedPort, Ssc32, board_of, pulses_beyond
+from sfms_robot.servo.boards import (
+    TRIES,
+    PulseOutput,
+    RateLimitedPort,
+    answers,
+    board_for,
+    board_of,
+    board_problem,
+    pulses_beyond,
+)
 from sfms_robot.servo.bus import RECONNECT_S, WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -40,7 +49,6 @@ _TRAVEL_PARTS: Final = 14  # of that wait; after each, the latch is checked
 _STATUS_EVERY_S: Final = 1.0
 _SILENT_AFTER: Final = 3  # requests without an answer
 _LEAST_PATIENCE_S: Final = 0.02  # an SSC-32 thinks for up to 5 ms, an adapter holds its bytes for up to 16
-_TRIES: Final = 3
 _STOP_S: Final = 0.4  # the longest that `stop` waits for the board to confirm that its pulses are off
 _LEAST_RECONNECT_S: Final = 5.0  # a board that is asked once a second has to have a few chances
 _NO_ANSWER: Final = "no answer"
@@ -82,7 +90,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         table = board_of(name, servos)
         self.model = table.model
         crc = config is not None and config.crc
-        self._board: Maestro | Ssc32 = Maestro(table, crc) if table.family == "maestro" else Ssc32()
+        self._table, self._board = table, board_for(table, crc)
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us):
             raise ConfigError(f"bus {name!r}: a {self.model} does not make the pulses of {beyond}")
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):
@@ -96,7 +104,7 @@ class PulseBus(WireBus[RateLimitedPort]):
 
     def _forget(self) -> None:
         """Reset what holds for one connection only."""
-        self._outputs = [Output(index, servo) for index, servo in enumerate(self._servos)]
+        self._outputs = [PulseOutput(index, servo) for index, servo in enumerate(self._servos)]
         self._latched = False  # by `torque_off`: nothing is sent until `enable` or `resume`
         self._off_due = False  # torque off is to be sent again by the next poll
         self._pending = False  # goals that have not been sent yet
@@ -119,11 +127,8 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._forget()
         self._powered = frozenset()
         try:
-            present = self._present(wire)
-            if misfit := self._board.misfit(wire.exchange, present):
-                raise self._absent(wire, f"the {self.model} {misfit}")
-            if not present:
-                raise self._absent(wire)
+            if problem := board_problem(self._table, self._board, wire):
+                raise self._absent(wire, problem)
             self._read_pulses(wire)
         except BaseException:
             wire.port.close()
@@ -139,11 +144,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: {problem}")
 
     def _present(self, wire: RateLimitedPort) -> bool:
-        return any(self._answers(wire, restarted) for _ in range(_TRIES) for restarted in (False, True))
-
-    def _answers(self, wire: RateLimitedPort, restarted: bool) -> bool:
-        answer = wire.exchange(self._board.status_request(restarted), self._board.status_length)
-        return answer is not None and self._board.decode_status(answer) is not None
+        return answers(self._board, wire)
 
     def _read_pulses(self, wire: RateLimitedPort) -> bool:
         """Read the pulses that the board sends; return whether it reported them."""
@@ -178,7 +179,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._check_latch()
         return np.array(held)
 
-    def _output(self, joint: str) -> Output:
+    def _output(self, joint: str) -> PulseOutput:
         return self._outputs[self.joints.index(joint)]
 
     def _unlatch(self) -> None:
@@ -194,7 +195,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.enabled = False
             raise BusError(f"bus {self.name!r}: torque was switched off while joints came on")
 
-    def _switch_on(self, wire: RateLimitedPort, output: Output) -> float:
+    def _switch_on(self, wire: RateLimitedPort, output: PulseOutput) -> float:
         """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` comes."""
         new, index = not output.enabled, output.index
         self._powered |= {output.channel}
@@ -285,7 +286,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             return
         wire = self._link or self._open_again()
         until_s = wire.port.now_s() + min(_STOP_S, within_s) if wire is not None else 0.0
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             if wire is None:
                 break
             try:
@@ -301,14 +302,14 @@ class PulseBus(WireBus[RateLimitedPort]):
         self, wire: RateLimitedPort, channels: Sequence[int], until_s: float, restarted: bool = False
     ) -> bool:
         """Ask the board whether its pulses are off, and send torque off again; return whether it confirms it."""
-        for _ in range(4 * _TRIES):  # each costs a mute board's patience
+        for _ in range(4 * TRIES):  # each costs a mute board's patience
             wire.wait(min(wire.busy_until_s, until_s))
             if wire.port.now_s() >= until_s:
                 break
             pulses = self._board.read_pulses(wire.exchange, channels)
             on = {channel for channel, ticks in (pulses or {}).items() if ticks}
             # A board that cannot report its pulses confirms by any answer; a lost answer of another one does not.
-            if pulses is None and (self._board.reports_pulses or not self._answers(wire, restarted=True)):
+            if pulses is None and (self._board.reports_pulses or not answers(self._board, wire, 1, True)):
                 on = set(channels)
             self._powered &= on
             if not on:
@@ -408,7 +409,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._counts["writes"] += 1
         return True
 
-    def _send(self, wire: RateLimitedPort, outputs: Sequence[Output]) -> None:
+    def _send(self, wire: RateLimitedPort, outputs: Sequence[PulseOutput]) -> None:
         """Send goals, unless torque is off; if it was switched off while these bytes left, send torque off again."""
         outputs = [output for output in outputs if not output.resting]
         if self._latched or not outputs:
@@ -461,7 +462,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.sent = None  # what the board does now is not what was sent
         if was_silent:
             self._counts["reconnects"] += 1
-            log.warning("bus %r: the %s answers again", self.name, self.model)
+            log.info("bus %r: the %s answers again", self.name, self.model)
             # Channels that the board switched off during the silence, if it reports them, come on again in turn.
             if self._read_pulses(wire) and not self._latched:
                 for output in self._outputs:
@@ -475,7 +476,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._report_fault(self._outputs, status.faults, shown=status.lasting)
         return True
 
-    def _report_fault(self, outputs: Sequence[Output], fault: str, shown: bool = True) -> None:
+    def _report_fault(self, outputs: Sequence[PulseOutput], fault: str, shown: bool = True) -> None:
         """Record a fault of some outputs; `shown` puts it into their readings, too."""
         for output in outputs if shown else ():
             output.fault = fault

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import math
+import os
+import struct
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.data import archive_kind
+from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
 
 if TYPE_CHECKING:
@@ -26,12 +30,79 @@ LOUDEST: Final = 8.0  # full scale is 1; a file that goes beyond this was writte
 _BLOCK: Final = 65_536  # samples of a file at once
 _UNBOUNDED: Final = ("FLOAT", "DOUBLE")  # sample formats that hold more than full scale, and NaN
 _NONE: Final = np.zeros(0, dtype=np.float32)
+_NO_SIZE: Final = 0x7FFF0000  # of a WAV file: programs that write to a pipe put 0, or this or more
+_HEAD: Final = 65_536  # bytes in which the samples of a WAV file begin
+_LOST: Final = 0.3  # of the loudest channel's energy: less left in the mean is a voice that is lost
+_OPPOSITE: Final = -0.5  # correlation with the loudest channel
+_STUDIED: Final = 48_000  # samples louder than this, in which a mix is decided
+_AUDIBLE: Final = 1e-3
+
+
+class Downmix:
+    """Mix of several channels to one: their mean, unless it loses a voice.
+
+    In a mean, a voice in one of six channels loses 15.6 dB, and one with opposite signs in two is silence. Where the
+    mean is 5 dB or more below the loudest channel, channels are added at that one's level, those of opposite sign
+    turned around. That is decided in the first second of sound, and said. `name`: of the sound, in the log.
+
+    Attributes:
+        decided: enough sound was heard.
+        line: what is logged of a mix that is not the mean; empty before, and for the mean.
+    """
+
+    def __init__(self, name: str = "sound") -> None:
+        self._name = name
+        self._weights: Doubles | None = None  # None: the mean
+        self._moments: Doubles = np.zeros((0, 0))
+        self._heard = 0
+        self.decided = False
+        self.line = ""
+
+    def __call__(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return (n,) of finite samples (n,) or (n, channels)."""
+        if samples.ndim == 1:
+            return samples
+        if not self.decided or len(self._moments) != samples.shape[1]:
+            self.study(samples)
+        mixed = samples.mean(axis=1, dtype=np.float64) if self._weights is None else samples @ self._weights
+        return mixed.astype(np.float32)
+
+    def study(self, samples: NDArray[np.float32]) -> None:
+        """Decide by these samples (n, channels) too."""
+        channels = samples.shape[1]
+        if len(self._moments) != channels:
+            self._moments, self._heard, self.decided = np.zeros((channels, channels)), 0, False
+        self._heard += int(np.count_nonzero(np.abs(samples).max(axis=1, initial=0.0) > _AUDIBLE))
+        self._moments += samples.T.astype(np.float64) @ samples
+        power = self._moments.diagonal()
+        loudest = int(np.argmax(power))
+        self._weights = None
+        if self._moments.sum() / channels**2 < _LOST * power[loudest]:
+            opposite = self._moments[loudest] < _OPPOSITE * np.sqrt(power * power[loudest])
+            signs = np.where(opposite, -1.0, 1.0)
+            together = signs @ self._moments @ signs
+            self._weights = signs * min(1.0, math.sqrt(power[loudest] / together))
+        if self._heard >= _STUDIED:
+            self.decide()
+
+    def decide(self) -> None:
+        """Keep the mix from now on, and say one that is not the mean."""
+        self.decided = True
+        if self._weights is not None:
+            turned = ", those of opposite sign turned around" if (self._weights < 0).any() else ""
+            count = len(self._weights)
+            self.line = f"{self._name}: the mean of {count} channels loses the voice: they are added{turned}"
+            logger.warning("%s", self.line)
 
 
 class Resampler:
-    """A stream from one rate to 16 kHz; its pieces, put together, equal the whole resampled at once."""
+    """A stream from one rate to 16 kHz; its pieces, put together, equal the whole resampled at once.
 
-    def __init__(self, rate_hz: float) -> None:
+    mix: of several channels to one; None: one that decides by this stream.
+    """
+
+    def __init__(self, rate_hz: float, mix: Downmix | None = None) -> None:
+        self._mix = Downmix() if mix is None else mix
         self._stream: Any = None
         if rate_hz != AUDIO_HZ:
             import soxr
@@ -40,7 +111,7 @@ class Resampler:
 
     def push(self, samples: NDArray[np.float32], last: bool = False) -> Floats:
         """Return (m,) mono, -1..1, of samples (n,) or (n, channels); some come out later, the rest with `last`."""
-        mixed = samples.mean(axis=1, dtype=np.float64).astype(np.float32) if samples.ndim > 1 else samples
+        mixed = self._mix(samples)
         if self._stream is not None:
             mixed = self._stream.resample_chunk(np.ascontiguousarray(mixed), last=last)
         clipped: Floats = np.clip(mixed, -1.0, 1.0)
@@ -48,7 +119,7 @@ class Resampler:
 
 
 class AudioFile:
-    """A sound file as mono 16 kHz, -1..1, read in pieces: channels averaged, other rates resampled.
+    """A sound file as mono 16 kHz, -1..1, read in pieces: channels mixed (`Downmix`), other rates resampled.
 
     Raises ConfigError, in one line, for a file that is missing, no sound, empty, of a rate outside 4 to 384 kHz, not
     finite or far beyond full scale. One that is cut off is used as far as it goes, and the log says so.
@@ -61,12 +132,22 @@ class AudioFile:
         self.path = Path(path)
         self._file = _open(self.path)
         self.length = int(self._file.frames * AUDIO_HZ / self._file.samplerate + 0.5)
+        self._mix = Downmix(str(path))
+        self.rewind()
+        while self._file.channels > 1 and not self._over and not self._mix.decided:
+            self._piece()
+        if not self._mix.decided:
+            self._mix.decide()
         self.rewind()
 
     def rewind(self) -> None:
         """Read from the start again."""
-        self._file.seek(0)
-        self._resampler = Resampler(self._file.samplerate)
+        if self._file.seekable():
+            self._file.seek(0)
+        else:
+            self._file.close()
+            self._file = _opened(self.path)
+        self._resampler = Resampler(self._file.samplerate, self._mix)
         self._ready = _NONE
         self._over = False
 
@@ -102,20 +183,51 @@ def read_audio(path: Path | str) -> Floats:
 
 
 def _open(path: Path) -> soundfile.SoundFile:
-    import soundfile
-
-    if not path.is_file():
-        raise ConfigError(f"{path}: " + ("is a folder, not a sound file" if path.is_dir() else "no such file"))
-    try:
-        file = soundfile.SoundFile(str(path))
-    except (soundfile.LibsndfileError, OSError, TypeError) as error:
-        raise ConfigError(f"{path}: not a sound file that can be read (WAV, FLAC, OGG, MP3, AIFF)") from error
+    file = _opened(path)
     try:
         _check(file, path)
     except BaseException:
         file.close()
         raise
     return file
+
+
+def _opened(path: Path) -> soundfile.SoundFile:
+    import soundfile
+
+    if path.is_dir() or not path.exists():
+        raise ConfigError(f"{path}: " + ("is a folder, not a sound file" if path.is_dir() else "no such file"))
+    if not path.is_file():
+        raise ConfigError(f"{path}: is a pipe or a device: sound is read from files; write it to one first")
+    try:
+        with path.open("rb") as raw:
+            head = raw.read(_HEAD)
+        place = os.fsencode(path) if os.name == "posix" else str(path)  # the library would not encode every path
+        return soundfile.SoundFile(_whole_wav(path, head) or place)
+    except (soundfile.SoundFileError, OSError, TypeError, ValueError) as error:
+        kind = archive_kind(head)
+        what = f"is an archive ({kind}): unpack it first" if kind else "not a sound file that can be read"
+        more = "" if kind else f" (WAV, FLAC, OGG, MP3, AIFF; for others: ffmpeg -i {path.name} {path.stem}.wav)"
+        raise ConfigError(f"{path}: {what}{more}") from error
+
+
+def _whole_wav(path: Path, head: bytes) -> io.BytesIO | None:
+    """Return a WAV file with its true sizes, where it was written to a pipe, which does not know them; else None."""
+    place = 12
+    while head[:4] == b"RIFF" and place + 8 <= len(head):
+        name, size = struct.unpack_from("<4sI", head, place)
+        place += 8
+        if name != b"data":
+            place += size + size % 2
+            continue
+        held = path.stat().st_size - place
+        if held <= 0 or (size and not size >= _NO_SIZE > held):
+            return None
+        data = bytearray(path.read_bytes())
+        struct.pack_into("<I", data, place - 4, held)
+        struct.pack_into("<I", data, 4, len(data) - 8)
+        return io.BytesIO(data)
+    return None
 
 
 def _check(file: soundfile.SoundFile, path: Path) -> None:
@@ -125,14 +237,20 @@ def _check(file: soundfile.SoundFile, path: Path) -> None:
     if not LOWEST_RATE_HZ <= file.samplerate <= HIGHEST_RATE_HZ:
         allowed = f"{LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ}"
         raise ConfigError(f"{path}: {file.samplerate} samples a second is not a rate of speech ({allowed})")
-    if "should be" in file.extra_info:  # libsndfile's log: a chunk is longer than what is there
+    if "(should be" in file.extra_info:  # libsndfile's log: a chunk is longer than what is there
         logger.warning("%s: is cut off, its header promises more than the %d samples there are", path, file.frames)
     for _ in range(math.ceil(file.frames / _BLOCK)) if file.subtype in _UNBOUNDED else ():
         block = file.read(_BLOCK, dtype="float32", always_2d=True)
         if not np.isfinite(block).all():
             raise ConfigError(f"{path}: holds samples that are not finite")
-        if (peak := float(np.abs(block).max(initial=0.0))) > LOUDEST:
-            raise ConfigError(f"{path}: holds samples up to {peak:g}, full scale is 1: divide them")
+        check_scale(str(path), block)
+
+
+def check_scale(name: str, samples: NDArray[Any]) -> None:
+    """Raise InputError for samples far beyond full scale: in another unit. Those that are not finite are left out."""
+    peak = float(np.abs(samples).max(initial=0.0, where=np.isfinite(samples)))
+    if peak > LOUDEST:
+        raise InputError(f"{name}: holds samples up to {peak:g}, full scale is 1: divide them (16-bit: by 32768)")
 
 
 def energy_db(samples: Floats) -> float:

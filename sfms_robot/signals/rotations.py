@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sfms_robot.frames import Doubles
 
+FROM_CAMERA: Final = [2, 0, 1]  # axes of a camera that are ours: z towards the viewer, x to the picture's right, y up
 AXIS: Final = {"roll": 0, "pitch": 1, "yaw": 2}  # the coordinate axis that each one turns about
 
 
@@ -68,6 +69,11 @@ def euler(matrix: Doubles, axes: tuple[int, int, int]) -> Doubles:
 def angles_of(matrix: Doubles) -> Doubles:
     """Return roll, pitch, yaw (..., 3) of rotations (..., 3, 3); the roll is 0 where the pitch is a quarter turn."""
     return euler(matrix, (2, 1, 0))[..., ::-1]
+
+
+def camera_angles(matrix: NDArray[np.floating]) -> Doubles:
+    """Return roll, pitch, yaw (3,) of MediaPipe's transformation matrix (4, 4), face -> camera."""
+    return angles_of(matrix[np.ix_(FROM_CAMERA, FROM_CAMERA)].astype(np.float64))
 
 
 def twist(matrix: Doubles, axis: int) -> Doubles:

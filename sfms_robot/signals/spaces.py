@@ -6,11 +6,17 @@
 matrix that maps one to the other, which no licence lets us ship. Without it pose and jaw move and nothing else.
 
 A rotation R of a space turns our head by A R A^T, where A takes the space's axes to ours (x forward, y left, z up).
+
+The last part of this file decides the names and the units of faces that come from elsewhere, for files, the API and
+the network: `channel_of`, `units_of`, `LiveUnits`, `beyond`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections import deque
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,8 +24,20 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, JAW_FULL_OPEN_RAD, MOTION_DIM, ORDERS, POSE, SHAPES, Doubles, Floats, reorder
+from sfms_robot.errors import ConfigError, InputError, did_you_mean
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    CHANNEL_INDEX,
+    CHANNELS,
+    JAW_FULL_OPEN_RAD,
+    MOTION_DIM,
+    ORDERS,
+    POSE,
+    SHAPES,
+    Doubles,
+    Floats,
+    reorder,
+)
 from sfms_robot.signals.rotations import angles_of
 from sfms_robot.signals.rotations import rotation as rotation_of
 
@@ -309,3 +327,157 @@ def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
     if not rows.any():
         raise ConfigError(f"{file}: holds nothing but zeros")
     return FlameMatrix(rows)
+
+
+# --- Names and units of faces that come from elsewhere: files, the API, Live Link, VMC, the network -------------------
+
+# Head pose: HeadYaw, yaw_deg, x_m, "pitch (deg)". A name that begins with "head" is measured from a camera.
+_POSE_NAME: Final = re.compile(
+    r"(head)?[ _]?(yaw|pitch|roll|x|y|z)(?:[ _]?[(\[]?(?<![a-z])(deg|rad|m|cm|mm)(?:rees|ians)?[)\]]?)?", re.IGNORECASE
+)
+_SEPARATORS: Final = re.compile(r"[\s_-]+")
+_SHAPE_OF: Final[Mapping[str, str]] = {
+    **{name.lower(): name for name in BLENDSHAPES},
+    **{name.lower().removesuffix("eft").removesuffix("ight"): name for name in BLENDSHAPES},  # ..._L, ..._R
+}
+_MOST_NAMED: Final = 8
+
+_ANGLES: Final = slice(0, 3)
+_MOST_TURN_RAD: Final = 2.0  # further than a head turns; the same number of degrees is a small movement
+_FASTEST_RAD_S: Final = 4.0  # on average; a head that is shaken fast reaches 3
+_RARE: Final = 0.05  # share of rows that a tracker may get wrong
+_DECIDED_S: Final = 1.0
+_WINDOW: Final = 256  # rows kept of the last second
+_SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped
+
+
+@lru_cache(maxsize=1024)
+def channel_of(name: str) -> str | None:
+    """Return the channel of `frames.CHANNELS` that a tracker's name stands for, or None.
+
+    Any case; `Left`, `_L` and `L` are the same; what stands before a dot or a colon (`BlendShape.`) is left out. Head
+    pose goes as `HeadYaw`, `yaw`, `yaw_deg`: `pose_of` returns its unit.
+    """
+    pose = pose_of(name)
+    return pose[0] if pose else _SHAPE_OF.get(_SEPARATORS.sub("", re.split("[.:]", name)[-1]).lower())
+
+
+def pose_of(name: str) -> tuple[str, str, bool] | None:
+    """Return channel, unit ("" where the name has none) and whether a camera is the origin, of a head pose's name."""
+    match = _POSE_NAME.fullmatch(name.strip())
+    return (match[2].lower(), (match[3] or "").lower(), bool(match[1])) if match else None
+
+
+def motion_of(channels: Mapping[str, float], what: str = "face") -> Floats:
+    """Return motion (58,) of some channels by any of their names, 0 elsewhere. Raises InputError for unknown names."""
+    motion = np.zeros(MOTION_DIM, dtype=np.float32)
+    for name, value in channels.items():
+        if (channel := channel_of(name)) is None:
+            raise InputError(
+                f"{what}: {name!r} is not a channel{did_you_mean(name, CHANNELS)} (valid: {', '.join(CHANNELS)})"
+            )
+        motion[CHANNEL_INDEX[channel]] = value
+    return motion
+
+
+def used_line(used: Collection[str], unknown: Collection[str]) -> str:
+    """Return how much of a face is used, in one line: "31 of 52 channels used; not known: a, b, c"."""
+    shapes = sum(name in BLENDSHAPES for name in used)
+    names = sorted(unknown)
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    listed = f"; not known: {', '.join(names[:_MOST_NAMED])}{more}" if names else ""
+    return f"{shapes} of {len(BLENDSHAPES)} channels used{listed}"
+
+
+@dataclass(frozen=True)
+class FaceUnits:
+    """Factors that turn a face's angles to radians and its blendshapes to 0..1."""
+
+    angle: float = 1.0
+    shape: float = 1.0
+
+    @property
+    def line(self) -> str:
+        """One line about units that are not ours; "" for radians and 0..1."""
+        degrees = "angles are taken as degrees" if self.angle != 1.0 else ""
+        percent = "blendshapes are taken as percent" if self.shape != 1.0 else ""
+        return " and ".join(filter(None, (degrees, percent)))
+
+    def ours(self, motion: Floats | Doubles) -> Floats:
+        """Return motion (..., 58) in radians and 0..1; a copy."""
+        out = np.array(motion, dtype=np.float32)
+        out[..., _ANGLES] *= self.angle
+        out[..., SHAPES] *= self.shape
+        return out
+
+
+def units_of(motion: Floats | Doubles, times_s: Doubles) -> FaceUnits:
+    """Decide the units of a face (N, 58) over all its rows, by what a head can do; rows of NaN are left out.
+
+    Angles are degrees where more than one row in twenty is beyond 2 rad, or where they change by more than 4 rad/s on
+    average. Blendshapes are percent where more than one row in twenty is beyond 2.
+    """
+    seen = np.isfinite(motion).all(axis=1)
+    rows, at_s = np.asarray(motion, dtype=np.float64)[seen], np.asarray(times_s)[seen]
+    if not len(rows):
+        return FaceUnits()
+    angles = np.abs(rows[:, _ANGLES])
+    lasted_s = float(at_s[-1] - at_s[0])
+    path = np.abs(np.diff(rows[:, _ANGLES], axis=0)).sum(axis=0).max(initial=0.0)
+    degrees = np.mean(angles.max(axis=1) > _MOST_TURN_RAD) > _RARE or path > _FASTEST_RAD_S * max(lasted_s, 0.25)
+    percent = np.mean(rows[:, SHAPES].max(axis=1) > _SHAPE_RANGE[1]) > _RARE
+    return FaceUnits(math.pi / 180 if degrees else 1.0, 0.01 if percent else 1.0)
+
+
+def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | None:
+    """Return what is wrong with a face (58,) in our units: one line that names the channel, or None.
+
+    turn_rad: the largest angle.
+    """
+    low = np.array([-turn_rad] * 3 + [-10.0] * 3 + [_SHAPE_RANGE[0]] * len(BLENDSHAPES))
+    high = np.array([turn_rad] * 3 + [10.0] * 3 + [_SHAPE_RANGE[1]] * len(BLENDSHAPES))
+    inside = (motion >= low) & (motion <= high)  # NaN is in no range
+    if inside.all():
+        return None
+    place = int(np.argmin(inside))
+    value, name = float(motion[place]), CHANNELS[place]
+    if not math.isfinite(value):
+        return f"{name} is not finite"
+    expected = ("radians (in degrees?)", "metres (in cm or mm?)", "0 to 1 (in percent?)")[(place > 2) + (place > 5)]
+    return f"{name}: expected {expected}, got {value:g}"
+
+
+class LiveUnits:
+    """Units of a live face, decided over its first second, and again when they turn out to be others.
+
+    angles: False where the angles are known to be radians.
+
+    Attributes:
+        units: as decided so far.
+    """
+
+    def __init__(self, angles: bool = True) -> None:
+        self._angles = angles
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again: another sender."""
+        self.units = FaceUnits()
+        self._rows: deque[tuple[float, Floats]] = deque(maxlen=_WINDOW)
+        self._began_s: float | None = None
+
+    def take(self, motion: Floats, time_s: float) -> Floats | None:
+        """Return a face (58,) in our units; None within the first second, and for one beyond what a head can do."""
+        self._began_s = time_s if self._began_s is None else self._began_s
+        self._rows.append((time_s, motion))
+        while self._rows[0][0] < time_s - _DECIDED_S:
+            self._rows.popleft()
+        waits = time_s - self._began_s < _DECIDED_S
+        ours = self.units.ours(motion)
+        if waits or beyond(ours) is not None:
+            found = units_of(np.stack([row for _, row in self._rows]), np.array([at_s for at_s, _ in self._rows]))
+            self.units = FaceUnits(
+                min(self.units.angle, found.angle) if self._angles else 1.0, min(self.units.shape, found.shape)
+            )
+            ours = self.units.ours(motion)
+        return None if waits or beyond(ours, _MOST_TURN_RAD if self._angles else 2 * math.pi) else ours

@@ -1,8 +1,8 @@
-"""Face-track files: CSV (also gzipped), read as motion in our units and axes.
+"""Face-track files: CSV (also gzipped), JSON and OpenFace's, read as motion in our units and axes.
 
-Columns go by name, in any case, so the column order of the Live Link app, of its UDP packet, of Apple's header and of
-MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without one
-they are radians and metres. Axes of other sources are turned into ours.
+Columns go by name (`spaces.channel_of`), so the column order of the Live Link app, of its UDP packet, of Apple's header
+and of MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without
+one angles are radians or degrees by what a head can do, and places metres. Axes of other sources are turned into ours.
 
 A row of NaN means: no face was seen.
 """
@@ -15,16 +15,15 @@ import io
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
-    BLENDSHAPES,
     BLINKS,
     CHANNEL_INDEX,
     CHANNELS,
@@ -34,6 +33,16 @@ from sfms_robot.frames import (
     Doubles,
     Floats,
 )
+from sfms_robot.signals.face_tables import (
+    csv_cells,
+    csv_numbers,
+    from_openface,
+    is_counted,
+    is_openface,
+    row_times,
+    time_column,
+)
+from sfms_robot.signals.spaces import channel_of, pose_of, units_of, used_line
 
 logger = logging.getLogger(__name__)
 
@@ -46,19 +55,9 @@ logger = logging.getLogger(__name__)
 _FROM_CAMERA: Final = {"z": "x", "x": "y", "y": "z"}  # its axis -> ours
 
 _UNITS: Final = {"deg": math.pi / 180, "rad": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
-_POSE_COLUMN: Final = re.compile(r"(head)?_?(yaw|pitch|roll|x|y|z)(?:_(deg|rad|m|cm|mm))?")
-_TIME_COLUMNS: Final = {
-    "timecode": 0.0,
-    "t_s": 1.0,
-    "time_s": 1.0,
-    "time": 1.0,
-    "t": 1.0,
-    "t_ms": 1e-3,
-    "time_ms": 1e-3,
-}
-_SHAPE_BY_KEY: Final = {name.lower(): name for name in BLENDSHAPES}
+# Rotations of the eyes, which blendshapes have too, and counts beside them.
+_NOT_NEEDED: Final = re.compile(r"(left|right)eye(yaw|pitch|roll)|blendshapecount|_neutral|subject", re.IGNORECASE)
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
-_USUAL_STEP_S: Final = (1e-3, 2.0)  # beyond these a time column is in another unit
 _ANGLES: Final = ("roll", "pitch", "yaw")
 _PLACE: Final = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
 # Lowest and highest value, and the problem of one beyond: most likely it is in another unit.
@@ -70,6 +69,17 @@ _RANGES: Final[Mapping[str, tuple[float, float, str]]] = {
 }
 _SHAPE_RANGE: Final = (-0.5, 2.0, "is not a blendshape (0 to 1)")  # a tracker may overshoot 0..1, and is clipped
 _TIME_EPS_S: Final = 1e-6
+
+
+class _Column(NamedTuple):
+    """A column of the file. `factor` to our unit; NaN for an angle whose name has no unit."""
+
+    place: int
+    factor: float
+
+
+_Columns = Mapping[str, _Column]
+_Rows = Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -95,37 +105,35 @@ class Track:
 def read_track(path: Path | str) -> Track:
     """Read a face track; its axes are recognised by the header.
 
-    Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, cells
-    divided by something else than commas, values or times that are in another unit.
+    Raises ConfigError, in one line with file, row and column, for a file that cannot be used: ragged rows, values
+    or times that are in another unit.
     """
     file = Path(path)
     header, rows = csv_cells(file)
-    if len(header) == 1 and (other := next((mark for mark in (";", "\t") if mark in header[0]), None)):
-        raise ConfigError(f"{file}: its cells are divided by {other!r}, a comma is needed")
-    from_camera = any(match and match[1] for match in map(_POSE_COLUMN.fullmatch, map(str.lower, header)))
-    columns = _columns(file, header, _FROM_CAMERA if from_camera else {})
-    time_column = next((index for index, name in enumerate(header) if name.lower() in _TIME_COLUMNS), None)
-    if time_column is None:
-        raise ConfigError(f"{file}: no column tells the time (Timecode, t_s, time_s, t_ms, time_ms)")
-    rows = _even(file, header, rows, time_column)
+    time_at = time_column(file, header)
+    rows = _even(file, header, rows, time_at)
+    if is_openface(header):
+        header, rows = from_openface(file, header, rows)
+        time_at = 0
+    columns, from_camera = _columns(file, header)
+    times_s = row_times(file, header[time_at], [row[time_at].strip() for row in rows])
+    once = np.diff(times_s, prepend=-np.inf) > 0
+    if not once.all():
+        logger.warning("%s: rows with the time of the row before are left out: %d", file, (~once).sum())
 
     motion = np.zeros((len(rows), MOTION_DIM))
-    for channel, (index, factor) in columns.items():
-        cells = [row[index].strip() for row in rows]
+    for channel, column in columns.items():
+        cells = [row[column.place].strip() for row in rows]
         lost = [cell == "" or cell.lower() == "nan" for cell in cells]
-        values = factor * np.where(lost, np.nan, csv_numbers(file, header[index], np.where(lost, "0", cells)))
-        low, high, problem = _RANGES.get(channel, _SHAPE_RANGE)
-        outside = np.flatnonzero((values < low) | (values > high))
-        if len(outside):
-            row = int(outside[0])
-            raise ConfigError(f"{file}: row {row + 2}, column {header[index]} = {cells[row]} {problem}")
-        motion[:, CHANNEL_INDEX[channel]] = values
+        values = np.where(lost, np.nan, csv_numbers(file, header[column.place], np.where(lost, "0", cells)))
+        motion[:, CHANNEL_INDEX[channel]] = values if math.isnan(column.factor) else column.factor * values
     motion[np.isnan(motion).any(axis=1)] = np.nan
+    motion = _in_our_units(file, motion, times_s, columns)
+    _check_ranges(file, header, rows, motion, columns)
     if from_camera and np.isfinite(motion[:, 0]).any():
         motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
     motion[:, SHAPES] = np.clip(motion[:, SHAPES], 0.0, 1.0)
-    times_s = _times(file, header[time_column], [row[time_column].strip() for row in rows])
-    return Track(times_s, motion.astype(np.float32), frozenset(columns))
+    return Track(times_s[once], motion[once].astype(np.float32), frozenset(columns))
 
 
 def write_track(path: Path | str, track: Track) -> None:
@@ -177,30 +185,14 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
 # --- the parts of reading ---------------------------------------------------------------------------------------
 
 
-def csv_cells(file: Path) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows that are not empty, of a CSV file that may be gzipped. Raises ConfigError."""
-    try:
-        data = file.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-        rows = [row for row in csv.reader(io.StringIO(data.decode("utf-8-sig"))) if row]
-    except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file") from None
-    except (OSError, EOFError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
-    if len(rows) < 2:
-        raise ConfigError(f"{file}: holds no rows: " + ("only a header" if rows else "the file is empty"))
-    return [cell.strip() for cell in rows[0]], rows[1:]
-
-
-def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column: int) -> list[list[str]]:
+def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_at: int) -> list[list[str]]:
     """Return rows as long as the header; an incomplete last row is left out.
 
     A row that ends with its time, or with a count of 0 after it, has lost the face: Live Link writes such rows.
     """
-    lost = [""] * (len(header) - time_column - 1)
-    ends = time_column + 1
-    rows = [[*row[:ends], *lost] if len(row) == ends or row[ends:] == ["0"] else row for row in rows]
+    lost = [""] * (len(header) - time_at - 1)
+    ends = time_at + 1
+    rows = [[*row[:ends], *lost] if len(row) < len(header) and row[ends:] in ([], ["0"]) else row for row in rows]
     if len(rows) > 1 and len(rows[-1]) < len(header):
         logger.warning("%s: its last row is cut off and left out", file)
         rows = rows[:-1]
@@ -210,76 +202,61 @@ def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_column:
     return rows
 
 
-def _columns(file: Path, header: Sequence[str], moved: Mapping[str, str]) -> dict[str, tuple[int, float]]:
-    """Return the column of each of our channels in the file, and its factor to our unit."""
-    columns: dict[str, tuple[int, float]] = {}
+def _columns(file: Path, header: Sequence[str]) -> tuple[dict[str, _Column], bool]:
+    """Return the column of each of our channels in the file, and whether its pose is measured from a camera.
+
+    Columns that are not used are named in the log.
+    """
+    poses = {name: pose for name in header if (pose := pose_of(name)) is not None}
+    from_camera = any(camera for _, _, camera in poses.values())
+    moved = _FROM_CAMERA if from_camera else {}
+    columns: dict[str, _Column] = {}
+    unknown = []
     for index, name in enumerate(header):
-        channel, factor = _SHAPE_BY_KEY.get(name.lower()), 1.0
+        channel, factor = channel_of(name), 1.0
         if channel is None:
-            match = _POSE_COLUMN.fullmatch(name.lower())
-            if match is None:
-                continue
-            axis, unit = match[2], match[3] or "rad"
-            if match[3] and (axis in _ANGLES) != (unit in ("deg", "rad")):
+            if not is_counted(name) and not _NOT_NEEDED.fullmatch(name):
+                unknown.append(name)
+            continue
+        if name in poses:
+            axis, unit, _ = poses[name]
+            if unit and (axis in _ANGLES) != (unit in ("deg", "rad")):
                 choices = ("_deg, _rad for angles, _m, _cm, _mm for positions",)
                 raise ConfigError.at(file, "column", name, "has a unit that does not fit", choices)
-            channel, factor = moved.get(axis, axis), _UNITS[unit]
+            channel, factor = moved.get(axis, axis), _UNITS.get(unit, math.nan if axis in _ANGLES else 1.0)
         if channel in columns:
             raise ConfigError.at(file, "column", name, f"gives {channel} a second time")
-        columns[channel] = (index, factor)
+        columns[channel] = _Column(index, factor)
     if not columns:
         names = "ARKit names such as eyeBlinkLeft, jawOpen; head pose such as headYaw_deg, pitch_rad, x_m"
         raise ConfigError(f"{file}: no column is a face channel ({names})")
-    return columns
+    if unknown:
+        logger.warning("%s: %s", file, used_line(columns, unknown))
+    return columns, from_camera
 
 
-def csv_numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
-    """Return the numbers of a column, one row after the other from row 2 on. Raises ConfigError for another cell."""
-    numbers = []
-    for row, cell in enumerate(cells, 2):
-        try:
-            number = float(cell)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            raise ConfigError(f"{file}: row {row}, column {column} = {str(cell)!r} is not a number")
-        numbers.append(number)
-    return np.array(numbers)
+def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: _Columns) -> Doubles:
+    """Return motion (N, 58) in radians and 0..1: units that no name declares are decided over all rows."""
+    open_angles = [CHANNEL_INDEX[name] for name in _ANGLES if name in columns and math.isnan(columns[name].factor)]
+    undecided = motion.copy()
+    undecided[:, [CHANNEL_INDEX[name] for name in _ANGLES if CHANNEL_INDEX[name] not in open_angles]] *= 0.0
+    units = units_of(undecided, times_s)
+    motion[:, open_angles] *= units.angle
+    motion[:, SHAPES] *= units.shape
+    if units.line:
+        logger.warning("%s: %s, by what a head can do (names with a unit: headYaw_deg, yaw_rad)", file, units.line)
+    return motion
 
 
-def _times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """Return seconds (N,): as written, or from the first row for a time of day and for a clock that began long ago."""
-    factor = _TIME_COLUMNS[name.lower()]
-    times_s = factor * csv_numbers(file, name, cells) if factor else _timecodes(file, name, cells)
-    steps_s = np.diff(times_s)
-    backwards = np.flatnonzero(steps_s <= 0)
-    if len(backwards):
-        row = int(backwards[0]) + 1
-        problem = f"is not later than the row before ({cells[row - 1]!r})"
-        raise ConfigError(f"{file}: row {row + 2}, column {name} = {cells[row]!r} {problem}")
-    if len(steps_s) and not _USUAL_STEP_S[0] <= (usual_s := float(np.median(steps_s))) <= _USUAL_STEP_S[1]:
-        unit = "milliseconds: call it t_ms" if usual_s > 1 else "seconds: call it t_s"
-        raise ConfigError(f"{file}: column {name}: its rows are {usual_s:g} s apart; are they {unit}?")
-    return times_s - times_s[0] if not factor or times_s[0] > 1e6 else times_s
-
-
-def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """Return seconds (N,) of HH:MM:SS:FF.fff. FF counts 60 a second in the Live Link app for any rate of the rows.
-
-    Other writers count 24, 25 or 30, which the file shows: a take that holds one whole second has nearly all counts.
-    """
-    fields = [cell.split(":") for cell in cells]
-    for row, each in enumerate(fields, 2):
-        if len(each) != 4:
-            raise ConfigError(f"{file}: row {row}, column {name} = {':'.join(each)!r} is not HH:MM:SS:FF.fff")
-    hours, minutes, seconds, frames = (csv_numbers(file, name, column) for column in zip(*fields, strict=True))
-    whole_s = 3600.0 * hours + 60.0 * minutes + seconds
-    whole_s += 86_400.0 * np.cumsum(np.diff(whole_s, prepend=whole_s[0]) < -43_200)  # a take across midnight
-    counts = 60
-    if whole_s[-1] - whole_s[0] >= 2 and frames.max() < 30:
-        counts = next(base for base in (24, 25, 30) if frames.max() < base)
-    times_s: Doubles = whole_s + frames / counts
-    return times_s
+def _check_ranges(file: Path, header: Sequence[str], rows: _Rows, motion: Doubles, columns: _Columns) -> None:
+    """Raise ConfigError for a value beyond its range, with row and column."""
+    for channel, column in columns.items():
+        low, high, problem = _RANGES.get(channel, _SHAPE_RANGE)
+        values = motion[:, CHANNEL_INDEX[channel]]
+        outside = np.flatnonzero((values < low) | (values > high))
+        if len(outside):
+            row, place = int(outside[0]), column.place
+            raise ConfigError(f"{file}: row {row + 2}, column {header[place]} = {rows[row][place].strip()} {problem}")
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, address_text, host_and_port, is_address, is_loopback
-from sfms_robot.errors import ConfigError, PacketError, PortError
+from sfms_robot.errors import NOTE, ConfigError, PacketError, PortError
 from sfms_robot.frames import (
     BLENDSHAPES,
     CHANNEL_INDEX,
@@ -37,6 +37,7 @@ from sfms_robot.frames import (
     Sighting,
 )
 from sfms_robot.signals.rotations import angles_of, rotation
+from sfms_robot.signals.spaces import LiveUnits, beyond
 from sfms_robot.sources.live_voice import SourcePart
 
 logger = logging.getLogger(__name__)
@@ -57,10 +58,20 @@ PACKETS_PER_CALL: Final = 64
 LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
 LOST_S: Final = 0.5  # five packets of one that sends ten a second
-SILENT_S: Final = 2.0  # after so long another sender may take over
+SILENT_S: Final = 2.0  # after so long another sender may take over, and what is left out of a new one is logged
+USUAL_PORTS: Final = {"vmc": 39539, "live-link": 11111}  # what the protocol, and the app, suggest
 ANY: Final = ("0.0.0.0", "::")  # every address of this machine
 UNHEARD_S: Final = 5.0  # into a run without a sender, what to type there is logged
-_REASONS_SAID: Final = 4
+_REASONS_SAID: Final = 6
+# Packets of other programs, and what to do about them.
+_FOREIGN: Final = (
+    (rb"/(W|HT|HRQ?|ELR|ERR)\0", "Face Cap in live mode, which has no VMC: use Live Link Face and --face live-link"),
+    (rb"/avatar/parameters/", "VRCFaceTracking for VRChat, which is not VMC: let VRCFTtoVMCP turn it into VMC"),
+    (rb"[A-Za-z_]+[-&]\d+\|", "iFacialMocap's own format: in its desktop app, switch on sending of VMC Protocol"),
+    (rb"(#bundle\0.{12})?/VMC/", "VMC: --face vmc takes it"),
+    (rb"\x06\0\0\0.\$?[\w-]{4}", "Live Link Face: --face live-link takes it"),
+    (rb"\s*\{", "JSON, which is not read here: choose Live Link Face or VMC in the app that sends it"),
+)
 
 # Linux says when a datagram came in, to the nanosecond of the wall clock; Python has no name for the option.
 _SO_TIMESTAMPNS: Final = 35
@@ -261,16 +272,37 @@ def _age_s(extra: list[tuple[int, int, bytes]], wall_s: float) -> float:
     return 0.0
 
 
-class Decoder(Protocol):
-    """Reads the packets of one sender."""
+def foreign(data: bytes) -> str | None:
+    """Return the program that sends such a packet, and what to change there; None: not known."""
+    return next((text for pattern, text in _FOREIGN if re.match(pattern, data, re.DOTALL)), None)
+
+
+class Decoder:
+    """Reader of the packets of one sender.
+
+    Attributes:
+        blind: the sender says that it sees no face.
+    """
+
+    blind = False
 
     def restart(self) -> None:
         """Forget the last sender: another one begins."""
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
-        """Return motion (58,) of a packet; None: it has no new face. Raises PacketError for other packets."""
+        """Return motion (58,) of a packet, in the sender's units; None: it has no new face. Raises PacketError."""
+        raise NotImplementedError
 
-    def statistics(self) -> Mapping[str, Any]: ...
+    def due(self, time_s: float) -> Floats | None:
+        """Return motion (58,) that is complete by now, although no packet said so."""
+        return None
+
+    def remark(self) -> str | None:
+        """Return what is not used of this sender, in one line."""
+        return None
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {}
 
 
 class UdpSight(LiveFace):
@@ -281,20 +313,27 @@ class UdpSight(LiveFace):
     Args:
         hint: returns what a person has to do so that packets come, for the bound host and port, and for the flag that
             would also take packets of other machines ("" where this one does).
+        units: decide the units of each sender over its first second, which shows no face; None: they are ours.
 
     Attributes:
         address: host and port that are bound.
-        lost: the sender is silent.
+        lost: no face, and no word that there is none, for half a second.
 
     Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
     """
 
     def __init__(
-        self, kind: str, argument: str, usual_port: int, decoder: Decoder, hint: Callable[[str, int, str], str]
+        self,
+        kind: str,
+        argument: str,
+        usual_port: int,
+        decoder: Decoder,
+        hint: Callable[[str, int, str], str],
+        units: LiveUnits | None = None,
     ) -> None:
         place, signs = parse_face_argument(kind, argument)
         super().__init__(signs)
-        self._kind, self._decoder = kind, decoder
+        self._kind, self._decoder, self._units = kind, decoder, units
         self._socket = _bound(kind, *parse_endpoint(kind, place, usual_port))
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self._stamped = sys.platform == "linux" and _ask_for_stamps(self._socket)
@@ -302,17 +341,23 @@ class UdpSight(LiveFace):
         wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
         self._hint: str | None = hint(host, port, wider if is_loopback(host) else "")
         self._sender: Address | None = None
-        self._heard_s = -math.inf
+        self._before: Address | None = None  # the sender's last port, where it has changed
+        self._other: Address | None = None  # a second program of the sender's machine
+        self._heard_s = self._result_s = -math.inf
+        self._remark_s = math.inf  # when what is left out of this sender is logged
         self._said: set[str] = set()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused", "errors"), 0)
-        logger.warning("%s: %s", kind, self._hint)
+        logger.log(NOTE, "%s: %s", kind, self._hint)
 
     def at(self, time_s: float) -> Sighting | None:
         for packet in self._packets():
             self.feed(packet)
-        self.lost = self._sender is not None and self._origin_s + time_s - self._heard_s > LOST_S
-        if self._hint is not None and time_s > UNHEARD_S:
+        now_s = self._origin_s + time_s
+        if self._sender is not None and (motion := self._decoder.due(now_s)) is not None:
+            self._show(motion, self._heard_s)
+        self.lost = self._sender is not None and now_s - self._result_s > LOST_S
+        if self._hint is not None and time_s > UNHEARD_S and not self._counts["packets"]:
             logger.warning("%s: no packets yet: %s", self._kind, self._hint)
             self._hint = None
         return super().at(time_s)
@@ -320,28 +365,33 @@ class UdpSight(LiveFace):
     def feed(self, packet: Datagram) -> None:
         """Take one packet, of any sender. Never raises."""
         self._counts["packets"] += 1
+        known = self._is_sender(packet.sender)
         # Stamps come from a clock that may be set: time goes forward here.
-        time_s = max(packet.time_s, self._heard_s) if packet.sender == self._sender else packet.time_s
-        if packet.sender != self._sender:
+        time_s = max(packet.time_s, self._heard_s) if known else packet.time_s
+        if not known:
             if time_s - self._heard_s < SILENT_S:
                 self._refuse(packet.sender)
                 return
-            self._sender = None
+            self._sender = self._before = self._other = None
             self._decoder.restart()
         try:
             motion = self._decoder.decode(packet.data, time_s)
         except PacketError as error:
-            self._counts["malformed"] += 1
-            self._say(str(error), packet.sender)
+            self._leave_out(str(error), packet.sender)
             return
         if self._sender is None:
             logger.info("%s: packets come from %s", self._kind, address_text(*packet.sender[:2]))
             self._refusal_said = False
+            self._result_s, self._remark_s = time_s, time_s + SILENT_S
+            if self._units is not None:
+                self._units.restart()
             self.forget()
         self._sender, self._heard_s, self._hint = packet.sender, time_s, None
         if motion is not None:
-            self._counts["faces"] += 1
-            self.put(time_s, motion)
+            self._show(motion, time_s)
+        elif self._decoder.blind:
+            self._result_s = time_s
+        self._remark(time_s)
 
     def statistics(self) -> dict[str, Any]:
         """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
@@ -372,6 +422,46 @@ class UdpSight(LiveFace):
             if time.monotonic() - now_s > LONGEST_CALL_S:
                 return
 
+    def _is_sender(self, sender: Address) -> bool:
+        """Return whether this is the sender in use, by its host: some open a new port for each packet.
+
+        A port that comes back after another one is one of two programs; the first is used.
+        """
+        if self._sender is None or sender[0] != self._sender[0] or sender == self._other:
+            return False
+        if sender != self._sender:
+            self._other = self._sender if sender == self._before else None
+            self._before, self._sender = self._sender, sender
+        return True
+
+    def _show(self, motion: Floats, time_s: float) -> None:
+        """Show a face (58,) in the sender's units, once these are known."""
+        ours: Floats | None = motion
+        if self._units is not None:
+            ours, units = self._units.take(motion, time_s), self._units.units
+            if ours is None and (wrong := beyond(units.ours(motion))) is not None:
+                self._leave_out(wrong, self._sender)
+                return
+            if units.line:
+                self._say("%s: in packets of %s %s (said once)", units.line)
+        self._result_s = time_s
+        if ours is not None:
+            self._counts["faces"] += 1
+            ours[SHAPES] = np.clip(ours[SHAPES], 0.0, 1.0)
+            self.put(time_s, ours)
+
+    def _remark(self, time_s: float) -> None:
+        """Log what is not used of this sender, some seconds after its first packet."""
+        if time_s < self._remark_s:
+            return
+        self._remark_s = math.inf
+        if (remark := self._decoder.remark()) is not None:
+            self._say("%s: of packets of %s: %s (said once)", remark)
+        elif time_s - self._result_s > UNHEARD_S:
+            self._say("%s: packets come from %s, but no face: %s (said once)", "they repeat one frame")
+        else:
+            self._remark_s = time_s + UNHEARD_S
+
     def _refuse(self, sender: Address) -> None:
         self._counts["refused"] += 1
         if not self._refusal_said and self._sender is not None:
@@ -380,33 +470,17 @@ class UdpSight(LiveFace):
             logger.warning(text, self._kind, address_text(*sender[:2]), first, SILENT_S)
             self._refusal_said = True
 
-    def _say(self, reason: str, sender: Address) -> None:
-        if reason not in self._said and len(self._said) < _REASONS_SAID:
-            logger.warning(
-                "%s: packets of %s are left out: %s (said once)", self._kind, address_text(*sender[:2]), reason
-            )
-            self._said.add(reason)
+    def _leave_out(self, reason: str, sender: Address | None) -> None:
+        self._counts["malformed"] += 1
+        self._say("%s: packets of %s are left out: %s (said once)", reason, sender)
 
-
-def addresses_of_this_machine() -> list[str]:
-    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
-    if sys.platform != "linux":
-        try:
-            found = socket.gethostbyname_ex(socket.gethostname())[2]
-        except OSError:
-            return []
-        return [address for address in found if not address.startswith("127.")]
-    import fcntl
-
-    addresses = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            try:
-                answer = fcntl.ioctl(asked, 0x8915, struct.pack("256s", name.encode()[:15]))  # SIOCGIFADDR
-            except OSError:  # an interface without an address
-                continue
-            addresses.append(socket.inet_ntoa(answer[20:24]))
-    return [address for address in addresses if not address.startswith("127.")]
+    def _say(self, text: str, reason: str, sender: Address | None = None) -> None:
+        """Log `text` with its reason, a few reasons at most, each once."""
+        key = re.sub(r"got .*", "", reason)
+        if key not in self._said and len(self._said) < _REASONS_SAID:
+            at = address_text(*(sender or self._sender or ("?", 0))[:2])
+            logger.warning(text, self._kind, at, reason)
+            self._said.add(key)
 
 
 def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:

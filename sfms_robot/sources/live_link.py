@@ -2,42 +2,43 @@
 
 One packet a frame, big-endian:
 
-    uint8   version, 6
+    uint8   version, 6; another one is read where the rest is as here
     int32   length n, then n bytes: device id          (n < 0: -n characters of UTF-16)
-    int32   length n, then n bytes: subject name
+    int32   length n, then n bytes: subject name; some senders count characters, not bytes
     int32   frame number, counted from midnight; float32 part of a frame
-    int32   frame rate: numerator, denominator
-    uint8   number of values: 61, or 0 while no face is seen
+    int32   frame rate: numerator, denominator; 30/0 and the like of senders below 60 a second are 30
+    uint8   number of values: 61, or 0 while no face is seen; 52 have no head, of more than 61 the first are read
     float32 52 blendshapes in the order "live_link_udp"; head yaw, pitch, roll; yaw, pitch, roll of each eye [rad]
 
-The head's angles turn as ours do, which is not proved (`signals.tracks`).
+The head's angles turn as ours do, which is not proved (`signals.tracks`). Some senders write them in degrees, which is
+decided over the first second (`signals.spaces`). Only what a face needs is judged: 52 blendshapes, three angles.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
-from sfms_robot.frames import CHANNELS, ORDERS, SHAPES, Floats
-from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
+from sfms_robot.frames import CHANNELS, ORDERS, Floats
+from sfms_robot.signals.spaces import LiveUnits
+from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
 
-PORT: Final = 11111  # what the app suggests
+PORT: Final = USUAL_PORTS["live-link"]
 VERSION: Final = 6
 LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began again
 
 _LENGTH: Final = struct.Struct(">i")
 _FRAME: Final = struct.Struct(">ifiiB")
 _LONGEST_NAME: Final = 512  # bytes
-_COUNT: Final = 61
+_USUAL_HZ: Final = 60.0
 _SHAPES: Final = ORDERS["live_link_udp"]
 _VALUES: Final = (*_SHAPES, "yaw", "pitch", "roll", *(f"eye{i}" for i in range(6)))
-# A tracker may overshoot 0..1, and is clipped; another unit is refused.
-_LOWEST: Final = np.array([-0.5] * 52 + [-2 * np.pi] * 9, dtype=np.float32)
-_HIGHEST: Final = np.array([2.0] * 52 + [2 * np.pi] * 9, dtype=np.float32)
+_NEEDED: Final = _VALUES.index("eye0")
 # Of each of our channels: where it stands in a packet, and its factor; a packet has no position.
 _COLUMNS: Final = np.array([_VALUES.index(name) if name in _VALUES else 0 for name in CHANNELS])
 _FACTORS: Final = np.array([1, 1, 1, 0, 0, 0, *[1] * 52], dtype=np.float32)
@@ -48,58 +49,85 @@ class LiveLinkPacket(NamedTuple):
 
     Attributes:
         number: of the frame; what it counts is frames of `rate_hz` since midnight, or anything.
-        values: (61,) as the phone sent them, or None: no face is seen.
+        values: (61,) as the phone sent them, 0 for those that are missing, or None: no face is seen.
+        sent: number of values in the packet.
     """
 
     subject: str
     number: int
     rate_hz: float
     values: Floats | None
+    sent: int
 
 
 def parse_packet(data: bytes) -> LiveLinkPacket:
-    """Return a whole packet of version 6 with finite values. Raises PacketError, in one line, for any other."""
+    """Return a packet that has what a face needs. Raises PacketError, in one line, for any other."""
     if not data:
         raise PacketError("an empty packet")
-    if data[0] != VERSION:
-        raise PacketError(_other_version(data))
-    _, start = _name(data, 1)  # the device's id
-    subject, start = _name(data, start)
-    if len(data) < start + _FRAME.size:
+    try:
+        return _packet(data)
+    except PacketError as error:
+        raise PacketError(_other_format(data) or str(error)) from None
+
+
+def _packet(data: bytes) -> LiveLinkPacket:
+    start = _end_of_name(data, 1)  # the device's id
+    end = _end_of_name(data, start)
+    end = next((each for each in _ends(data, start) if _fits(data, each)), end)
+    if len(data) < end + _FRAME.size:
         raise PacketError("a packet that is cut off")
-    number, _, numerator, denominator, count = _FRAME.unpack_from(data, start)
-    if count not in (0, _COUNT):
-        raise PacketError(f"a packet of another number of values than {_COUNT}")
-    if len(data) != start + _FRAME.size + 4 * count:
-        raise PacketError("a packet that is cut off, or too long")
-    if numerator <= 0 or denominator <= 0:
-        raise PacketError(f"frame rate: expected positive numbers, got {numerator}/{denominator}")
-    values = None if count == 0 else _values(data, start + _FRAME.size)
-    return LiveLinkPacket(subject, number, numerator / denominator, values)
+    number, _, numerator, denominator, count = _FRAME.unpack_from(data, end)
+    if 0 < count < len(_SHAPES):
+        raise PacketError(f"{count} values, of which the first {len(_SHAPES)} have to be blendshapes")
+    if len(data) < end + _FRAME.size + 4 * count:
+        raise PacketError("a packet that is cut off")
+    rate_hz = numerator / max(denominator, 1) if numerator > 0 else _USUAL_HZ
+    values = None if count == 0 else _values(data, end + _FRAME.size, count)
+    return LiveLinkPacket(_text(data, start, end), number, rate_hz, values, count)
 
 
-def _values(data: bytes, start: int) -> Floats:
-    values = np.frombuffer(data, dtype=">f4", count=_COUNT, offset=start).astype(np.float32)
-    if not ((values >= _LOWEST) & (values <= _HIGHEST)).all():  # NaN fails both
-        raise PacketError("values that are not finite, not within 0..1 or not in radians")
+def _values(data: bytes, start: int, count: int) -> Floats:
+    values = np.zeros(len(_VALUES), dtype=np.float32)
+    read = np.frombuffer(data, dtype=">f4", count=min(count, len(_VALUES)), offset=start)
+    if not np.isfinite(read[:_NEEDED]).all():
+        raise PacketError("values that are not finite")
+    values[: len(read)] = np.where(np.isfinite(read), read, np.float32(0))
     return values
 
 
-def _name(data: bytes, start: int) -> tuple[str, int]:
-    """Return a text and where it ends."""
+def _ends(data: bytes, start: int) -> Iterator[int]:
+    """Yield where a name may end: at its length in bytes, or with more bytes to a character."""
+    (length,) = _LENGTH.unpack_from(data, start)
+    begin = start + _LENGTH.size
+    yield from range(begin + (length if length >= 0 else -2 * length), begin + 4 * abs(length) + 1)
+
+
+def _fits(data: bytes, at: int) -> bool:
+    """Return whether a frame that begins here fills the rest of the packet."""
+    values = at + _FRAME.size
+    return values <= len(data) == values + 4 * data[values - 1]
+
+
+def _end_of_name(data: bytes, start: int) -> int:
+    """Return where a text ends by its own length, which is at `start`."""
     if len(data) < start + _LENGTH.size:
         raise PacketError("a packet that is cut off")
     (length,) = _LENGTH.unpack_from(data, start)
-    wide = length < 0
-    size, start = (-2 * length if wide else length), start + _LENGTH.size
-    if size > _LONGEST_NAME or start + size > len(data):
+    size = int(length if length >= 0 else -2 * length)
+    end = start + _LENGTH.size + size
+    if size > _LONGEST_NAME or end > len(data):
         raise PacketError("a name that is longer than its packet")
-    text = data[start : start + size].decode("utf-16-be" if wide else "utf-8", "replace")
-    return text.rstrip("\0"), start + size
+    return end
 
 
-def _other_version(data: bytes) -> str:
-    """Return why a packet of another version is not read."""
+def _text(data: bytes, start: int, end: int) -> str:
+    """Return the text whose length begins at `start`."""
+    wide = data[start] > 0x7F  # a negative length
+    return data[start + _LENGTH.size : end].decode("utf-16-be" if wide else "utf-8", "replace").rstrip("\0")
+
+
+def _other_format(data: bytes) -> str | None:
+    """Return which other format this is; None: Live Link's."""
     if any(_is_animator(data, order) for order in "<>"):
         return (
             "the app is in MetaHuman Animator mode, which sends no blendshapes: choose Live Link (ARKit) as its "
@@ -107,7 +135,7 @@ def _other_version(data: bytes) -> str:
         )
     if 0 < data[0] < VERSION:
         return f"an older version of the app (its packets are version {data[0]}, not {VERSION}): update it"
-    return "no packets of Live Link Face"
+    return None if data[0] == VERSION else foreign(data) or "no packets of Live Link Face"
 
 
 def _is_animator(data: bytes, order: str) -> bool:
@@ -124,18 +152,17 @@ def _is_animator(data: bytes, order: str) -> bool:
 
 
 def motion_of(values: Floats) -> Floats:
-    """Return motion (58,) of the values (61,) of a packet; it has no position, which stays 0."""
+    """Return motion (58,) of the values (61,) of a packet, in its units; it has no position, which stays 0."""
     motion: Floats = values[_COLUMNS] * _FACTORS
-    shapes = motion[SHAPES]
-    np.minimum(np.maximum(shapes, 0.0, out=shapes), 1.0, out=shapes)
     return motion
 
 
-class LiveLinkDecoder:
+class LiveLinkDecoder(Decoder):
     """`Decoder` of one phone: the order of its packets is judged by their frame numbers.
 
     A number a little back is late, one far back a new count: midnight, or the app was started again. Phones count in
-    steps of one, or of two where they send every other frame: lost is what is missing between steps.
+    steps of one, or of two where they send every other frame: lost is what is missing between steps. Of a sender that
+    has never counted, each packet is a new frame.
     """
 
     def __init__(self) -> None:
@@ -148,6 +175,7 @@ class LiveLinkDecoder:
         self._data = b""
         self._time_s = 0.0
         self._step: int | None = None
+        self._sent = len(_VALUES)
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
         packet = parse_packet(data)
@@ -155,10 +183,18 @@ class LiveLinkDecoder:
         if not self._is_next(packet, data, time_s):
             return None
         self._number, self._data, self._time_s = packet.number, data, time_s
+        self.blind = packet.values is None
         if packet.values is None:
             self._counts["no_face"] += 1
             return None
+        self._sent = packet.sent
         return motion_of(packet.values)
+
+    def remark(self) -> str | None:
+        if _NEEDED <= self._sent <= len(_VALUES):
+            return None
+        unused = "no head angles" if self._sent < _NEEDED else f"the first {_NEEDED} are used"
+        return f"{self._sent} values, not {len(_VALUES)}: {unused}"
 
     def statistics(self) -> Mapping[str, Any]:
         """Return counts of frames lost, doubled, late, without a face, of new counts of the phone; and its name."""
@@ -167,7 +203,7 @@ class LiveLinkDecoder:
     def _is_next(self, packet: LiveLinkPacket, data: bytes, time_s: float) -> bool:
         if self._number is None:
             return True
-        if data == self._data:
+        if data == self._data and self._step is not None:
             self._counts["doubled"] += 1
             return False
         forward = packet.number - self._number
@@ -177,7 +213,7 @@ class LiveLinkDecoder:
         if forward < 0:
             self._counts["late"] += 1
             return False
-        if forward > 0:  # not every program that sends these packets counts
+        if forward > 0:
             self._step = forward if self._step is None else min(self._step, forward)
             self._counts["lost"] += forward // self._step - 1
         return True
@@ -189,7 +225,7 @@ def open_live_link(argument: str) -> UdpSight:
     The log says what to type for a phone, which is another machine, and the address for its app. Raises as
     `UdpSight`.
     """
-    return UdpSight("live-link", argument, PORT, LiveLinkDecoder(), _hint)
+    return UdpSight("live-link", argument, PORT, LiveLinkDecoder(), _hint, LiveUnits())
 
 
 def _hint(host: str, port: int, wider: str) -> str:

@@ -17,10 +17,13 @@ placed again where it is `UNSETTLED_S` off.
 from __future__ import annotations
 
 import math
+import statistics
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from itertools import pairwise
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +31,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
-from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix
 
 GAP_S: Final = 0.15
 SETTLE_S: Final = 1.0
@@ -169,15 +172,93 @@ def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
     return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
 
 
+# --- the pace at which sound is handed over --------------------------------------------------------------------------
+
+PAUSE_S: Final = 0.25  # a longer wait than its piece by so much: nothing was said meanwhile
+OFF_PACE: Final = 0.015  # a sound card is off by a third of it at most
+PACE_SECONDS: Final = 6
+BURSTS: Final = 5  # within `BURSTS_S`
+BURSTS_S: Final = 10.0
+
+
+class Pace:
+    """The pace at which a source hands over sound, against time: too slow, too fast, or in bursts.
+
+    A source is behind by the time that has passed, less the sound that came. That goes up and down with its pieces; but
+    the least of each second stays where it is for a source that keeps pace. The median of its changes is the pace.
+
+    Attributes:
+        rate: seconds of sound a second, over the last seconds; None: not known yet.
+    """
+
+    def __init__(self) -> None:
+        self.rate: float | None = None
+        self._last_s = -math.inf
+        self._behind_s = self._most_s = 0.0
+        self._least: deque[_Point] = deque(maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
+        self._wait_s = self._widest_s = 0.0  # longest since the last burst, and before any
+        self._bursts_s: deque[float] = deque(maxlen=BURSTS)
+
+    def observe(self, piece_s: float, now_s: float) -> None:
+        """Take in a piece that is handed over at `now_s`."""
+        wait_s, self._last_s = now_s - self._last_s, now_s
+        if math.isinf(wait_s):
+            wait_s = piece_s
+        self._behind_s += wait_s - piece_s
+        if wait_s > piece_s + PAUSE_S:
+            self._least.clear()
+        self._observe_burst(wait_s if wait_s > piece_s + GAP_S else 0.0, now_s)
+        if self._least and now_s < self._least[-1][0] + 1.0:
+            begin_s, least_s = self._least.pop()
+            self._least.append((begin_s, min(least_s, self._behind_s)))
+            return
+        self._least.append((now_s, self._behind_s))
+        if len(self._least) == self._least.maxlen:
+            whole = list(self._least)[:-1]
+            self.rate = 1.0 - statistics.median((d - b) / (c - a) for (a, b), (c, d) in pairwise(whole))
+
+    @property
+    def problem(self) -> str | None:
+        """A fault of the pace, in one line, or None."""
+        if self.off:
+            way = "falls behind" if self.off < 1.0 else "is ahead"
+            return f"sound comes at {self.off:.2f} of real time: its sender {way}; pace it by the clock"
+        if self.apart_s:
+            return f"sound comes in bursts, up to {self.apart_s * 1e3:.0f} ms apart: send it as it is recorded"
+        return None
+
+    @property
+    def off(self) -> float | None:
+        """Return the rate where it is not that of time, else None."""
+        return None if self.rate is None or abs(self.rate - 1.0) <= OFF_PACE else self.rate
+
+    @property
+    def apart_s(self) -> float:
+        """Longest wait between two bursts, where sound comes in bursts, else 0."""
+        bursts = len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S
+        return self._widest_s if bursts else 0.0
+
+    def _observe_burst(self, wait_s: float, now_s: float) -> None:
+        self._wait_s, self._most_s = max(self._wait_s, wait_s), max(self._most_s, self._behind_s)
+        if self._most_s - self._behind_s > GAP_S and self._wait_s:
+            self._bursts_s.append(now_s)
+            self._widest_s = max(self._widest_s, self._wait_s)
+            self._wait_s, self._most_s = 0.0, self._behind_s
+
+
 class LiveVoice(SourcePart):
     """`ports.Voice` of a live stream. All methods may be called from any thread; none blocks for longer than a piece
     takes to be resampled.
+
+    Attributes:
+        mix: of its channels; `name` is that of the sound in its line.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now: Callable[[], float] = time.monotonic, name: str = "sound") -> None:
         super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s: float | None = None
+        self.mix = Downmix(name)
         self._rate_hz = 0.0
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
         self._skew = 0.0  # of the card, kept over its gaps
@@ -191,6 +272,7 @@ class LiveVoice(SourcePart):
         self._frames: dict[int, Floats] = {}
         self._wanted = 0  # frame
         self._counts = {"gaps": 0, "late_samples": 0, "not_finite": 0}
+        self._uneven_s = 0.0  # by which pieces come late without being missing
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped, but taught the clock."""
@@ -210,10 +292,11 @@ class LiveVoice(SourcePart):
         What is not finite counts as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
         """
         check_rate(rate_hz)
-        mono, not_finite = _mono(samples)
-        if not len(mono):
+        finite, not_finite = _finite(samples)
+        if not len(finite):
             return
         with self._lock:
+            mono = np.ascontiguousarray(np.clip(self.mix(finite), -1.0, 1.0))
             self._counts["not_finite"] += not_finite
             self._observe(len(mono), rate_hz, captured_s)
             if self._origin_s is not None:
@@ -246,7 +329,9 @@ class LiveVoice(SourcePart):
         """Learn from a piece; it begins a stretch when it cannot follow the last one."""
         if rate_hz != self._rate_hz:
             self._end_stretch()
-        elif self._clock is not None and self._clock.lateness_s(self._received + n, captured_s) > GAP_S:
+        elif (
+            self._clock is not None and self._clock.lateness_s(self._received + n, captured_s) > GAP_S + self._uneven_s
+        ):
             self._counts["gaps"] += 1
             self._end_stretch()
         if self._clock is None:
@@ -328,16 +413,13 @@ class LiveVoice(SourcePart):
 
 
 def check_rate(rate_hz: float) -> None:
-    """Raise ConfigError for a rate that speech does not have."""
-    if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
+    """Raise ConfigError for a rate that speech does not have, and for one that is not a number."""
+    if not isinstance(rate_hz, Real) or not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
         raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
-def _mono(samples: NDArray[np.float32]) -> tuple[Floats, int]:
-    """Return the mean of the channels, and how many of the samples are not finite."""
+def _finite(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+    """Return the samples, 0 for those that are not finite, and how many these are."""
     finite = np.isfinite(samples)
     not_finite = samples.size - int(np.count_nonzero(finite))
-    if not_finite:
-        samples = np.where(finite, samples, np.float32(0))
-    mixed = samples.mean(axis=1, dtype=np.float64) if samples.ndim > 1 else samples
-    return np.ascontiguousarray(np.clip(mixed, -1.0, 1.0), dtype=np.float32), not_finite
+    return np.where(finite, samples, np.float32(0)) if not_finite else samples, not_finite

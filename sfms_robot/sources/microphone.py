@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.errors import NOTE
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Floats
 from sfms_robot.ports import Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
@@ -31,6 +32,7 @@ logger = logging.getLogger(__name__)
 MIC_FLAG: Final = "--audio mic"
 DEVICE_FLAG: Final = "--agent-audio device"
 STATISTICS_S: Final = 1.0
+LINES: Final = "lines"  # key of the statistics: what the run logs of the device, as its process has no log
 LONGEST_WAIT_S: Final = 0.15  # for the microphone, from the end of a frame: later it is of no use to the loop
 REFERENCE_WAIT_S: Final = 0.1
 SAID_FRAMES: Final = 12  # of the robot's voice in a message: the worker may miss half a second of messages
@@ -112,7 +114,7 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
         if recording.reference is not None:
             said = stack.enter_context(Capture.opened(recording.reference, recording.reference_flag))
         reference = SpeechFrames() if recording.spoken else None if said is None else LiveVoice()
-        front_end = FrontEnd(reference)
+        front_end = FrontEnd(reference, mic.device.name)
         given = yield mic.device.name
         before: ToWorker | None = None
         said_s = next_statistics_s = 0.0
@@ -130,7 +132,9 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
             messages: list[MicrophoneMessage | None] = [*front_end.frames(time.monotonic())]
             if (now_s := time.monotonic()) >= next_statistics_s:
                 next_statistics_s = now_s + STATISTICS_S
-                messages.append({**front_end.statistics(), "overflows": mic.overflows})
+                lines = {"mix": front_end.mic.mix.line, "pace": mic.problem}
+                pace = None if mic.pace.rate is None else round(mic.pace.rate, 3)
+                messages.append({**front_end.statistics(), "overflows": mic.overflows, "pace": pace, LINES: lines})
             elif not messages and (before is None or recording.spoken or now_s > said_s + _ALIVE_S):
                 messages.append(None)  # and receive what the parent sends
             for message in messages:
@@ -173,14 +177,15 @@ class FrontEnd:
 
     Args:
         reference: what the robot says: a `LiveVoice` of what its loudspeaker is given, or frames from the parent.
+        name: of the device, in log lines.
 
     Attributes:
         mic: push its pieces here.
         speed_rad_s: how fast the head's joints move, all together, by which the noise of their motors is judged.
     """
 
-    def __init__(self, reference: LiveVoice | SpeechFrames | None = None) -> None:
-        self.mic = LiveVoice()
+    def __init__(self, reference: LiveVoice | SpeechFrames | None = None, name: str = "microphone") -> None:
+        self.mic = LiveVoice(name=name)
         self.speed_rad_s = 0.0
         self._reference = reference
         self._gate = OwnVoiceGate(speaks=reference is not None)
@@ -266,6 +271,7 @@ class Microphone:
         self.latency_s = 0.0
         self._late_frames = 0
         self._figures: Mapping[str, Any] = {}
+        self._logged: set[str] = set()
         self._said: dict[int, Floats | None] = {}
         self._speed_rad_s = self._sent_speed_rad_s = 0.0
         self._collect(0.0, 0)
@@ -335,6 +341,10 @@ class Microphone:
             elif isinstance(message, str):
                 self.device = message
             else:
+                for about, line in message.pop(LINES, {}).items():
+                    if line and about not in self._logged:
+                        self._logged.add(about)
+                        logger.warning("%s (said once)", line)
                 self._figures = message
 
     def _take_in(self, heard: MicrophoneFrame, wanted: int) -> None:
@@ -411,5 +421,5 @@ def _opened(recording: Recording, early_s: float | None = None) -> Microphone:
     worker = SourceWorker(name, listen, recording)
     worker.wait()
     microphone = Microphone(worker, early_s)
-    logger.warning("%s: %s", name, microphone.device)
+    logger.log(NOTE, "%s: %s", name, microphone.device)
     return microphone

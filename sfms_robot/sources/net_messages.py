@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Literal
@@ -31,14 +32,19 @@ from sfms_robot.config.base import one_line
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import MOTION_DIM, Floats
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from sfms_robot.signals.spaces import beyond
 
 VERSION: Final = 1
 VOICE, FACE, SPEECH, MICROPHONE = 1, 2, 3, 4
 FEEDS: Final = {"voice": VOICE, "face": FACE, "speech": SPEECH}
-LONGEST: Final = 262_144  # bytes: 2.7 s at 48 kHz
+LONGEST: Final = 1_048_576  # bytes: 21.8 s at 24 kHz
 LONGEST_JSON: Final = 4096
 
 _HEADER: Final = struct.Struct("<BBHIdd")
+_SOUND_IS: Final = "sound comes in binary messages, int16 behind a header of 24 bytes (docs/reference/protocol.md)"
+_REALTIME: Final = re.compile(rb'"type"\s*:\s*"((?:session|input_audio_buffer|conversation|response)\.[\w.]+)"')
+# Files, by their first bytes.
+_FILES: Final = {b"RIFF": "a WAV file", b"OggS": "an Ogg file", b"fLaC": "a FLAC file", b"ID3\x04": "an MP3 file"}
 
 
 def _printable(text: str) -> str:
@@ -96,18 +102,17 @@ _JSON: Final[TypeAdapter[Hello | Hush]] = TypeAdapter(Annotated[Hello | Hush, Fi
 
 def parse_message(data: bytes) -> Message:
     """Return a message from a program. Raises PacketError, in one line, for anything but a whole message."""
-    if len(data) > LONGEST:
-        raise PacketError(f"a message of more than {LONGEST} bytes")
     if data[:1] == b"{":
-        if len(data) > LONGEST_JSON:
-            raise PacketError(f"JSON of more than {LONGEST_JSON} bytes")
-        try:
-            return _JSON.validate_json(data)
-        except ValidationError as error:
-            raise PacketError(" ".join(one_line(error.errors()[0]).split())) from None
+        return _json(data)
+    if len(data) > LONGEST:
+        raise PacketError(f"a message of {len(data)} bytes, more than {LONGEST}: send it in pieces")
+    if re.fullmatch(rb"[\t\n\r -~]{4,}", data[:256]):
+        raise PacketError(f"a text that is not a JSON object (base64?): {_SOUND_IS}")
     if len(data) < _HEADER.size:
         raise PacketError(f"a message of {len(data)} bytes, shorter than a header")
     kind, version, zero, rate_hz, sent_s, at_s = _HEADER.unpack_from(data)
+    if data[:4] in _FILES or (kind not in FEEDS.values()) + (version != VERSION) + (zero != 0) > 1:
+        raise PacketError(f"{_FILES.get(data[:4], 'no header (raw PCM?)')}: {_SOUND_IS}")
     if version != VERSION:
         raise PacketError(f"a message of version {version}, not {VERSION}")
     if kind not in FEEDS.values() or zero:
@@ -122,9 +127,23 @@ def parse_message(data: bytes) -> Message:
     if not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
         raise PacketError(f"sound of {rate_hz} samples a second ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
     if len(rest) % 2:
-        raise PacketError("sound that is not of 16-bit samples")
+        raise PacketError(f"{len(rest)} bytes of sound, not of 16-bit samples")
+    if rest[:4] in _FILES:
+        raise PacketError(f"{_FILES[rest[:4]]} behind the header: send its samples alone")
     samples = np.frombuffer(rest, dtype="<i2").astype(np.int16)
     return SoundMessage(kind=kind, rate_hz=rate_hz, sent_s=sent_s, at_s=at_s, samples=samples)
+
+
+def _json(data: bytes) -> Hello | Hush:
+    if found := _REALTIME.search(data[:LONGEST_JSON]):
+        event = found[1].decode()
+        raise PacketError(f"{event!r} is an event of the OpenAI Realtime API, which is not spoken here: {_SOUND_IS}")
+    if len(data) > LONGEST_JSON:
+        raise PacketError(f"JSON of more than {LONGEST_JSON} bytes: {_SOUND_IS}")
+    try:
+        return _JSON.validate_json(data)
+    except ValidationError as error:
+        raise PacketError(" ".join(one_line(error.errors()[0]).split())) from None
 
 
 def _face(rest: bytes, sent_s: float, at_s: float) -> SeenMessage:
@@ -135,6 +154,8 @@ def _face(rest: bytes, sent_s: float, at_s: float) -> SeenMessage:
     values = np.frombuffer(rest, dtype="<f4").astype(np.float32)
     if not np.isfinite(values).all():
         raise PacketError("a face with values that are not finite")
+    if (wrong := beyond(values[:MOTION_DIM])) is not None:
+        raise PacketError(f"a face left out: {wrong}")
     attention = float(values[MOTION_DIM]) if len(values) > MOTION_DIM else None
     return SeenMessage(sent_s, at_s, values[:MOTION_DIM], attention)
 

@@ -52,6 +52,7 @@ SILENT_S: Final = 2.0
 FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
 
 OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
+_OLD: Final = f"its time (`at`) is more than {OLDEST_S:g} s ago, by the sender's clock"
 _WINDOW_S: Final = 10.0  # that a clock is remembered, once or twice
 _SET_S: Final = 1.0  # a message that took so much longer than the quickest: the clock was set
 _SPARE_S: Final = 2.0  # of sound, that may arrive faster than time passes
@@ -103,18 +104,24 @@ class Intake:
         self._spare_s = _SPARE_S
         self._spared_s = now()
 
-    def hear(self, voice: PushedVoice, message: SoundMessage, clock: SenderClock) -> None:
-        """Hand on the next piece of their voice. Never blocks."""
+    def hear(self, voice: PushedVoice, message: SoundMessage, clock: SenderClock) -> str | None:
+        """Hand on the next piece of their voice; return why it was left out, or what is wrong. Never blocks."""
         now_s, at_s, old = self._times(message, clock)
         piece_s = len(message.samples) / message.rate_hz
-        if not old and self._in_time(piece_s, now_s):
-            voice.hear(message.samples, message.rate_hz, at_s)
+        if old:
+            return f"voice left out: {_OLD}"
+        if not self._in_time(piece_s, now_s):
+            return f"voice left out: {piece_s:.2g} s came faster than time passes; send it as it is recorded"
+        voice.hear(message.samples, message.rate_hz, at_s)
+        return voice.pace.problem
 
-    def see(self, sight: PushedSight | BrowserSight, message: SeenMessage, clock: SenderClock) -> None:
-        """Hand on their face now, or that it is lost. Never blocks."""
+    def see(self, sight: PushedSight | BrowserSight, message: SeenMessage, clock: SenderClock) -> str | None:
+        """Hand on their face now, or that it is lost; return why it was left out. Never blocks."""
         _, at_s, old = self._times(message, clock)
-        if not old:
-            sight.see(message.motion, at_s, message.attention)
+        if old:
+            return f"face left out: {_OLD}"
+        sight.see(message.motion, at_s, message.attention)
+        return None
 
     def at_s(self, message: SoundMessage | SeenMessage, clock: SenderClock) -> float | None:
         """Return the time of a message in our clock; None: as it arrives."""
@@ -220,16 +227,18 @@ class NetPerson:
         if self._feeders.get(name) is not connection:
             raise PacketError(f"{name} was not announced in its hello")
         self._heard_s[name] = self.now()
-        clock = self._clocks[connection]
+        clock, problem = self._clocks[connection], None
         match self._feeds[name], message:
             case NetSpeech() as speech, Hush():
                 speech.hush()
             case NetSpeech() as speech, SoundMessage() as sound:
                 speech.say(sound.samples, sound.rate_hz, self._intake.at_s(sound, clock))
             case NetSight() as sight, SeenMessage() as seen:
-                self._intake.see(sight, seen, clock)
+                problem = self._intake.see(sight, seen, clock)
             case NetVoice() as voice, SoundMessage() as sound:
-                self._intake.hear(voice, sound, clock)
+                problem = self._intake.hear(voice, sound, clock)
+        if problem is not None:
+            connection.tell_once(problem)
 
     def gone(self, connection: NetProgram) -> None:
         """Free the places of a program that has gone."""
@@ -318,6 +327,7 @@ class NetVoice(_NetPart, PushedVoice):
     """`ports.Voice` of a person whose sound another program has: `--audio push[:[HOST:]PORT]`."""
 
     feed = "voice"
+    _way = FLAGS["voice"]
 
 
 class NetSight(_NetPart, PushedSight):
@@ -410,6 +420,8 @@ class PageVisitor:
 
 class BrowserVoice(PushedVoice):
     """`ports.Voice` of a visitor."""
+
+    _way = "--audio browser"
 
     def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
         super().__init__(now)

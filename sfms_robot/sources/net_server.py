@@ -10,6 +10,7 @@ A client costs the servo loop no tick:
 1. All of it happens in one thread. The loop hands over what is to be sent through a bounded queue.
 2. A connection is read in small turns with pauses between them: TCP itself holds up one that sends faster.
 3. A slow reader gets the newest `OUTBOX` messages; older ones are left out and counted.
+   What is wrong with its own messages is sent to each program, as a message of type "error", before it is counted.
 4. A client that sends no hello, or has gone without closing, is disconnected.
 """
 
@@ -47,6 +48,7 @@ TURN_S: Final = 0.01
 MOST_MALFORMED: Final = 100  # then the connection is closed
 LAST_WORDS_S: Final = 0.2  # that a program gets to read why it is closed
 _SLICE: Final = TURN_BYTES // TURN_MESSAGES  # bytes of a WebSocket that are read at once
+_MOST_READ: Final = 4 * LONGEST  # bytes of a WebSocket's message; a longer one closes the connection
 _STOP_S: Final = 2.0
 _MOST_SAID: Final = 20
 _HTTP: Final = b"GET "
@@ -159,6 +161,7 @@ class NetProgram:
     def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.name = address_text(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
         self.greeted, self.malformed = False, 0
+        self._told: set[str] = set()
         self.wants: frozenset[str] = frozenset()
         self._server, self._reader, self._writer = server, reader, writer
         self._loop = asyncio.get_running_loop()
@@ -201,6 +204,18 @@ class NetProgram:
         self._server.counts["missed"] += len(self._outbox) == self._outbox.maxlen
         self._outbox.append(message)
         self._waiting.set()
+
+    def tell(self, problem: str) -> None:
+        """Send what is wrong with its messages, as a message of type "error"; it stays connected."""
+        self.send(json_message(type="error", error=problem))
+
+    def tell_once(self, problem: str) -> None:
+        """Tell it, and the log, the first time of a problem, whatever its numbers."""
+        key = re.sub(r"\d+", "", problem)
+        if key not in self._told:
+            self._told.add(key)
+            self.tell(problem)
+            self._server.say_once(problem, f"{self.name}: {problem}")
 
     def end(self, reason: str, refused: bool = True) -> None:
         """Send the reason, as a message of type "error", and close. `refused`: the client is to blame."""
@@ -251,10 +266,13 @@ class NetProgram:
         try:
             message = parse_message(data)
         except PacketError as error:
-            server.counts["malformed"] += 1
             self.malformed += 1
+            closes = not self.greeted or self.malformed > MOST_MALFORMED
+            if not closes:
+                self.tell(str(error))
+            server.counts["malformed"] += 1
             server.say_once(f"malformed {error}", f"{self.name}: left out: {error}")
-            if not self.greeted or self.malformed > MOST_MALFORMED:
+            if closes:
                 self.end(str(error))
             return
         try:
@@ -282,7 +300,7 @@ class TcpWire:
         while True:
             (length,) = _LENGTH.unpack(head)
             if not 0 < length <= LONGEST:
-                raise PacketError(f"a message of {length} bytes (1 to {LONGEST})")
+                raise PacketError(f"a message of {length} bytes (1 to {LONGEST}, behind its length in 4 bytes)")
             yield await reader.readexactly(length)
             head = await reader.readexactly(_LENGTH.size)
 
@@ -299,7 +317,7 @@ class WebSocketWire:
     """A WebSocket (RFC 6455), server's side; methods as of `TcpWire`."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
-        self._protocol = ServerProtocol(max_size=LONGEST)
+        self._protocol = ServerProtocol(max_size=_MOST_READ)
         self._writer = writer
 
     async def messages(self, reader: asyncio.StreamReader, head: bytes) -> AsyncGenerator[bytes | None, None]:

@@ -29,6 +29,8 @@ from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Fac
 from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
+from sfms_robot.signals.spaces import beyond
+from sfms_robot.sources.live_voice import Pace
 
 logger = logging.getLogger(__name__)
 
@@ -176,6 +178,7 @@ class JudgedSource:
         self._inner = inner
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
+        self._pace, self._said = Pace(), False
         self._given = 0
 
     def start(self, origin_s: float) -> None:
@@ -188,6 +191,10 @@ class JudgedSource:
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
             frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
             self._given += 1
+            self._pace.observe(FRAME_S, now_s)
+        if not self._said and (problem := self._pace.problem) is not None:
+            self._said = True
+            logger.warning("%s: %s (said once)", type(self._inner).__name__, problem)
         self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 
@@ -243,6 +250,9 @@ class FrameJudge:
         jaw = None if shapes is None else self._finite(index, "face", face.jaw_rad, (3,))
         if pose is None or shapes is None or (jaw is None) != (face.jaw_rad is None):
             return None
+        if problem := beyond(np.concatenate([pose, shapes])):
+            self._leave_out(index, "face", problem)
+            return None
         end_s = (index + 1) / FRAME_HZ
         time_s = face.time_s if -FACE_S - _EPS_S <= face.time_s - end_s <= FRAME_S + _EPS_S else end_s
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
@@ -255,10 +265,13 @@ class FrameJudge:
         if values.shape == shape and np.isfinite(values).all():
             return values
         got = "values that are not finite" if values.shape == shape else f"shape {values.shape}, not {shape}"
+        self._leave_out(index, what, got)
+        return None
+
+    def _leave_out(self, index: int, what: str, got: str) -> None:
         if what not in self.left_out:
             logger.warning("source: frame %d: %s left out: %s (said once)", index, what, got)
         self.left_out[what] = self.left_out.get(what, 0) + 1
-        return None
 
 
 def _length_s(voice: Voice | None, sight: Sight | None, agent: Voice | None) -> float | None:

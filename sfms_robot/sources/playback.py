@@ -22,6 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.errors import NOTE
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.signals.audio import at_positions
 from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, SampleClock, window
@@ -405,5 +406,5 @@ def open_playback(argument: str, spoken: Spoken) -> PlayedVoice:
     worker.wait()
     played = PlayedVoice(worker, spoken)
     spoken.played_by(played)
-    logger.warning("loudspeaker: %s, %.0f ms after it is said", played.device, played.delay_s * 1e3)
+    logger.log(NOTE, "loudspeaker: %s, %.0f ms after it is said", played.device, played.delay_s * 1e3)
     return played

@@ -1,26 +1,31 @@
 """A person handed over by calls, from any thread: sound, faces, and the robot's own speech.
 
 A call brings no time of its own, so sound counts from the moment it arrives: a piece is played out from then on, and
-the next ones follow it. Where pieces are long, or arrive unevenly, that leaves room for the longest of them.
+the next ones follow it. Where pieces are long, that leaves room for the longest of them; where they come in bursts,
+for the longest wait between two.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
 from sfms_robot.ports import Voice
-from sfms_robot.signals.audio import Resampler
-from sfms_robot.sources.live_voice import LiveVoice, SourcePart, check_rate, window
+from sfms_robot.signals.audio import Downmix, Resampler, check_scale
+from sfms_robot.signals.spaces import beyond, motion_of
+from sfms_robot.sources.live_voice import LiveVoice, Pace, SourcePart, check_rate, window
+
+logger = logging.getLogger(__name__)
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
@@ -28,6 +33,7 @@ HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a 
 SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
 SIGHTINGS: Final = 64  # kept: more than a camera sees between two ticks
 _JOIN: Final = round(0.02 * AUDIO_HZ)
+_MOST_CHANNELS: Final = 32
 _NONE: Final = np.zeros(0, dtype=np.float32)
 
 
@@ -58,7 +64,13 @@ class Spoken(Voice, Protocol):
 
 
 class PushedVoice(LiveVoice):
-    """`ports.Voice` of what a program hears."""
+    """`ports.Voice` of what a program hears.
+
+    Attributes:
+        pace: at which it comes. What is wrong with it is logged once.
+    """
+
+    _way: ClassVar[str] = "hear()"  # in logs
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__(now)
@@ -66,12 +78,14 @@ class PushedVoice(LiveVoice):
         self._longest_s = 0.0  # piece
         self._last_s = 0.0
         self._dropped = 0
+        self.pace = Pace()
+        self._said = False
 
     def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
-        """Take the next piece: (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit mono.
+        """Take the next piece, float of full scale 1 or int16: (n,), (n, channels) or (channels, n); or bytes of mono.
 
         Of one that is longer than a second the newest is kept. `captured_s`: `time.monotonic` of its newest sample;
-        None: it counts from this call on. Never blocks. Raises ConfigError for another rate, type or shape.
+        None: it counts from this call on. Never blocks. Raises ConfigError for another rate, type, shape or scale.
         """
         check_rate(rate_hz)
         samples = as_floats(pcm)
@@ -79,18 +93,29 @@ class PushedVoice(LiveVoice):
         with self._pushing:
             self._dropped += len(samples) - len(kept)
             now_s, piece_s = self._now(), len(kept) / rate_hz
+            if len(samples):
+                self.pace.observe(len(samples) / rate_hz, now_s)
+            self._uneven_s = min(self.pace.apart_s, HEARD_S)
             if captured_s is None:
                 if now_s - self._last_s > self._longest_s + HEARD_S:
                     self._longest_s = 0.0
-                if piece_s > self._longest_s:
-                    self._longest_s = piece_s
+                if (needed_s := max(piece_s, self._uneven_s)) > self._longest_s:
+                    self._longest_s = needed_s
                     self.interrupt()
                 self._last_s = now_s
                 captured_s = now_s + self._longest_s
             self.push(kept, rate_hz, captured_s, now_s)
+        if not self._said and (problem := self.pace.problem) is not None:
+            self._said = True
+            logger.warning("%s: %s (said once)", self._way, problem)
 
     def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), "dropped": self._dropped, "delay_ms": round(self._longest_s * 1e3, 1)}
+        return {
+            **super().statistics(),
+            "dropped": self._dropped,
+            "delay_ms": round(self._longest_s * 1e3, 1),
+            "pace": None if self.pace.rate is None else round(self.pace.rate, 3),
+        }
 
 
 class PushedSight(SourcePart):
@@ -104,22 +129,26 @@ class PushedSight(SourcePart):
 
     def see(
         self,
-        face: FaceFrame | NDArray[np.floating] | None,
+        face: FaceFrame | NDArray[np.floating] | Mapping[str, float] | None,
         seen_s: float | None = None,
         attention: float | None = None,
     ) -> None:
-        """Take the person's face, as a `FaceFrame` or (58,) motion; None: it is lost. Never blocks.
+        """Take the person's face, as a `FaceFrame`, (58,) motion or channels by name; None: it is lost. Never blocks.
 
         Args:
             seen_s: `time.monotonic` when it was seen, no earlier than the last one; None: now.
             attention: see `Sighting`.
 
-        Raises ConfigError for another shape.
+        Raises ConfigError for another shape, an unknown channel, and a value beyond what a head can do.
         """
+        if isinstance(face, Mapping):
+            face = motion_of(face)
         if face is not None and not isinstance(face, FaceFrame):
             if np.shape(face) != (MOTION_DIM,):
                 raise ConfigError(f"face has the shape {np.shape(face)}, not ({MOTION_DIM},): pose 6, blendshapes 52")
             face = FaceFrame.of(0.0, face)
+        if face is not None and (problem := beyond(face.motion)):
+            raise InputError(f"face: {problem}")
         with self._lock:
             at_s = self._now() if seen_s is None else seen_s
             self._seen.append((at_s, None if face is None else Sighting(face, attention)))
@@ -149,6 +178,7 @@ class PushedSpeech(SourcePart):
         self._longest = int(longest_s * AUDIO_HZ)
         self._saying = threading.Lock()  # of `say` and `hush`: the stretch that is resampled
         self._rate_hz = float(AUDIO_HZ)
+        self._mix = Downmix()
         self._resampler: Resampler | None = None  # None: the next piece begins a stretch
         self._given = 0  # samples of the stretch, at its rate
         self._began = 0  # samples of 16 kHz since 0 of `now`, as all places
@@ -252,7 +282,7 @@ class PushedSpeech(SourcePart):
     def _begin(self, at: int, rate_hz: float) -> None:
         self._finish()
         self._cut(at)
-        self._rate_hz, self._resampler, self._given = rate_hz, Resampler(rate_hz), 0
+        self._rate_hz, self._resampler, self._given = rate_hz, Resampler(rate_hz, self._mix), 0
         self._began = self._place = at
 
     def _finish(self) -> None:
@@ -286,16 +316,27 @@ def _place(time_s: float) -> int:
 
 
 def as_floats(pcm: Pcm) -> NDArray[np.float32]:
-    """Return sound as (n,) or (n, channels) of full scale 1. Raises ConfigError for another type or shape."""
+    """Return sound as (n,) or (n, channels) of full scale 1; the smaller axis is that of channels.
+
+    Raises ConfigError for another type, shape or scale.
+    """
     if isinstance(pcm, bytes | bytearray | memoryview):
         if len(pcm) % 2:
             raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples")
         pcm = np.frombuffer(pcm, dtype="<i2")
     samples = np.asarray(pcm)
     if samples.ndim not in (1, 2) or (samples.dtype != np.int16 and samples.dtype.kind != "f"):
-        problem = "not float or int16 of (n,) or (n, channels)"
+        problem = "not float or int16 of (n,), (n, channels) or (channels, n)"
         raise ConfigError(f"pcm is {samples.dtype} of shape {samples.shape}, {problem}")
+    if not samples.size:
+        return _NONE
+    if samples.ndim == 2:
+        channels, n = sorted(samples.shape)
+        if channels > _MOST_CHANNELS or 1 < channels == n:
+            problem = f"expected (n, channels) or (channels, n), at most {_MOST_CHANNELS} channels and more samples"
+            raise ConfigError(f"pcm of shape {samples.shape}: {problem}")
+        samples = samples.T if samples.shape[0] == channels else samples
     if samples.dtype == np.int16:
         return samples.astype(np.float32) / np.float32(32768)
-    with np.errstate(over="ignore"):  # what is too large for 32 bits becomes infinite, and is judged as that
-        return samples.astype(np.float32)
+    check_scale("pcm", samples)
+    return samples.astype(np.float32)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.data import SPEAKER_VOICE, data_dir, speaker_names
 from sfms_robot.errors import ConfigError
+from sfms_robot.network import LOCAL, Router
 from sfms_robot.plugins import plug_in, plugins
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
@@ -44,11 +45,12 @@ def _ours(**kinds: str) -> Kinds:
 
 KINDS: Final[Mapping[str, Kinds]] = {
     "--audio": _ours(
-        mic="microphone:open_microphone", push="net_person:NetVoice", browser="net_person:open_browser_voice"
+        mic="microphone:open_microphone", push="net_person:NetVoice", browser="net_person:open_browser_voice",
+        ros2="ros2:Ros2Voice",
     ),
     "--face": _ours(
         live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
-        push="net_person:NetSight", browser="net_person:open_browser_sight",
+        push="net_person:NetSight", browser="net_person:open_browser_sight", ros2="ros2:Ros2Sight",
     ),
     "--agent-audio": _ours(device="microphone:open_loudspeaker", tcp="net_person:NetSpeech"),
 }  # fmt: skip
@@ -119,7 +121,8 @@ def check_source(
     ):
         kinds = source_kinds(flag, others)
         if split_kind(value)[0] not in kinds and value not in files and file is None:
-            raise ConfigError(f"{flag} {value}: no such file ({', '.join([*kinds, *files])})")
+            problem = "sound is not read from a pipe: write it to a file" if value == "-" else "no such file"
+            raise ConfigError(f"{flag} {value}: {problem} ({', '.join([*kinds, *files])})")
     if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
         choices = ", ".join(["FILE.wav", "tcp", *speakers])
         raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")
@@ -134,6 +137,7 @@ def open_source(
     agent: Spoken | None = None,
     play: str | None = None,
     visitor: PageVisitor | None = None,
+    router: Router = LOCAL,
     others: Iterable[EntryPoint] | None = None,
 ) -> Source:
     """Open a person by the flags of a run.
@@ -146,6 +150,7 @@ def open_source(
         agent: what the robot says, instead of `agent_audio`.
         play: the device that plays it; None: it is played elsewhere.
         visitor: the person in front of the page, where one is served.
+        router: of ROS 2.
         others: see `source_kinds`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
@@ -172,14 +177,14 @@ def open_source(
 
                 own = open_playback(play, own)
                 failed.callback(own.close)
-            voice = opened("--audio", audio, mic=own, browser=visitor) or _recorded_voice(audio, again)
+            voice = opened("--audio", audio, mic=own, browser=visitor, ros2=router) or _recorded_voice(audio, again)
         if voice is not None and hasattr(voice, "read"):
             for flag, value, free in (("--face", face, "auto"), ("--agent-audio", agent_audio, "none")):
                 if value not in (free, "none"):
                     raise ConfigError(f"{flag} {value}: --audio {audio} brings its own ({free})")
             source: Source = JudgedSource(voice)
         else:
-            sight = opened("--face", face, browser=visitor)
+            sight = opened("--face", face, browser=visitor, ros2=router)
             sight = sight or _recorded_sight(face, audio, again, getattr(voice, "frames", None))
             source = PairedSource(voice, sight, own, duration_s)
         failed.pop_all()

@@ -23,7 +23,7 @@ import numpy as np
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
-from sfms_robot.sources.live_voice import LiveVoice
+from sfms_robot.sources.live_voice import LiveVoice, Pace
 from sfms_robot.sources.worker import SourceWorker
 
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
@@ -169,10 +169,11 @@ class DeviceStream:
 
 
 class Capture(DeviceStream):
-    """A device that records into a queue. Of more than two channels the first is taken.
+    """A device that records into a queue.
 
     Attributes:
         overflows: times that PortAudio lost samples.
+        pace: at which sound comes.
     """
 
     plays = False
@@ -182,7 +183,7 @@ class Capture(DeviceStream):
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         super().__init__(device, rate_hz, channels)
-        self.overflows = 0
+        self.overflows, self.pace = 0, Pace()
         self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
 
     def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
@@ -194,14 +195,24 @@ class Capture(DeviceStream):
                 if overflow:
                     self.overflows += 1
                     voice.interrupt()
+                self.pace.observe(len(samples) / self.rate_hz, captured_s)
                 voice.push(samples, self.rate_hz, captured_s)
         self.check()
+
+    @property
+    def problem(self) -> str:
+        """Return what is wrong with its pace, in one line; empty without a fault."""
+        if (rate := self.pace.off) is None:
+            return ""
+        return (
+            f"{self.device.name}: gives {rate:.2f} s of sound a second: its clock is wrong, or sound is lost on the "
+            "way; use another port, rate or device"
+        )
 
     def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
         now_s = self._called_s = time.monotonic()
         adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
-        used = samples[:, :1] if self.channels > STEREO else samples  # arrays put there what they made of the others
-        piece = np.where(np.abs(used) < _DENORMAL, np.float32(0), used)  # a copy: PortAudio writes there again
+        piece = np.where(np.abs(samples) < _DENORMAL, np.float32(0), samples)  # a copy: PortAudio writes there again
         self._pieces.put((piece, captured_s(now_s, adc_age_s, n / self.rate_hz), bool(status.input_overflow)))
         self._flows.set()
 

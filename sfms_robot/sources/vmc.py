@@ -3,14 +3,17 @@
 Read (protocol.vmc.info, "Marionette" specification), alone or in bundles:
 
     /VMC/Ext/Blend/Val   name, value                 a blendshape: ARKit's 52 ("perfect sync"), or a preset of VRM
-    /VMC/Ext/Blend/Apply                             those since the last one hold now
+    /VMC/Ext/Blend/Apply                             those since the last one hold now; without it a face is complete
+                                                     when the next begins (a bundle, or a name again), or after 100 ms
     /VMC/Ext/Bone/Pos    name, position, quaternion  of bones "Head" and "Neck", each against its parent
     /VMC/Ext/OK          loaded, ..., tracking       tracking 0: the face is lost
 
-Names go by any case. A sender whose ARKit shapes move is believed in these; the presets of another become the ARKit
-shapes nearest to them. Unity's axes are left-handed, x right, y up, z forward as the avatar has them; a rotation about
-(x, y, z) there is one about (-z, x, -y) in ours. That follows from the two definitions; whether an avatar mirrors its
-person is a setting of its software, and not proved here: `flip=yaw+roll` undoes a mirror.
+Names go by any spelling that `signals.spaces.channel_of` knows. A sender whose ARKit shapes move is believed in these;
+the presets of another become the ARKit shapes nearest to them. Values above 1 are percent, where they stay so.
+
+Unity's axes are left-handed, x right, y up, z forward as the avatar has them; a rotation about (x, y, z) there is one
+about (-z, x, -y) in ours. That follows from the two definitions; whether an avatar mirrors its person is a setting of
+its software, and not proved here: `flip=yaw+roll` undoes a mirror.
 
 Messages are read here, in a third of python-osc's time, and bundles too: python-osc 1.10 does not return from one that
 gives a size of -4.
@@ -27,12 +30,14 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.rotations import angles_of
-from sfms_robot.sources.live_face import ANY, UdpSight, addresses_of_this_machine
+from sfms_robot.signals.spaces import LiveUnits, channel_of, used_line
+from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
 
-PORT: Final = 39539  # what the protocol gives those who receive
+PORT: Final = USUAL_PORTS["vmc"]
 
 # The ARKit shapes nearest to a preset of VRM 0 and 1.
 _SMILE: Final = {"mouthSmileLeft": 1.0, "mouthSmileRight": 1.0, "cheekSquintLeft": 0.5, "cheekSquintRight": 0.5}
@@ -59,8 +64,7 @@ _PRESETS: Final[Mapping[str, Mapping[str, float]]] = {
     "neutral": {},
 }  # fmt: skip
 _ARKIT: Final = len(BLENDSHAPES)
-# Every name as it stands on the wire, lower case, and its place among the values: ARKit's first, then the presets.
-_PLACES: Final = {name.lower().encode(): place for place, name in enumerate((*BLENDSHAPES, *_PRESETS))}
+_NAMES: Final = (*BLENDSHAPES, *_PRESETS)  # of the values
 _AS_ARKIT: Final = np.array(
     [[preset.get(name, 0.0) for name in BLENDSHAPES] for preset in _PRESETS.values()], np.float32
 )
@@ -69,6 +73,13 @@ _MOST_ELEMENTS: Final = 512  # of a packet
 _DEEPEST: Final = 4  # bundles in bundles
 _MOST_UNKNOWN: Final = 64  # names that are counted apart
 _UNIT_RANGE: Final = (0.9, 1.1)  # length of a quaternion that is one
+_FACE_S: Final = 0.1  # after so long a face without "Apply" is complete
+_MOST_VALUE: Final = 1000.0
+
+_NOTHING: Final = (
+    "neither blendshapes (/VMC/Ext/Blend/Val) nor the bone Head among its messages: switch on their sending"
+)
+_ONLY_THE_HEAD: Final = "the head's pose and no blendshapes: switch on sending of blendshapes (perfect sync)"
 
 _BUNDLE: Final = b"#bundle\0"
 _SIZE: Final = struct.Struct(">i")
@@ -79,7 +90,7 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
     """Yield the messages of a packet, one or a bundle of them, in order. Raises PacketError for other bytes."""
     if not data.startswith(_BUNDLE):
         if not data.startswith(b"/"):
-            raise PacketError("no OSC packet")
+            raise PacketError(foreign(data) or "no OSC packet")
         yield data
         return
     if depth == _DEEPEST:
@@ -147,24 +158,42 @@ def turn_of_unity(quaternion: Sequence[float]) -> Doubles:
     return turn
 
 
-class VmcDecoder:
+@lru_cache(maxsize=1024)
+def _place(name: bytes) -> int | None:
+    """Return the place of a name among the values."""
+    text = name.decode("utf-8", "replace")
+    preset, channel = text.lower().rpartition(".")[2], channel_of(text)
+    found = preset if preset in _PRESETS else channel
+    return _NAMES.index(found) if found in _NAMES else None
+
+
+class VmcDecoder(Decoder):
     """`Decoder` of one avatar. A name that is not sent again keeps its value, as receivers of avatars have it."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(("messages", "wrong_messages", "lost_tracking"), 0)
-        self._unknown: set[bytes] = set()
         self.restart()
 
     def restart(self) -> None:
-        self._values = [0.0] * len(_PLACES)
+        self._unknown: set[bytes] = set()
+        self._values = [0.0] * len(_NAMES)
+        self._known: set[int] = set()  # places
+        self._pending: set[int] = set()  # places whose values are not applied yet
+        self._pending_s = 0.0  # since when
+        self._applies = False  # the sender says when a face is complete
+        self._turned = False
         self._shapes: Floats = np.zeros(_ARKIT, dtype=np.float32)
         self._has_arkit = False
         self._bones = {b"neck": np.eye(3), b"head": np.eye(3)}
-        self._tracking = True
+        self.blind = False
         self._changed = False
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
-        ours = False
+        if self._pending and (time_s - self._pending_s > _FACE_S or (data[:1] == b"#" and not self._applies)):
+            self._apply()
+        if not self._pending:
+            self._pending_s = time_s
+        ours, other = False, b""
         for number, element in enumerate(elements(data)):
             if number == _MOST_ELEMENTS:
                 raise PacketError("an OSC bundle without end")
@@ -175,10 +204,22 @@ class VmcDecoder:
                     self._take(element)
                 except PacketError:
                     self._counts["wrong_messages"] += 1
+            else:
+                other = element
         if not ours:
-            raise PacketError("no packet of the VMC protocol")
-        changed, self._changed = self._changed, False
-        return self._motion() if changed and self._tracking else None
+            raise PacketError(foreign(other) or "no packet of the VMC protocol")
+        return self._face()
+
+    def due(self, time_s: float) -> Floats | None:
+        if self._pending and time_s - self._pending_s > _FACE_S:
+            self._apply()
+        return self._face()
+
+    def remark(self) -> str | None:
+        if not self._unknown and not self._known:
+            return None if self.blind else _ONLY_THE_HEAD if self._turned else _NOTHING
+        moved = {name for place in self._known for name in _PRESETS.get(_NAMES[place], {_NAMES[place]: 1.0})}
+        return used_line(moved, [name.decode("utf-8", "replace") for name in self._unknown]) if self._unknown else None
 
     def statistics(self) -> Mapping[str, Any]:
         """Return counts of messages, those of unexpected types, losses of tracking, and unknown names."""
@@ -191,8 +232,9 @@ class VmcDecoder:
             return
         match address, arguments(element, at):
             case b"/VMC/Ext/Blend/Val", [bytes(name), value, *_] if _is_number(value) and math.isfinite(value):
-                self._blend(name.lower(), min(max(float(value), 0.0), 1.0))
+                self._blend(name, min(max(float(value), -_MOST_VALUE), _MOST_VALUE))
             case b"/VMC/Ext/Blend/Apply", _:
+                self._applies = True
                 self._apply()
             case b"/VMC/Ext/Bone/Pos", [bytes(name), _, _, _, *quaternion]:
                 if name.lower() in self._bones:
@@ -203,30 +245,42 @@ class VmcDecoder:
                 raise PacketError("values of other types")
 
     def _blend(self, name: bytes, value: float) -> None:
-        place = _PLACES.get(name)
-        if place is not None:
-            self._values[place] = value
-            self._has_arkit = self._has_arkit or (place < _ARKIT and value > 0.0)
-        elif len(self._unknown) < _MOST_UNKNOWN:
-            self._unknown.add(name)
+        place = _place(name)
+        if place is None:
+            if len(self._unknown) < _MOST_UNKNOWN:
+                self._unknown.add(name)
+            return
+        if place in self._pending and not self._applies:  # the next face begins
+            self._apply()
+        self._pending.add(place)
+        self._known.add(place)
+        self._values[place] = value
+        self._has_arkit = self._has_arkit or (place < _ARKIT and value > 0.0)
 
     def _turn(self, bone: bytes, quaternion: Sequence[Any]) -> None:
         length = math.hypot(*quaternion) if len(quaternion) == 4 and all(map(_is_number, quaternion)) else 0.0
         if not _UNIT_RANGE[0] <= length <= _UNIT_RANGE[1]:  # NaN is in no range
             raise PacketError("not a quaternion of unit length")
         self._bones[bone] = turn_of_unity([part / length for part in quaternion])
-        self._changed = True
+        self._changed = self._turned = True
 
     def _apply(self) -> None:
+        self._pending.clear()
+        if self._unknown and not self._known:
+            return  # nothing of it can be shown
         values = np.array(self._values, dtype=np.float32)
         self._shapes = values[:_ARKIT] if self._has_arkit else (values[_ARKIT:, None] * _AS_ARKIT).max(axis=0)
         self._changed = True
 
     def _track(self, tracking: bool) -> None:
-        self._counts["lost_tracking"] += self._tracking and not tracking
-        self._tracking = tracking
+        self._counts["lost_tracking"] += not self.blind and not tracking
+        self.blind = not tracking
 
-    def _motion(self) -> Floats:
+    def _face(self) -> Floats | None:
+        """Return what has changed since the last question."""
+        changed, self._changed = self._changed, False
+        if not changed or self.blind:
+            return None
         motion = np.zeros(MOTION_DIM, dtype=np.float32)
         motion[POSE][:3] = angles_of((self._bones[b"neck"] @ self._bones[b"head"])[None])[0]
         motion[SHAPES] = self._shapes
@@ -242,7 +296,7 @@ def open_vmc(argument: str) -> UdpSight:
 
     Raises as `UdpSight`.
     """
-    return UdpSight("vmc", argument, PORT, VmcDecoder(), _hint)
+    return UdpSight("vmc", argument, PORT, VmcDecoder(), _hint, LiveUnits(angles=False))
 
 
 def _hint(host: str, port: int, wider: str) -> str:

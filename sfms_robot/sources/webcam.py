@@ -26,7 +26,7 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PortError, optional
 from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
 from sfms_robot.signals.quantiles import Quantiles
-from sfms_robot.signals.rotations import angles_of
+from sfms_robot.signals.rotations import FROM_CAMERA, camera_angles
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.worker import SourceWorker
 
@@ -40,7 +40,6 @@ _ALIVE_S: Final = 0.02
 # 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
 _EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
 
-_TO_ROBOT_AXES: Final = [2, 0, 1]  # their z (forward), x (own left), y (up)
 
 NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
 TAKE_OVER_S: Final = 1.0  # for so long, without a break
@@ -255,8 +254,7 @@ def _why_not(number: int) -> str:
 
 def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
     """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
-    turn = matrix[np.ix_(_TO_ROBOT_AXES, _TO_ROBOT_AXES)].astype(np.float64)
-    pose = (*angles_of(turn[None])[0], *matrix[_TO_ROBOT_AXES, 3] / 100.0)
+    pose = (*camera_angles(matrix), *matrix[FROM_CAMERA, 3] / 100.0)
     eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
     return SeenFace(
         np.array([*pose, *(shapes.get(name, 0.0) for name in BLENDSHAPES)], dtype=np.float32),

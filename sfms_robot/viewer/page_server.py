@@ -254,7 +254,7 @@ class PageServer:
         self._new_scene, self._scene, self._over = new_scene, new_scene(), None
         drawn: dict[str, Any] = {}
         if (scene := self._scene) is not None:
-            drawn = {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.text is not None}
+            drawn = {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.generic}
         self._hello = {**hello, **drawn}
         self._history.clear()
         self._began.set()

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from itertools import groupby
 
 import numpy as np
@@ -60,7 +61,7 @@ class Still(Nodder):
 
 
 def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end():
-    told = []
+    told, began_s = [], time.monotonic()
     with sr.Robot(HEAD, listener=(nodder := Nodder())) as robot:
         assert robot.state == "starting"
         nodded = threading.Event()
@@ -72,6 +73,7 @@ def test_a_listener_object_moves_the_head_and_its_nods_are_told_before_the_end()
     assert report["listener"] == "Nodder" and report["joints"]
     assert nodder.threads == {"listener"}
     assert len(told) == len({event.start_s for event in told})
+    assert all(began_s < event.starts_monotonic_s < time.monotonic() + 1.0 for event in told)
 
 
 def test_what_is_pushed_is_what_the_listener_hears_from_any_thread():
@@ -245,8 +247,7 @@ def test_a_plain_script_needs_no_main_guard_and_rests_when_it_forgets_to_stop(tm
     script = tmp_path / "mine.py"
     script.write_text(SCRIPT)
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
-    # A machine that is held up for half a second tells of servos that were silent meanwhile: nothing else may be told.
-    told = [line for line in done.stderr.splitlines() if not line.endswith((" is silent", " answers again"))]
+    told = [line for line in done.stderr.splitlines() if not line.startswith("this computer was too busy")]
     assert (done.returncode, done.stdout.strip(), told) == (0, "starting", [])
 
 

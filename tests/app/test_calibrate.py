@@ -256,6 +256,13 @@ def test_practice_on_emulated_servos_is_kept_apart(name):
     assert outcome.file.exists() and not overlay_file("two").exists()
 
 
+def test_a_stored_value_that_stops_a_joint_names_the_command_with_the_arguments_of_this_one(name):
+    person = Person("k", "", "", "", "n")
+    with launch([EmulatedServo(1, registers={"startup_configuration": 1}), EmulatedServo(2)]) as chain:
+        outcome = calibrate(name, chain.device, person.say, person.ask, ["jaw"])
+    assert f"; sfms-robot doctor --port {chain.device} --head {shlex.quote(name)} --fix" in outcome.skipped["jaw"]
+
+
 # --- what a run makes of it -------------------------------------------------------------------------------------
 
 
@@ -347,6 +354,7 @@ def test_the_command_that_a_refusal_names_records_the_value_and_the_head_starts(
         stored = identify(load_head(head), ["pan", "tilt"], {"main": chain.device}, RealClock())
         refused = command_line(*start)
         assert refused.code == 4 and "servo 2 (tilt): homing_offset is -100, wanted 0" in refused.err
+        assert f"(sfms-robot head calibrate --port {chain.device} {shlex.quote(head)} --joint tilt)" in refused.err
         cure = shlex.split(refused.err.strip().partition("fits it: sfms-robot ")[2])
         looked = command_line(*cure[:-1], "--json")
         errors = [each for each in looked.told["findings"] if each["severity"] == "error"]

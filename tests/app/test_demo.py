@@ -1,13 +1,25 @@
-"""`sfms-robot demo` in virtual time."""
+"""`sfms-robot demo`: in virtual time, with a visitor, and on a computer without pseudo terminals."""
 
+import json
+import os
+import subprocess
 import sys
+import threading
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from websockets.sync.client import connect
 
-from sfms_robot.app.listen.demo import compare_seeds, demo, free_folder, nods_over_seeds
-from sfms_robot.app.options import RunOptions
+from sfms_robot.app.listen.demo import compare_seeds, demo, free_folder, next_speaker, nods_over_seeds
+from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.data import speaker_names
+from sfms_robot.errors import install_command
 
 SHORT = RunOptions(head="op3_head", duration_s=1.0, fast=True)
+ELSEWHERE = Path(__file__).parents[1] / "elsewhere"
+WAIT_S = 60.0
 
 
 @pytest.mark.slow
@@ -18,9 +30,60 @@ def test_the_demo_draws_what_it_saw(tmp_path, monkeypatch, command_line):
     ended = command_line("demo", "--fast", "--head", "op3_head", "--duration", 20, "--json")
     told = ended.told
     assert ended.code == 0 and told["exit"] == "done" and told["nods"] >= 1 and told["neck_travel_deg"] > 10
-    assert told["pictures"] == ["sfms-demo/run.png", "sfms-demo/head.png"]
+    assert told["pictures"] == ["runs/demo/run.png", "runs/demo/head.png"]
     assert all((tmp_path / png).stat().st_size > 10_000 for png in told["pictures"])
-    assert (tmp_path / "sfms-demo" / "run.mcap").is_file()
+    assert (tmp_path / "runs" / "demo" / "run.mcap").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_while_a_visitor_is_there_the_bundled_people_talk_one_after_the_other(tmp_path):
+    seen = []
+
+    def visit(url):
+        with connect(url.replace("http", "ws", 1) + "ws") as page:
+            while len(seen) < 3:
+                told = json.loads(page.recv(timeout=WAIT_S))
+                if told["type"] == "hello":
+                    seen.append(told["speaker"])
+
+    with closing(begin_page("0")) as page:
+        page.wait()
+        threading.Thread(target=visit, args=(page.url,), daemon=True).start()
+        told = demo(replace(SHORT, fast=False), tmp_path / "demo", page=page)
+    first, second, third = seen
+    assert (second, third) == (next_speaker(first), next_speaker(second)) and first != second
+    assert told["exit"] == "done" and told["pictures"] == []
+    assert json.loads((tmp_path / "demo" / "report.json").read_text())["exit"] == "done"  # of the first
+
+
+def test_bundled_people_take_turns_and_the_first_follows_a_visitor():
+    names = speaker_names()
+    assert [next_speaker(name) for name in names] == [*names[1:], names[0]] and next_speaker("browser") == names[0]
+
+
+def elsewhere(folder, *words):
+    """Run a command where `tests/elsewhere` is the computer; return the object that it prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from sfms_robot.cli.main import main; main()", *words, "--json"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ELSEWHERE), str(Path(__file__).parents[2])])},
+        cwd=folder, capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_the_demo_runs_on_a_computer_without_pseudo_terminals(tmp_path):
+    told = elsewhere(tmp_path, "demo", "--view", "0", "--duration", "2")
+    assert told["exit"] == "done" and told["report"]["bus"]["errors"] == 0 and told["report"]["bus"]["silent"] == []
+    assert (tmp_path / "runs" / "demo" / "run.png").is_file()
+
+
+def test_a_head_receives_the_same_bytes_over_tcp_as_over_a_pseudo_terminal(tmp_path, command_line):
+    words = ("run", "--fast", "--duration", "1", "--head", "reachy_mini", "--audio", "katie")
+    assert elsewhere(tmp_path, *words)["wire"] == command_line(*words, "--json").told["wire"]
 
 
 @pytest.mark.slow
@@ -36,8 +99,8 @@ def test_a_recording_of_an_earlier_demo_is_replaced_only_when_told(tmp_path, com
 
 
 def test_a_second_demo_writes_beside_the_first(tmp_path):
-    first = tmp_path / "sfms-demo"
-    for name in ("sfms-demo", "sfms-demo-2", "sfms-demo-3"):
+    first = tmp_path / "demo"
+    for name in ("demo", "demo-2", "demo-3"):
         assert free_folder(first) == tmp_path / name
         (tmp_path / name).mkdir()
 
@@ -66,4 +129,4 @@ def test_without_a_package_of_pictures_the_run_is_kept_and_the_pip_install_named
     told = demo(SHORT, tmp_path / "demo")
     assert told["exit"] == "done" and (tmp_path / "demo" / "run.mcap").is_file()
     assert told["pictures"] == [str(tmp_path / "demo" / name) for name in pictures]
-    assert told["missing"].count("\n") == 0 and f"pip install 'sfms-robot[{extra}]'" in told["missing"]
+    assert told["missing"].count("\n") == 0 and told["missing"].endswith(install_command(extra))

@@ -7,17 +7,21 @@ from hypothesis import strategies as st
 from sfms_robot.app.servo.diagnosis import (
     Finding,
     Line,
+    Wanted,
     grouped,
     ids_text,
     judge_adapter,
     judge_duplicate_ids,
     judge_opening,
     judge_port,
+    judge_presence,
     judge_rate,
     udev_rule,
     wire_budget,
 )
+from sfms_robot.app.servo.serial_line import FoundServo
 from sfms_robot.app.servo.single_servo import checked_ids
+from sfms_robot.config import Faults
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.discovery import Holder, SerialDevice
 
@@ -70,6 +74,14 @@ def test_single_reads_pay_the_adapter_once_per_servo():
     assert slow["plain"]["ms"] == pytest.approx(150, abs=0.5) and slow["fast"] is None
     assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2, together=False)["plain"]["ms"] > 9 * 16
     assert wire_budget("feetech", 9, 1_000_000, 0.0, 16.0, 2, 2)["plain"]["ms"] < 18
+
+
+def test_a_servo_of_an_unknown_model_is_named_by_its_number_once():
+    wanted = {1: Wanted(joint="jaw", model="sts3215", model_number=777, faults=Faults())}
+    seen = FoundServo(id=1, baud=BAUD, model_number=2307, firmware=3, firmware_minor=9, table=None, wire=None)
+    line = Line(device="/dev/ttyUSB0", shown="/dev/ttyUSB0", family="feetech", wanted=wanted)
+    (found,) = judge_presence(line, {1: seen}, {}, BAUD)
+    assert found.problem == "unknown (2307) answers, the head says sts3215 (777)"
 
 
 def test_what_is_to_be_typed_reaches_the_servos_it_is_about():
@@ -125,7 +137,7 @@ def test_fast_sync_read_makes_a_slow_bus_fast_enough_where_it_works():
 
 def test_findings_alike_are_one_and_the_worst_come_first():
     notes = [Finding("note", f"id {i}", "slow", "do {id}", servo=i) for i in (3, 1, 2)]
-    out = grouped([*notes, *judge_duplicate_ids([7])])
+    out = grouped([*notes, *judge_duplicate_ids([7], LINE)])
     assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
     assert out[1].fix == "do 1-3"
 

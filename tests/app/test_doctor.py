@@ -269,7 +269,7 @@ def board(model: str, family: str, baud: int, rate_hz: float, registers: dict | 
     """What is said of 24 channels of a board."""
     with launch([EmulatedServo(i, model, baud, registers=registers or {}) for i in range(24)], virtual=True) as chain:
         sick = Patient(chain, 1, "xl330-m288", ())
-        wanted = dict(enumerate([sick.wanted[1]] * 24))
+        wanted = dict(enumerate([replace(sick.wanted[1], model=model)] * 24))
         return sick.examined(rate_hz, shown="/dev/ttyACM0", family=family, baud=baud, wanted=wanted, **line)
 
 
@@ -281,9 +281,10 @@ def test_a_board_that_answers_is_fit_and_one_that_does_not_comes_with_its_serial
     assert slow["exit_code"] == 0 and slow["budget"]["write_only"]["ms"] > 50
     assert "Hz of 50" in told(slow, "warning")[0] and "24 servos" in told(slow, "note")[0]
     with patient() as sick:  # servos on the port where the board should be
-        report = sick.examined(50.0, shown="/dev/ttyACM0", family=family)
-    assert told(report, "error") == [f"bus: no {family} board answers"] and report["exit_code"] == 4
-    assert ("USB Dual Port" if family == "maestro" else "jumpers") in fix_of(report, "board answers")
+        wanted = {0: replace(sick.wanted[1], model=model)}
+        report = sick.examined(50.0, shown="/dev/ttyACM0", family=family, wanted=wanted)
+    assert told(report, "error") == [f"bus: no {model} answers"] and report["exit_code"] == 4
+    assert ("USB Dual Port" if family == "maestro" else "jumpers") in fix_of(report, "answers")
 
 
 @pytest.mark.parametrize("stored", [{}, {"crc": 1}])
@@ -293,8 +294,11 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
     if crc == bool(stored):
         assert told(report, "error") == []
     else:
-        assert told(report, "error") == ["bus: no maestro board answers"]
-        assert "Enable CRC" in fix_of(report, "board answers")
+        (problem,) = told(report, "error")  # the line of a run
+        assert (
+            f"expects {'a' if stored else 'no'} CRC: set crc: {'true' if stored else 'false'} for this bus" in problem
+        )
+        assert "Enable CRC" in fix_of(report, "CRC")
 
 
 # --- ports ------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from sfms_robot.app.head.fit import (
 )
 from sfms_robot.app.head.head_check import fidelity, named_faces
 from sfms_robot.app.options import HeadOptions
+from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.config import load_head
 from sfms_robot.config.overlay import load_overlay, overlay_file
 from sfms_robot.errors import ConfigError
@@ -86,23 +87,25 @@ def test_babbling_keeps_to_the_limits_and_is_learnt_from(babbled, monkeypatch, t
     folder, report = babbled
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert report["limits"]["violations"] == 0 and report["exit"] == "done"
-    result = fit_head("inmoov2_maestro", folder, practice=True)
+    result = fit_head("inmoov2_maestro", folder)
     assert result["after"] < result["before"]
     json.dumps(result)
     head = load_head("inmoov2_maestro")
     practice = overlay_file(head.name, practice=True)
     assert load_overlay(head, practice).fit is not None
     assert not overlay_file(head.name).exists()
+    assert result["practice"] and result["file"] == str(practice)
 
 
 @pytest.mark.slow
 def test_what_is_no_recording_of_this_face_is_told(babbled, tmp_path):
     folder, head = babbled[0], load_head("inmoov2_maestro")
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
+    run = read_recording(folder)
     with pytest.raises(ConfigError, match=r"has no face\.csv"):
-        read_pairs(head, tmp_path)
+        read_pairs(head, tmp_path, run)
     with pytest.raises(ConfigError, match="without joint"):
-        read_pairs(load_head("face28"), folder)
+        read_pairs(load_head("face28"), folder, run)
 
 
 def test_random_faces_begin_and_end_at_rest_and_stay_faces():
@@ -123,3 +126,13 @@ def test_a_face_shows_more_of_a_face_than_a_neck_does(tmp_path):
     assert rows["face28", "all"]["expression"] > 0.5 and rows["op3_head", "all"]["expression"] == 0
     assert rows["face28", "brows.csv"]["expression"] > 0.9 and rows["face28", "brows.csv"]["pose"] is None
     assert rows["face28", "heads.csv"]["pose"] > 0.9 and rows["face28", "heads.csv"]["expression"] is None
+
+
+def test_where_no_file_can_be_written_nothing_moves(tmp_path, monkeypatch, command_line):
+    """A calibration asks nothing and a babble records nothing before the folder of their result is there."""
+    (tmp_path / "config").write_text("a file where the folder should be")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    for command in (["calibrate", "op3_head", "--port", "sim"], ["fit", "op3_head", "--babble", "--record", tmp_path]):
+        ended = command_line("head", *command)
+        assert ended.code == 2 and "config" in ended.err and "cannot be written" in ended.err
+        assert "Enter" not in ended.out and not (tmp_path / "run.mcap").exists()

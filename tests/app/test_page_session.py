@@ -104,7 +104,8 @@ def test_a_visitor_moves_halts_records_and_chooses_the_next_run():
 def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_path, caplog, capfd):
     head = tmp_path / "op3_head"
     shutil.copytree(data_dir("configs") / "heads" / "op3_head", head)
-    mesh = '<visual><geometry><mesh filename="/etc/passwd"/></geometry></visual></link>'
+    shapes = '<mesh filename="/etc/passwd"/>', '<capsule radius="1" length="1"/>', ""
+    mesh = "".join(f"<visual><geometry>{shape}</geometry></visual>" for shape in shapes) + "</link>"
     robot = (data_dir("sim") / "heads" / "op3_head" / "robot.urdf").read_text()
     (head / "robot.urdf").write_text(robot.replace("</link>", mesh, 1))
     with (head / "head.yaml").open("a") as file:
@@ -112,8 +113,10 @@ def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_pa
     options = RunOptions(head=str(head), audio="none", duration_s=0.5, packages=(str(tmp_path / "parts"),))
     with closing(begin_page("0")) as page, page_session(page, options) as pages:
         assert pages.run()["exit"] == "done"
-    (line,) = [record.message for record in caplog.records if "/etc/passwd" in record.message]
-    assert line.startswith(f"{head}/robot.urdf: link ") and line.endswith("the page leaves it out")
+    odd, empty, line = [record.message for record in caplog.records if "robot.urdf: link" in record.message]
+    assert "<capsule>, not box" in odd and "without a geometry: not drawn" in empty
+    assert line.startswith(f"picture of the head: {head}/robot.urdf: link ")
+    assert line.endswith("got '/etc/passwd': not drawn")
     assert "/etc/passwd" not in capfd.readouterr().err
 
 

@@ -44,11 +44,11 @@ def test_it_says_what_the_document_says():
     told = drawn(status("degraded", ("voice", "jaw"), faults=["jaw"]))
     for part in (
         "degraded", "voice, jaw", "continues without", "0:00:12 of 0:00:47", "face28", "-20 dB", "attention 62%",
-        "no sound", "3 nods, 12 blinks, 0 smiles", "99.9 of 100 Hz, 2 late", "frame to wire 11 ms (21)",
+        "no sound", "3 nods, 12 blinks, 0 smiles", "99.9 of 100 a second, 2 late", "11 ms after picture and sound",
         "lid_right 45 C", "jaw silent", "space halt",
     ):  # fmt: skip
         assert part in told
-    assert "speech to wire" not in told  # nobody knows yet
+    assert "speech begins" not in told  # nobody knows yet
 
 
 def test_who_asked_for_the_end_sees_that_it_comes():

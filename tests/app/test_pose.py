@@ -39,7 +39,9 @@ def test_later_words_go_over_earlier_ones():
         ("mouth=1", r"CHANNEL = 'mouth' is not a channel; did you mean 'mouthLeft'"),
         ("jawOpen=1.5", r"jawOpen = '1.5' is not a number in its range \(0..1\)"),
         ("jawOpen=nan", "jawOpen = 'nan'"),
-        ("yaw=wide", r"yaw = 'wide' .*\(-1.6..1.6\)"),
+        ("yaw=wide", r"yaw = 'wide' is not a number in its range, in rad \(-1.6..1.6\)"),
+        ("yaw=20", r"yaw = '20' is not a number in its range, in rad; 20 deg is yaw=0.349 \(-1.6..1.6\)"),
+        ("x=5", r"x = '5' .*, in m \(-0.1..0.1\)"),
         ("jawOpen=", "jawOpen = ''"),
     ],
 )

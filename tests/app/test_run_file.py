@@ -142,3 +142,37 @@ def test_a_recording_in_several_files_is_read_as_one(tmp_path, monkeypatch):
     assert len(recorder_module.parts_of(tmp_path / "many")) > 3
     assert many.whole and np.array_equal(one.times_s, many.times_s)
     assert np.array_equal(one.goals_rad, many.goals_rad) and np.array_equal(one.audio, many.audio)
+
+
+def same(one, other):
+    """Return whether two values are equal, NaN beside NaN."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(one, other, equal_nan=True) if isinstance(one, np.ndarray) else one == other
+
+
+def test_a_recording_in_the_messages_of_ros_2_is_read_as_one_in_json(tmp_path):
+    one, other = (read_recording(record(tmp_path / kind, record_format=kind)) for kind in ("json", "ros2"))
+    for name, value in vars(one).items():
+        assert name == "about" or same(value, getattr(other, name)), name  # `about` has the time of day
+    assert one.about.keys() == other.about.keys()
+
+
+def test_rosbags_opens_a_recording_in_the_messages_of_ros_2_without_definitions_of_its_own(tmp_path):
+    highlevel = pytest.importorskip("rosbags.highlevel", reason="needs rosbags, of the extra [dev]")
+    file = record(tmp_path, record_format="ros2") / RUN_FILE
+    with highlevel.AnyReader([file]) as bag:
+        read = {}
+        for connection, at_ns, data in bag.messages():
+            read.setdefault(connection.topic, []).append((at_ns, bag.deserialize(data, connection.msgtype)))
+        kinds = {each.topic: each.msgtype for each in bag.connections}
+    assert kinds["/joint_states"] == "sensor_msgs/msg/JointState" and len(read["/joint_states"]) == 200
+    at_ns, joints = read["/joint_states"][50]
+    assert at_ns == 500_000_000 and (joints.header.stamp.sec, joints.header.stamp.nanosec) == (0, 500_000_000)
+    assert tuple(joints.name) == JOINTS
+    np.testing.assert_allclose(joints.position, [0.2 * np.sin(0.5), 0.05, 0.0], atol=1e-5)
+    assert len(read["/audio"]) == 50 and len(read["/audio"][0][1].audio.data) == 1280
+    assert len(read["/robot_face/action_units"][0][1].intensity) == 99
+    assert [each.status[0].message for _, each in read["/diagnostics"]] == ["listening", "halted"]
+    assert read["/diagnostics"][1][1].status[0].values[0].value == "key"
+    assert json.loads(read["/sfms_robot/face"][0][1].data).keys() == {"time_s", *CHANNELS}

@@ -150,7 +150,7 @@ def test_a_server_that_is_killed_leaves_a_head_that_lives_and_one_that_comes_bac
     report = json.loads(out.splitlines()[-1])
     assert report["listener_state"]["restarts"] == 1
     assert "degraded" in [each["state"] for each in report["states"]["changes"]]
-    assert "listens again" in err
+    assert "was started again: joining again" in err
 
 
 @pytest.mark.slow

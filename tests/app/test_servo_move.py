@@ -9,7 +9,7 @@ from sfms_robot.app.servo.single_servo import read_registers
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import BusError, ConfigError, PortError, ServoError, TorqueError
+from sfms_robot.errors import NOTE, BusError, ConfigError, PortError, ServoError, TorqueError
 from sfms_robot.lab.bench.campaign_rig import FAMILIES, head_of
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.port import WrappedPort
@@ -73,7 +73,7 @@ def test_degrees_are_those_of_the_shaft_and_a_servo_that_held_goes_on_holding():
         (None, None, {}, "one of them"),
         ("5", "5", {}, "one of them"),
         ("x", None, {}, "not a place"),
-        ("2050", None, {"operating_mode": 1}, "sfms-robot servo write 1 operating_mode 3"),
+        ("2050", None, {"operating_mode": 1}, "sfms-robot servo write 1 operating_mode 3 --port /"),
     ],
 )
 def test_what_is_no_goal_is_refused_with_nothing_moved(to, by, stored, problem):
@@ -95,6 +95,7 @@ def outside(model, degrees=-12.0):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, caplog):
+    caplog.set_level(NOTE)
     servo, first, table = outside(model)
     with wire_on(servo, family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sfms_robot.app.servo.serial_line import Wire, check_device, open_wire, protocol_hint
+from sfms_robot.app.servo.serial_line import Wire, open_wire, other_wires, protocol_hint
 from sfms_robot.app.servo.single_servo import (
     Dump,
     checked_ids,
@@ -19,11 +19,13 @@ from sfms_robot.app.servo.single_servo import (
     restore,
     save_dump,
     scan,
+    scan_all,
     set_baud,
     set_id,
     watched,
     write_register,
 )
+from sfms_robot.app.wiring import EmulatedPort
 from sfms_robot.config import load_firmware_map
 from sfms_robot.config.base import load
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
@@ -269,6 +271,30 @@ def test_a_factory_reset_ends_where_it_says(keep, servo, baud):
         assert (back.id, back.baud) == (servo, baud)
 
 
+@pytest.mark.parametrize(
+    ("model", "number", "baud"), [("ax-12a", 1, 1_000_000), ("ax-12a", 7, 57_600), ("sts3215", 7, 115_200)]
+)
+@pytest.mark.parametrize("keep", ["all", "keep-id", "keep-id-and-baud"])
+def test_what_a_protocol_without_options_resets_is_written_back(model, number, baud, keep):
+    """A servo of Protocol 1 has id 1 and 1 Mbaud afterwards, whatever it was asked to keep."""
+    servo = EmulatedServo(number, model, baud, load_firmware_map(model).center_ticks, registers={"max_torque": 300})
+    family = "feetech" if model == "sts3215" else "dynamixel1"
+    with wire_on(servo, family=family) as (wire, _):
+        back = factory_reset(wire.find(number), keep, yes)
+        assert back.id == (1 if keep == "all" else number)
+        assert back.baud == (baud if keep == "keep-id-and-baud" else 1_000_000)
+        assert wire.find(back.id).baud == back.baud
+        assert read_registers(back, ["max_torque"])[0]["raw"] == back.registers()["max_torque"].initial
+
+
+def test_another_servo_is_not_taken_for_the_one_that_was_reset():
+    """Id 1 is at the rate that id 7 had: it must not get the id of the other."""
+    center = load_firmware_map("ax-12a").center_ticks
+    with wire_on(*(EmulatedServo(i, "ax-12a", 57_600, center) for i in (1, 7)), family="dynamixel1") as (wire, _):
+        assert factory_reset(wire.find(7), "keep-id-and-baud", yes).id == 7
+        assert [wire.find(i).baud for i in (1, 7)] == [57_600, 57_600]
+
+
 def test_a_factory_reset_does_not_make_two_servos_of_one_id():
     with wire_on(EmulatedServo(1, baud=57_600), EmulatedServo(7)) as (wire, _):
         with pytest.raises(ConfigError, match="id 1.*unplug"):
@@ -291,7 +317,19 @@ def test_watching_shows_position_supply_and_who_fell_silent(three):
     assert chain.digest() != before
 
 
+def test_the_second_number_of_an_sts_firmware_is_read():
+    with wire_on(EmulatedServo(1, "sts3215", registers={"firmware_minor": 9}), family="feetech") as (wire, _):
+        row = wire.find(1).row()
+        assert (row["firmware"], row["firmware_minor"]) == (53, 9)
+
+
 # --- ports ------------------------------------------------------------------------------------------------------
+
+
+def test_emulated_servos_confirm_a_silence_as_in_a_run():
+    with open_wire("sim", "dynamixel2", None, "op3_head") as wire:
+        assert isinstance(wire.port, EmulatedPort)
+        assert [wire.ping(servo) is not None for servo in (19, 20, 21)] == [True, True, False]
 
 
 def test_a_path_that_is_no_port_and_a_family_that_is_not_known_say_why(tmp_path):
@@ -299,7 +337,8 @@ def test_a_path_that_is_no_port_and_a_family_that_is_not_known_say_why(tmp_path)
         with open_wire("sim", "dynamixel3", None, "face28"):
             pass
     with pytest.raises(PortError, match="directory"):
-        check_device(str(tmp_path))
+        with open_wire(str(tmp_path), "dynamixel2", None, ""):
+            pass
     with pytest.raises(PortError, match="no such device"), open_wire(str(tmp_path / "x"), "dynamixel2", None, ""):
         pass
 
@@ -388,9 +427,20 @@ def test_servos_of_another_protocol_are_named(model, baud, asked):
     servo = EmulatedServo(1, model, baud, load_firmware_map(model).center_ticks)
     with wire_on(servo, family=asked) as (wire, chain):
         before, began_s = wire.baud, wire.clock.now_s()
-        hint = protocol_hint(wire)
+        hint = protocol_hint(other_wires(wire))
         spoken = SPOKEN[model]
         assert ("" if spoken == asked else f"--family {spoken}") in hint and bool(hint) == (spoken != asked)
         assert wire.baud == before and wire.clock.now_s() - began_s < 3.0
         chain.kill(1)
-        assert protocol_hint(wire) == ""  # an empty wire
+        assert protocol_hint(other_wires(wire)) == ""  # an empty wire
+
+
+@pytest.mark.parametrize("asked", ["dynamixel2", "feetech"])
+def test_a_scan_of_a_mixed_wire_lists_the_servos_of_every_protocol(asked):
+    mixed = EmulatedServo(1), EmulatedServo(7, "sts3215", 1_000_000), EmulatedServo(8, "sts3215", 1_000_000)
+    with wire_on(*mixed, family=asked) as (wire, _):
+        found, hint = scan_all(wire, [1, 7, 8])
+        assert {(seen.id, seen.model, seen.wire.family) for seen in found} == {
+            (1, "xl330-m288", "dynamixel2"), (7, "sts3215", "feetech"), (8, "sts3215", "feetech")
+        }  # fmt: skip
+        assert hint.endswith({"dynamixel2": "--family feetech", "feetech": "--family dynamixel2"}[asked])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.graph_export import export_listener
+from sfms_robot.app.catalogue import export_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.listeners.checkpoint import WEIGHTS, read_weights

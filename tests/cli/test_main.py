@@ -223,3 +223,16 @@ def test_a_shell_completes_names_of_heads():
 )
 def test_an_option_that_may_stand_alone_has_its_usual_value_then(words, read):
     assert main._completed(words.split()) == read.split()
+
+
+def test_a_note_is_a_plain_line_and_a_warning_is_marked():
+    program = (
+        "import logging\n"
+        "from sfms_robot.cli.main import main\n"
+        "from sfms_robot.errors import NOTE\n"
+        "try: main(['listener', 'list'])\n"
+        "except SystemExit: pass\n"
+        "for level in (logging.INFO, NOTE, logging.WARNING): logging.log(level, 'level %d', level)\n"
+    )
+    done = completed(program=[sys.executable, "-c", program])
+    assert done.stderr.splitlines() == ["level 25", "WARNING: level 30"]

@@ -56,7 +56,7 @@ def test_the_doctor_finds_a_directory_that_is_no_port_and_an_emulated_head_that_
     ended = command_line("doctor", "--json", "--port", tmp_path)
     assert ended.code == 3 and "directory" in ended.told["findings"][0]["problem"]
     ended = command_line("doctor", "--port", "sim", "--head", "face28")
-    assert not ended.code and "fit to run: 0 errors" in ended.out and "One tick of 28 servos" in ended.out
+    assert not ended.code and "fit to run: 0 errors" in ended.out and "the loop with 28 servos" in ended.out
 
 
 def test_release_says_of_every_joint_whether_its_torque_is_off(command_line):

@@ -11,6 +11,7 @@ from tiny_sfms_training import configuration, write_dyads
 
 from sfms_robot import config
 from sfms_robot.data import data_dir
+from sfms_robot.errors import install_command
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_curves_that_were_asked_for_name_the_missing_extra(arguments):
     program = [sys.executable, "-c", f"import sys; sys.modules['tensorboard'] = None; {PROGRAM[-1]}"]
     command = [*program, "train", "tokenizer", *arguments(), "--tensorboard"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    needs = "--tensorboard needs tensorboard, which is not installed: pip install 'sfms-robot[train]'"
+    needs = f"--tensorboard needs tensorboard, which is not installed: {install_command('train')}"
     assert (ended.returncode, ended.stderr) == (2, f"sfms-robot: {needs}\n")
 
 

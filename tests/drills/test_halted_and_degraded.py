@@ -11,7 +11,7 @@ from drill_rig import HEAD, Command
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here")]
 RUN = ("run", "--head", HEAD, "--duration", 600)
-TOLD = "WARNING: status: "
+TOLD = "status: "
 
 
 class Watched(Command):

@@ -1,4 +1,4 @@
-"""The emulator's process as a whole: control socket, terminal, virtual time, its end."""
+"""The emulator's process as a whole: control socket, device, virtual time, its end; by pty and by TCP."""
 
 import os
 import signal
@@ -10,11 +10,13 @@ import pytest
 import serial
 from virtual_time import Time
 
+from sfms_robot.app.wiring import EmulatedPort
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
-from sfms_robot.errors import BusError, ConfigError
+from sfms_robot.errors import BusError, ConfigError, PortError
+from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
-from sfms_robot.servo.port import VirtualTimePort
+from sfms_robot.servo.port import SerialPort, VirtualTimePort
 
 POSITIONS = (132).to_bytes(2, "little") + (4).to_bytes(2, "little")
 BAUD = 1_000_000
@@ -40,13 +42,18 @@ class Host:
         return found
 
 
+@pytest.fixture(params=["pty", "tcp"])
+def transport(request):
+    return request.param
+
+
 @pytest.fixture
-def virtual():
+def virtual(transport):
     """Start a chain in virtual time and a host on it."""
     open_ = []
 
     def start(*servos: EmulatedServo, **how):
-        chain = launch(servos or [EmulatedServo(i) for i in (1, 2, 3)], virtual=True, **how)
+        chain = launch(servos or [EmulatedServo(i) for i in (1, 2, 3)], virtual=True, transport=transport, **how)
         open_.append(chain)
         host = Host(chain)
         open_.append(host.port)
@@ -58,9 +65,41 @@ def virtual():
 
 
 def ping(device: str, servo: int, baud: int = BAUD) -> bytes:
-    with serial.Serial(device, baud, timeout=10) as port:
+    with serial.serial_for_url(device, baud, timeout=10) as port:
         port.write(encode_instruction(servo, dxl2.PING))
         return port.read(14)
+
+
+class Resuming(RealClock):
+    """A clock that lets a stopped process continue once `at_s` is past."""
+
+    at_s, pid = float("inf"), 0
+
+    def now_s(self):
+        now_s = super().now_s()
+        if now_s > self.at_s:
+            os.kill(self.pid, signal.SIGCONT)
+        return now_s
+
+
+@pytest.mark.parametrize("transport", ["pty", "tcp"])
+def test_a_silence_counts_only_if_the_emulator_confirms_it(transport):
+    clock = Resuming()
+    with launch([EmulatedServo(1), EmulatedServo(2)], transport=transport) as chain:
+        port = EmulatedPort(chain.device, chain.control, BAUD, clock)
+        port.discard_input()
+        chain.kill(2)
+        port.write(encode_instruction(2, dxl2.PING))
+        assert port.read(14, port.now_s() + 0.001) == b""  # it is silent
+        os.kill(chain.pid, signal.SIGSTOP)
+        port.write(encode_instruction(1, dxl2.PING))
+        clock.pid, clock.at_s = chain.pid, clock.now_s() + 0.001
+        deadline_s = port.now_s() + 0.001
+        assert len(port.read(14, deadline_s)) == 14  # the emulator is late
+        port.wait_until(deadline_s + 0.001)
+        assert clock.now_s() > clock.at_s + 0.001  # which is not time of the servos
+        assert port.read(14, port.now_s()) == b""
+        port.close()
 
 
 def test_reply_that_is_late_counts_as_silence_and_cannot_come_after_the_next_flush(virtual):
@@ -127,14 +166,17 @@ def test_hung_up_in_virtual_time_and_back(virtual):
     again.port.close()
 
 
-def test_unplugged_device_vanishes_and_comes_back_under_its_name():
-    with launch([EmulatedServo(1)]) as chain:
-        with serial.Serial(chain.device, BAUD, timeout=10) as port:
-            chain.hang_up()
-            with pytest.raises(OSError):
+def test_unplugged_device_vanishes_and_comes_back_under_its_name(transport):
+    with launch([EmulatedServo(1)], transport=transport) as chain:
+        port = SerialPort(chain.device, BAUD, Time())
+        chain.hang_up()
+        with pytest.raises(BusError):
+            for _ in range(3):
                 port.write(b"x" * 64)
-                port.read(1)
-        assert not os.path.lexists(chain.device)
+                port.read(1, 10.0)
+        port.close()
+        with pytest.raises(PortError, match="no such device|refused"):
+            SerialPort(chain.device, BAUD, Time())
         chain.come_back()
         assert len(ping(chain.device, 1)) == 14
 
@@ -149,8 +191,8 @@ def test_odd_bauds_are_heard_and_others_are_not(model, baud):
             assert port.read(14) == b""
 
 
-def test_wire_timing_tells_when_replies_were_due_and_when_they_left():
-    with launch([EmulatedServo(1)], timing="wire") as chain:
+def test_wire_timing_tells_when_replies_were_due_and_when_they_left(transport):
+    with launch([EmulatedServo(1)], timing="wire", transport=transport) as chain:
         ping(chain.device, 1)
         [stamp] = chain.stamps()
         statistics = chain.statistics()
@@ -198,6 +240,7 @@ def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
         ([EmulatedServo(1)], {"faults": ["bang"]}, "has no such kind as 'bang'"),
         ([EmulatedServo(1)], {"faults": ["drop:7"]}, "'drop:7' concerns no servo of this wire"),
         ([EmulatedServo(1)], {"link": "/no/such/folder/x"}, "lies in a folder that does not exist"),
+        ([EmulatedServo(1)], {"link": "x", "transport": "tcp"}, "needs a pseudo terminal, which only Linux has"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(servos, how, message):
@@ -224,9 +267,21 @@ def test_every_family_can_share_a_wire():
 # --- the end of the process -------------------------------------------------------------------------------------
 
 
-def test_process_ends_and_leaves_nothing_behind():
-    with launch([EmulatedServo(1)]) as chain:
-        folder = Path(chain.control).parent
+def test_hosts_at_a_tcp_port_share_the_wire_and_lose_nothing_they_wrote():
+    with launch([EmulatedServo(1), EmulatedServo(2)], transport="tcp") as chain:
+        first, second = (SerialPort(chain.device, BAUD, RealClock()) for _ in range(2))
+        for port, servo in ((first, 1), (second, 2), (first, 2)):  # the answer is the writer's
+            port.write(encode_instruction(servo, dxl2.PING))
+            assert port.read(14, port.now_s() + 10.0)[4] == servo
+        first.write(encode_instruction(1, dxl2.WRITE, bytes([64, 0, 1])))  # torque
+        first.close()
+        assert len(ping(chain.device, 1)) == 14 and chain.state(1)["torque"]
+        second.close()
+
+
+def test_process_ends_and_leaves_nothing_behind(transport):
+    with launch([EmulatedServo(1)], transport=transport) as chain:
+        folder = Path(chain.folder)
         assert folder.is_dir()
     chain.close()
     assert not folder.exists()

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -38,3 +39,14 @@ def test_an_example_runs(name, tmp_path):
     assert done.returncode == 0, done.stderr
     assert said in done.stdout
     assert "Traceback" not in done.stderr, done.stderr
+
+
+def test_the_app_of_reachy_mini_is_what_its_assistant_looks_for():
+    app = FOLDER / "reachy_mini_app"
+    project = tomllib.loads((app / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["entry-points"]["reachy_mini_apps"] == {project["name"]: "sfms_listener.main:SfmsListener"}
+    source = (app / "sfms_listener" / "main.py").read_text(encoding="utf-8")
+    assert "class SfmsListener(ReachyMiniApp)" in source and len(source.splitlines()) < 45
+    readme = (app / "README.md").read_text(encoding="utf-8")
+    assert readme.startswith("---\ntitle: ") and " - reachy_mini\n - reachy_mini_python_app\n" in readme
+    assert {"index.html", "style.css"} <= {path.name for path in app.iterdir()}

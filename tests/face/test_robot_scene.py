@@ -182,6 +182,7 @@ OUTSIDE = "expected a file in FOLDER (--package names another folder), got"
         ("notes.txt", "expected one of .stl, .obj, .ply, .dae, of at most 64 MiB, got"),
         ("notes.stl", "expected one of .stl, .obj, .ply, .dae, of at most 64 MiB, got"),
         ("large.stl", "of at most 64 MiB, got"),
+        ("lfs.stl", "expected a mesh, not a pointer of git-LFS (git lfs pull gets the file), got 'lfs.stl': not drawn"),
     ],
 )
 def test_a_mesh_that_may_not_be_public_is_left_out_and_named(tmp_path, command_line, mesh, expected):
@@ -195,6 +196,7 @@ def test_a_mesh_that_may_not_be_public_is_left_out_and_named(tmp_path, command_l
     (folder / "round.stl").symlink_to(folder / "round.stl")
     (folder / "notes.txt").write_text("secret")
     (folder / "notes.stl").symlink_to(folder / "notes.txt")
+    (folder / "lfs.stl").write_bytes(LFS)
     with (folder / "large.stl").open("wb") as large:
         large.truncate(MOST_MESH_BYTES + 1)
     mesh = mesh.replace("BESIDE", str(beside))
@@ -208,10 +210,11 @@ def test_a_mesh_that_may_not_be_public_is_left_out_and_named(tmp_path, command_l
     (line,) = scene.left_out
     assert line.startswith(f"{folder}/owl.urdf: link x: mesh filename: expected ") and "\n" not in line
     assert expected.replace("FOLDER", str(folder)) in line
-    assert check(str(folder))["problems"] == [line]
+    checked = check(str(folder))
+    assert not checked["problems"] and line in checked["remarks"]
     if len(mesh) < 100:
         ended = command_line("head", "check", folder, "--json")
-        assert ended.code == 2 and json.loads(ended.out)["problems"] == [line]
+        assert ended.code == 0 and line in json.loads(ended.out)["remarks"]
 
 
 def test_meshes_may_come_from_folders_of_the_command_line(tmp_path, command_line):
@@ -225,8 +228,32 @@ def test_meshes_may_come_from_folders_of_the_command_line(tmp_path, command_line
     assert scene_of(load_head(str(tmp_path / "owl"))).meshes == {}
     given = scene_of(load_head(str(tmp_path / "owl")), [str(parts)])
     assert given.meshes == {"package://owl/head.stl": parts / "head.stl"} and not given.left_out
-    assert command_line("head", "check", tmp_path / "owl").code == 2
-    assert command_line("head", "check", tmp_path / "owl", "--package", parts, "--json").code == 0
+    assert "--package names another folder" in command_line("head", "check", tmp_path / "owl").out
+    assert "--package" not in command_line("head", "check", tmp_path / "owl", "--package", parts, "--json").out
+
+
+@pytest.mark.parametrize(
+    ("name", "mesh"), [("owl", "owl/head.stl"), ("head", "head/owl/head.stl"), ("head", "head/urdf/owl/head.stl")]
+)
+def test_a_package_is_found_beside_the_urdf_and_among_the_folders_above(tmp_path, name, mesh):
+    """The head is the package itself, or the package lies beside the URDF's folder, or that of the URDF is inside."""
+    folder = tmp_path / name
+    folder.mkdir()
+    owl(folder, "{file: urdf/owl.urdf, joints: {jaw: BeakJoint}}")
+    (folder / "urdf").mkdir()
+    (folder / "owl.urdf").rename(folder / "urdf" / "owl.urdf")
+    inside = tmp_path / mesh
+    inside.parent.mkdir(exist_ok=True)
+    inside.write_text(TRIANGLE)
+    scene = scene_of(load_head(str(folder)))
+    assert scene.meshes == {"package://owl/head.stl": inside} and not scene.left_out
+
+
+def test_a_package_folder_of_the_command_line_is_known_by_its_name(tmp_path):
+    owl(tmp_path, "{file: owl.urdf, joints: {jaw: BeakJoint}}")
+    (tmp_path / "elsewhere" / "owl").mkdir(parents=True)
+    (tmp_path / "parts" / "head.stl").rename(tmp_path / "elsewhere" / "owl" / "head.stl")
+    assert scene_of(load_head(str(tmp_path)), [str(tmp_path / "elsewhere" / "owl")]).meshes
 
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
@@ -242,8 +269,9 @@ def test_a_broken_mesh_is_one_line_of_ours_and_none_of_vtk(tmp_path, capfd, suff
     scene.meshes["package://owl/head.stl"] = file = tmp_path / f"a{suffix}"
     file.write_bytes(content)
     said = "a picture needs one of .stl, .obj, .ply" if suffix == ".step" else "not a mesh that can be read"
-    with pytest.raises(ConfigError, match=f"^{file}: {said}$"):
-        render_robots(tmp_path / "a.png", [("", scene, scene.rest())], size_px=(64, 48))
+    render_robots(tmp_path / "a.png", [("", scene, scene.rest())], size_px=(64, 48))
+    assert scene.left_out == [f"{scene.urdf}: link head: mesh filename: {file}: {said}: not drawn"]
+    assert (tmp_path / "a.png").stat().st_size
     assert capfd.readouterr() == ("", "")
 
 

@@ -44,9 +44,18 @@ def test_shapes_sizes_and_colours(tmp_path):
     "old, new, told",
     [
         ("</robot>", "", "not XML: no element found"),
-        ('<robot name="two">', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:a/>', "a xacro file"),
+        ('<robot name="two">', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:a/>', "file with <xacro:a>"),
+        ('<robot name="two">', '<robot xmlns:x="http://wiki.ros.org/xacro"><x:if/>', "a xacro file with <xacro:if>: "),
+        ('<robot name="two">', '<robot xmlns:xacro="urn:any"><xacro:a/>', "a URDF of it (xacro robot.urdf > resolved"),
+        (
+            '<robot name="two">',
+            "<robot><xacro:a/>",
+            "unbound prefix: line 1, column 7; it is a xacro file without xmlns:",
+        ),
+        ('xyz="1 0 0"', 'xyz="1 0 ${height}"', "a xacro file with 1 0 ${height}: "),
+        ('<robot name="two">', '<machine xmlns="urn:any"/>', "not XML: "),
         ('<link name="slide"/>', "", "joint 'push' has as its child 'slide', which is not a link of this file"),
-        ('type="revolute"', 'type="floating"', "joint 'turn' has the type 'floating'; one of revolute, continuous"),
+        ('type="revolute"', 'type="ball"', "joint 'turn' has the type 'ball'; one of revolute, continuous"),
         ('xyz="0 0 2"', 'xyz="0 0 up"', "joint turn: xyz = '0 0 up' is not 3 finite numbers"),
         ('xyz="0 0 2"', 'xyz="0 0 0"', "joint 'turn' has an axis of length 0"),
         ('lower="-1"', 'lower="nan"', "joint turn: lower = 'nan' is not a finite number"),
@@ -54,8 +63,6 @@ def test_shapes_sizes_and_colours(tmp_path):
         ('joint="turn" m', 'joint="push" m', "joint 'push' mimics itself"),
         ('<parent link="arm"/>', '<parent link="slide"/>', "joint 'push' does not hang on the robot's first link"),
         ('<child link="slide"/>', '<child link="arm"/>', "joint 'push' has the child 'arm', which is that of turn too"),
-        ('<sphere radius="0.5"/>', "<capsule/>", "link 'arm' has the shape <capsule>"),
-        ('<sphere radius="0.5"/>', "<sphere/>", "link arm: radius = '' is not a finite number"),
         ('<link name="slide"/>', '<link name="slide"/><link name="loose"/>', "link 'loose' hangs on nothing"),
     ],
 )
@@ -70,3 +77,56 @@ def test_a_broken_file_is_one_line_that_names_what_is_wrong(tmp_path, old, new, 
 def test_a_file_that_is_not_there_is_told(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         read_urdf(tmp_path / "none.urdf")
+
+
+ODD = [
+    ('<sphere radius="0.5"/>', '<capsule radius="1" length="2"/>', "link 'arm' has the shape <capsule>, not box, "),
+    ('<sphere radius="0.5"/>', "<sphere/>", "link arm: radius = '' is not a finite number: not drawn"),
+    ('<sphere radius="0.5"/>', "", "link 'arm' has a visual without a geometry: not drawn"),
+    ('<geometry><sphere radius="0.5"/></geometry>', "", "link 'arm' has a visual without a geometry: not drawn"),
+    ('xyz="0 0 1" rpy', 'xyz="0 1" rpy', "link arm: xyz = '0 1' is not 3 finite numbers: not drawn"),
+    ('"1 0 0 1"', '"red"', "material red: rgba = 'red' is not 4 finite numbers: drawn grey"),
+    (
+        '<origin xyz="1',
+        '<origin rpy="0 0 90" xyz="1',
+        "joint turn: rpy: expected radians, got '0 0 90' (degrees?): drawn",
+    ),
+]
+
+
+@pytest.mark.parametrize("old, new, told", ODD)
+def test_one_odd_part_of_the_picture_is_left_out_and_named(tmp_path, old, new, told):
+    robot = read_urdf(written(tmp_path, TWO.replace(old, new)))
+    (line,) = robot.left_out
+    assert line.startswith(f"{tmp_path}/robot.urdf: {told}") and "\n" not in line
+    assert len(robot.visuals) == 1 + line.endswith(("grey", "as radians")) and len(robot.joints) == 2
+    if robot.text is not None:  # what the page draws in its place
+        cleaned = read_urdf(tmp_path / "robot.urdf", robot.text)
+        assert not cleaned.left_out and len(cleaned.visuals) == len(robot.visuals)
+
+
+def test_angles_beyond_a_turn_are_named_once_for_a_file(tmp_path):
+    text = TWO.replace('<origin xyz="1 0 0"/>', '<origin rpy="0 0 90"/>').replace('rpy="0 0 0"', 'rpy="180 0 0"')
+    assert ["in 2 elements (degrees?)" in line for line in read_urdf(written(tmp_path, text)).left_out] == [True]
+    turned = TWO.replace('rpy="0 0 0"', f'rpy="0 0 {np.pi}"')
+    assert not read_urdf(written(tmp_path, turned)).left_out
+
+
+FLOATING = '<joint name="a" type="floating"><parent link="sky"/><child link="base"/></joint>'
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ('<robot name="two">', '<robot name="two" xmlns="http://www.ros.org">'),
+        ('<robot name="two">', '<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">'),  # nothing of it left
+        ('"1 0 0 1"', '"1 0 0"'),
+        ('<link name="base">', f'<link name="sky"/>{FLOATING}<link name="base">'),
+    ],
+)
+def test_what_other_programs_read_is_read(tmp_path, old, new):
+    robot = read_urdf(written(tmp_path, TWO.replace(old, new)))
+    box, ball = robot.visuals
+    assert not robot.left_out and box.color == (1, 0, 0, 1) and ball.shape == "sphere" and "turn" in robot.joints
+    again = robot if robot.text is None else read_urdf(tmp_path / "robot.urdf", robot.text)
+    np.testing.assert_array_equal(again.link_places({"turn": 1.0})["slide"], robot.link_places({"turn": 1.0})["slide"])

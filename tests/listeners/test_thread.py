@@ -81,6 +81,7 @@ def test_plans_in_time_are_no_matter_however_late_they_are():
 
 
 def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_time(caplog):
+    caplog.set_level("INFO")
     lateness = Lateness()
     assert told(lateness, 0.0, LATE_S, 0.4) == []
     assert told(lateness, LATE_S, 5.0, 0.4)
@@ -88,6 +89,18 @@ def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_t
     assert [record.getMessage() for record in caplog.records] == [
         "the listener's plans come too late to be shown: the run continues without them",
         "the listener's plans are in time again",
+    ]
+
+
+def test_plans_that_are_late_by_their_source_are_not_the_listeners_fault(caplog):
+    lateness = Lateness()
+    for number in range(100):
+        frame = SpeakerFrame(number * FRAME_S, np.zeros(0, np.float32), None)
+        lateness.gave(frame, frame.time_s + 0.25)
+        lateness.came(plan(frame.time_s), frame.time_s + 0.25 + 0.2)
+        assert not lateness.lasting
+    assert [record.getMessage() for record in caplog.records] == [
+        "plans come too late: sound reaches the listener 250 ms late, by its source (said once)"
     ]
 
 

@@ -51,6 +51,7 @@ COMMANDS = (
     "head pose face28 yaw=0.1 --fast",
     "head solve reachy_mini --poses {tmp}/poses.csv --residual",
     "listener list",
+    "output list",
     "speaker list",
     "port list",
     "servo scan --port sim",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 import venv
+from functools import partial
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 from pins import COMMANDS, write_inputs
+
+from sfms_robot.errors import install_command
 
 ROOT = Path(__file__).parents[2]
 MAIN = "from sfms_robot.cli.main import main; main()"
@@ -89,6 +92,36 @@ def test_base_installation_drives_a_head(bare, how):
     assert report["exit"] == "done" and report["listener_state"]["engine"].startswith("onnx")
 
 
+def test_the_command_that_adds_an_extra_can_be_typed_in_the_present_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # another pip, or none: that of this Python is named
+    for folder, checkout in ((ROOT, "."), (tmp_path, ROOT)):
+        monkeypatch.chdir(folder)
+        python, said = install_command("plots").split(" -m ")
+        assert said == f"pip install -e '{checkout}[plots]'" and Path(folder, python) == Path(sys.executable)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.skipif(sys.platform == "win32", reason="links")
+def test_the_demo_of_a_wheel_runs_in_an_empty_folder_and_says_what_draws_its_plot(bare, tmp_path):
+    pytest.importorskip("hatchling")
+    here, python = tmp_path / "here", tmp_path / "venv" / "bin" / "python"
+    here.mkdir()
+    venv.create(tmp_path / "venv", symlinks=True)
+    environment = {**bare[1], "PYTHONPATH": bare[1]["PYTHONPATH"].split(os.pathsep)[0]}  # without the checkout
+    done = partial(subprocess.run, capture_output=True, text=True, check=False, timeout=120)
+    built = done([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path], cwd=ROOT)
+    assert built.returncode == 0, built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel]
+    put = done(pip)
+    assert put.returncode == 0, put.stderr
+    shown = done([python.with_name("sfms-robot"), *"demo --duration 2 --view 0".split()], cwd=here, env=environment)
+    assert shown.returncode == 0, shown.stderr
+    assert "face28 listened for 2.0 s" in shown.stdout and (here / "runs" / "demo" / "run.mcap").is_file()
+    assert shown.stderr.splitlines()[-1].endswith(f"{python} -m pip install 'sfms-robot[plots]'")
+
+
 # Commands up to the first use of an optional package, with the package that each names where it is missing.
 NEEDS = {
     "run --engine torch --fast --duration 1": "torch",
@@ -101,6 +134,7 @@ NEEDS = {
     "head show face28 --urdf {tmp}/head.png": "vtkmodules",
     "run --listener zenoh/arig-small --duration 1": "zenoh",
     "run --face webcam --fast --duration 1": "mediapipe",
+    "mcp": "mcp",
 }
 
 
@@ -127,7 +161,7 @@ def start(bare, words: str) -> subprocess.CompletedProcess[str]:
 def test_what_needs_an_extra_names_it_in_one_line(bare, folder, words, package):
     done = start(bare, words.format(tmp=folder))
     (line,) = done.stderr.splitlines()[-1:]
-    assert done.returncode == 2 and f"needs {package}, which is not installed: pip install" in line
+    assert done.returncode == 2 and f"needs {package}, which is not installed: " in line and " install -e " in line
     assert "Traceback" not in done.stderr
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, ListenerEvent, Plan
+from sfms_robot.ports import Tick
 from sfms_robot.runtime.planned_events import WINDOW, EventWatch, PlannedEvents
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 
@@ -99,6 +100,18 @@ def test_callbacks_are_told_and_one_that_raises_is_detached_and_named():
 def test_an_unknown_event_is_refused_with_those_there_are():
     with pytest.raises(InputError, match=r"on\('wink'\): no such event \(nod, shake, tilt, laugh"):
         EventWatch().on("wink", print)
+
+
+def test_an_event_says_when_it_starts_by_the_clock_of_programs():
+    nod = ListenerEvent("nod", 0.2, 0.6, 0.1)
+    watch, seen = EventWatch(), []
+    watch.tick(Tick(0.0, np.zeros(MOTION_DIM, np.float32), np.zeros(1), {}, origin_s=1000.0))
+    watch.on("nod", seen.append)
+    plan = Plan(0.04, 0.04 * np.arange(2, 10), np.zeros((8, MOTION_DIM), np.float32), events=(nod,))
+    watch.planned(plan)
+    watch.close()
+    watch.join(10)
+    assert (seen[0].start_s, seen[0].starts_monotonic_s, nod.starts_monotonic_s) == (0.2, 1000.2, None)
 
 
 def test_what_a_listener_decides_is_told_as_it_is_and_motion_is_not_looked_at():

@@ -1,6 +1,7 @@
 """What a run measures of itself: counted in blocks as from the whole, and in memory that does not grow."""
 
 import gc
+import logging
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,6 +11,7 @@ import pytest
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Plan, SpeakerFrame
 from sfms_robot.runtime.clock import TickTime
 from sfms_robot.runtime.log import EventCounter, RunLog
+from sfms_robot.runtime.states import RunState
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 
 RATE_HZ = 100.0
@@ -115,3 +117,19 @@ def test_a_worker_that_has_ended_loses_no_event():
     for value in pitch[3000:]:
         counter.add(float(value))
     assert counter.total() == len(find_nods(pitch, RATE_HZ))
+
+
+def test_a_state_is_a_warning_only_for_what_no_other_line_reports(caplog):
+    caplog.set_level(logging.INFO)
+    log = RunLog(joints=["a", "b"], period_s=1 / RATE_HZ, audit=NoAudit())
+    for name, why in (("degraded", ("a", "listener")), ("degraded", ("a", "voice")), ("degraded", ("voice",)),
+                      ("halted", ("button",)), ("starting", ())):  # fmt: skip
+        log.entered(RunState(name, 0.0, why), 0.0)
+    assert [(each.levelname, each.getMessage()) for each in caplog.records] == [
+        ("INFO", "degraded: a, listener"),
+        ("WARNING", "degraded: a, voice"),
+        ("INFO", "degraded: voice"),
+        ("WARNING", "halted: button"),
+        ("INFO", "halt released"),
+        ("INFO", "starting"),
+    ]

@@ -1,8 +1,11 @@
 """A port that knows when its bytes have left, and how long an answer may take."""
 
+import pytest
 from emulated_port import EmulatedPort, Says
 
-from sfms_robot.servo.boards import RateLimitedPort
+from sfms_robot.config import load_firmware_map
+from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem
+from sfms_robot.servo.registers import Table
 
 
 def wire_of(baud=9600, patience_s=0.02):
@@ -46,3 +49,17 @@ def test_what_was_there_before_the_question_is_no_answer():
     wire, port, _ = wire_of()
     port.inbox += b"ab"
     assert wire.exchange(b"?", 2) is None
+
+
+class Echo:
+    def receive(self, data, baud, now_s):
+        return data
+
+
+@pytest.mark.parametrize("device", [Echo(), Says(b"\r\nraspberrypi login: "), Says(b""), Says(b"\x10\x00")])
+@pytest.mark.parametrize(("model", "crc"), [("maestro-24", False), ("maestro-24", True), ("ssc-32", False)])
+def test_a_port_that_echoes_talks_or_only_reports_damaged_bytes_is_not_a_board(device, model, crc):
+    table = Table.of(load_firmware_map(model))
+    wire = RateLimitedPort(EmulatedPort(device, 115_200), 115_200, 0.02)
+    problem = board_problem(table, board_for(table, crc), wire)
+    assert problem is not None and model in problem

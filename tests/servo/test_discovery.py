@@ -12,12 +12,14 @@ from sfms_robot.servo.discovery import (
     Holder,
     SerialDevice,
     access_problem,
+    check_device,
     choose_ports,
     describe,
     holders,
     list_ports,
     parse_ports,
     ports_data,
+    rivals,
     stable_name,
 )
 
@@ -116,6 +118,36 @@ def test_what_is_no_serial_port_is_told_apart(tmp_path):
     assert "directory" in access_problem(str(tmp_path))
     assert "file" in access_problem(str(tmp_path / "file"))
     assert "no such device" in access_problem(str(tmp_path / "nothing"))
+    for device, meant in (
+        ("192.168.1.5:4000", "is written socket://192.168.1.5:4000"),
+        ("null", "is written /dev/null"),
+        ("COM12", "are Windows'"),
+    ):
+        with pytest.raises(PortError, match=rf"^{device}: no such device; .*{meant} \(serial ports here: .+\)$"):
+            check_device(device)
+
+
+def test_what_else_takes_a_port_is_named_with_the_command_that_frees_it(tmp_path):
+    proc, active = tmp_path / "proc", tmp_path / "sys" / "class" / "tty" / "console" / "active"
+    active.parent.mkdir(parents=True)
+    active.write_text("tty0 ttyAMA0\n")
+    for pid, name, line in (
+        (7, "agetty", "/sbin/agetty --keep-baud ttyAMA0 vt220"),
+        (8, "ModemManager", "/usr/sbin/ModemManager"),
+        (9, "brltty", "/usr/bin/brltty --no-daemon"),
+    ):
+        (proc / str(pid)).mkdir(parents=True)
+        (proc / str(pid) / "comm").write_text(f"{name}\n")
+        (proc / str(pid) / "cmdline").write_bytes(line.replace(" ", "\0").encode())
+    told = {path: rivals(path, proc, tmp_path / "sys") for path in ("/dev/ttyAMA0", "/dev/ttyUSB3", "/dev/ttyS1")}
+    (console, _), (getty, disable) = told["/dev/ttyAMA0"]
+    assert "login console" in console and "process 7" in getty
+    assert disable == "sudo systemctl disable --now serial-getty@ttyAMA0"
+    assert [(words.split()[0], fix) for words, fix in told["/dev/ttyUSB3"]] == [
+        ("ModemManager", "sudo systemctl mask --now ModemManager"),
+        ("brltty", "sudo systemctl mask --now brltty"),
+    ]
+    assert told["/dev/ttyS1"] == []
 
 
 def plug(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> Listed:

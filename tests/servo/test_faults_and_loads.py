@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import Faults, LoadRule, Safety, Threshold, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.servo.chain.member import Member, MemberState
+from sfms_robot.servo.chain.member import Member, MemberState, Notices
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Startup
 from sfms_robot.servo.policy import counts, load_rules
 from sfms_robot.servo.stored_settings import JointNeeds
@@ -101,7 +101,7 @@ def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold(make_ri
 def jaw(**safety):
     servo = bus_servo("jaw", 1, load_firmware_map("xl330-m288"), safety=Safety(**safety))
     startup = Dynamixel2Startup(servo, JointNeeds(0, 4095), {})
-    return servo, Member(0, startup, Faults(), {})
+    return servo, Member(0, startup, Faults(), {}, Notices("main", 1))
 
 
 def test_pinch_needs_current_without_a_break():

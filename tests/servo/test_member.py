@@ -1,12 +1,14 @@
 """One servo's states: the arrows of the diagram in docs/safety.md. Without a wire, times are given."""
 
+import logging
+
 import pytest
 from emulated_port import bus_servo
 
 from sfms_robot.config import Faults, LoadRule, Safety, load_firmware_map
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain import member as rules
-from sfms_robot.servo.chain.member import LONGEST_PAUSE_S, Member, MemberState
+from sfms_robot.servo.chain.member import LONGEST_PAUSE_S, Member, MemberState, Notices
 from sfms_robot.servo.chain.startup import Silent
 
 OVERLOAD = 1 << 5
@@ -32,9 +34,9 @@ class Way:
         return STANDS
 
 
-def made(**how):
+def made(notices=None, **how):
     """An enabled servo."""
-    member = Member(0, Way(**how), Faults(), {})
+    member = Member(0, Way(**how), Faults(), {}, notices or Notices("main", 1))
     member.connected(True)
     member.enabled()
     return member
@@ -224,14 +226,36 @@ def test_limp_is_to_be_released_until_the_servo_says_so_and_again_after_a_silenc
     assert member.state is LIMP and member.to_release
 
 
-def test_loose_contact_is_said_once_in_ten_seconds_with_a_count(member, caplog):
+def test_loose_contact_is_said_once_in_ten_seconds_with_a_count(caplog):
+    caplog.set_level(logging.INFO)
+    notices = Notices("main", 1)
+    member = made(notices=notices)
     for tick in range(200):
         member.suspect(tick * 0.1)
         member.answered()
         member.back(tick * 0.1)
-    said = [record.getMessage() for record in caplog.records]
-    first, again = "jaw (id 4) is silent", "jaw (id 4) answers again"
-    assert said == [first, again, f"{first} (99 times since the last message)", again]
+        notices.log(tick * 0.1)
+    said = [(record.levelname, record.getMessage()) for record in caplog.records]
+    first, again = "jaw (id 4): silent", ("INFO", "jaw (id 4): answers again")
+    assert said == [("WARNING", first), again, ("WARNING", f"{first} (99 times since the last message)"), again]
+
+
+def test_servos_with_one_message_at_one_time_share_a_line(caplog):
+    notices = Notices("main", 3)
+    servos = [bus_servo(name, number, load_firmware_map("xl330-m288")) for number, name in enumerate("abc", 1)]
+    for at_s, servo in ((1.0, servos[0]), (1.1, servos[1])):
+        notices.add(servo, "silent", times=servo.id)
+        notices.log(at_s)
+    assert not caplog.messages
+    notices.log(1.3)
+    for servo in servos:
+        notices.add(servo, "silent")
+    notices.log()
+    notices.log()
+    assert caplog.messages == [
+        "a (id 1), b (id 2): silent (up to 2 times since the last message)",
+        "bus 'main': all 3 servos: silent",
+    ]
 
 
 def test_probes_of_a_dead_servo_become_rare_and_never_stop(member):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.errors import BusError, ServoError
+from sfms_robot.errors import NOTE, BusError, ServoError
 from sfms_robot.servo.chain.link import Silent, finish
 from sfms_robot.servo.chain.startup import SPEED_DEG_S, way_inside
 from sfms_robot.servo.registers import Table
@@ -199,6 +199,7 @@ def sagged(make_rig):
 
 
 def test_enable_waits_for_it_and_says_so(make_rig, caplog):
+    caplog.set_level(NOTE)
     rig = sagged(make_rig)
     held = rig.hold()
     assert rig.state(2)["position"] >= STORED["min_position_limit"]
@@ -238,8 +239,9 @@ def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_r
 
 
 def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(make_rig, caplog):
+    caplog.set_level(NOTE)
     rig = make_rig([EmulatedServo(1, start_ticks=4000)])
     held = rig.hold()
     (line,) = caplog.messages
     assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line
-    assert "held there and led in" in line and "head calibrate" in line and "\n" not in line
+    assert "is moved back slowly" in line and "head calibrate" in line and "\n" not in line

@@ -120,6 +120,15 @@ def listening():
         yield server, f"socket://127.0.0.1:{server.getsockname()[1]}"
 
 
+def test_a_network_port_has_one_rate():
+    with listening() as (_, url):
+        port = SerialPort(url, 1_000_000, Time())
+        port.set_baud(1_000_000)
+        with pytest.raises(PortError, match=f"^{url}: cannot change to 57600 baud: a socket:// port has the rate of"):
+            port.set_baud(57_600)
+        port.close()
+
+
 def test_a_network_port_sends_at_once_what_is_written():
     with listening() as (server, url):
         port = SerialPort(url, 1_000_000, Time())
@@ -128,7 +137,6 @@ def test_a_network_port_sends_at_once_what_is_written():
             assert near.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
             port.write(b"goal")
             assert peer.recv(9) == b"goal"
-            port.set_baud(57_600)
             peer.sendall(b"answer")
             assert port.read(9, 60.0) == b"answer"
         with pytest.raises(BusError, match="the device is gone"):

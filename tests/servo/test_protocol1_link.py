@@ -19,8 +19,8 @@ def link_of(model, starts, **more):
     [
         ("ax-12a", Found(12, 53)),
         ("mx-64-1.0", Found(310, 53)),
-        ("sts3215", Found(777, 53)),
-        ("scs0009", Found(1284, 53)),
+        ("sts3215", Found(777, 53, 0)),
+        ("scs0009", Found(1284, 53, 0)),
     ],
 )
 def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):

@@ -1,5 +1,8 @@
 """Sound files, and a signal between its samples."""
 
+import os
+import struct
+
 import numpy as np
 import pytest
 import soundfile
@@ -9,7 +12,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.signals.audio import AudioFile, Resampler, at_positions, energy_db, read_audio
+from sfms_robot.signals.audio import AudioFile, Downmix, Resampler, at_positions, energy_db, read_audio
 
 
 def tone(rate_hz, seconds=0.5, frequency_hz=440):
@@ -130,3 +133,69 @@ def test_at_whole_positions_samples_are_what_they_are_and_0_around_them(seed, sh
 def test_a_constant_stays_one():
     assert at_positions(np.ones(200, np.float32), np.linspace(50, 150, 333)) == pytest.approx(np.ones(333), abs=1e-6)
     assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)
+
+
+VOICE = np.random.default_rng(3).normal(0, 0.1, 64_000).astype(np.float32)
+OTHER = np.random.default_rng(4).normal(0, 0.1, 64_000).astype(np.float32)
+QUIET = np.zeros_like(VOICE)
+MIXES = {
+    "stereo": ([VOICE, OTHER], (VOICE + OTHER) / 2, False),
+    "twice": ([VOICE, VOICE], VOICE, False),
+    "one side": ([QUIET, VOICE], VOICE, True),
+    "antiphase": ([VOICE, -0.9 * VOICE], VOICE, True),
+    "centre of 5.1": ([QUIET, QUIET, VOICE, QUIET, QUIET, QUIET], VOICE, True),
+    "silence": ([QUIET, QUIET], QUIET, False),
+}
+
+
+@pytest.mark.parametrize(("channels", "mono", "said"), MIXES.values(), ids=MIXES.keys())
+def test_no_mix_loses_the_voice_in_a_file_or_live(tmp_path, caplog, channels, mono, said):
+    sound = np.stack(channels, axis=1)
+    soundfile.write(tmp_path / "a.wav", sound, 16000, subtype="FLOAT")
+    np.testing.assert_allclose(read_audio(tmp_path / "a.wav"), np.clip(mono, -1, 1), atol=1e-6)
+    assert [record.getMessage().split(": ")[1][:12] for record in caplog.records] == ["the mean of "] * said
+    live = Downmix()
+    pieces = [live(piece) for piece in np.split(sound, 100)]
+    np.testing.assert_allclose(np.concatenate(pieces), mono, atol=1e-6)
+    assert len(caplog.records) == 2 * said
+
+
+@pytest.mark.parametrize("size", [0, 0xFFFFFFFF, 0x7FFFFFFF])
+@pytest.mark.parametrize("extra", [b"", b"LIST\x03\0\0\0abc\0"])
+def test_a_wav_file_that_was_streamed_is_whole(tmp_path, caplog, size, extra):
+    soundfile.write(tmp_path / "a.wav", tone(16000), 16000)
+    data = (tmp_path / "a.wav").read_bytes()
+    at = data.index(b"data")
+    sizes = struct.pack("<I", size)
+    (tmp_path / "b.wav").write_bytes(data[:4] + sizes + data[8:at] + extra + b"data" + sizes + data[at + 8 :])
+    np.testing.assert_array_equal(read_audio(tmp_path / "b.wav"), read_audio(tmp_path / "a.wav"))
+    assert not caplog.records
+
+
+def test_a_file_that_cannot_seek_can_start_again(tmp_path, caplog):
+    soundfile.write(tmp_path / "a.wav", tone(8000, 1.0), 8000, subtype="GSM610")
+    file = AudioFile(tmp_path / "a.wav")
+    first = file.read(8000)
+    file.rewind()
+    np.testing.assert_array_equal(file.read(8000), first)
+    assert energy_db(first) == pytest.approx(energy_db(tone(16000)), abs=0.5) and not caplog.records
+    file.close()
+
+
+def test_a_path_that_the_locale_cannot_encode_is_opened(tmp_path):
+    path = tmp_path / os.fsdecode(b"caf\xe9.wav")
+    soundfile.write(tmp_path / "a.wav", tone(16000), 16000)
+    (tmp_path / "a.wav").rename(path)
+    assert len(read_audio(path)) == 8000
+
+
+def test_what_is_no_sound_file_says_what_to_do(tmp_path):
+    (tmp_path / "a.m4a").write_bytes(bytes(4) + b"ftypM4A " + bytes(400))
+    with pytest.raises(ConfigError, match=r"not a sound file that can be read .*ffmpeg -i a.m4a a.wav"):
+        AudioFile(tmp_path / "a.m4a")
+    (tmp_path / "a.wav").write_bytes(b"PK\x03\x04" + bytes(400))
+    with pytest.raises(ConfigError, match=r"is an archive \(zip\): unpack it first$"):
+        AudioFile(tmp_path / "a.wav")
+    os.mkfifo(tmp_path / "b.wav")
+    with pytest.raises(ConfigError, match="is a pipe or a device: sound is read from files"):
+        AudioFile(tmp_path / "b.wav")

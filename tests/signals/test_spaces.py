@@ -9,10 +9,15 @@ from sfms_robot.signals.spaces import (
     JAW_FULL_OPEN_RAD,
     SPACES,
     FlameMatrix,
+    LiveUnits,
+    beyond,
     bounded_least_squares,
+    channel_of,
     decode,
     encode,
     read_matrix,
+    units_of,
+    used_line,
 )
 
 RNG = np.random.default_rng(5)
@@ -127,3 +132,78 @@ def test_what_is_no_frame_is_refused():
         decode(np.zeros((1, 58)), "deca56")
     with pytest.raises(ValueError, match="frame 1 is not finite"):
         decode(np.array([[0.0] * 56, [np.nan] * 56]), "deca56")
+
+
+@pytest.mark.parametrize(
+    ("name", "channel"),
+    [
+        ("eyeBlink_L", "eyeBlinkLeft"),
+        ("EYEBLINKRIGHT", "eyeBlinkRight"),
+        ("BlendShape.mouthSmile_R", "mouthSmileRight"),
+        ("brow_inner_up", "browInnerUp"),
+        ("jawL", "jawLeft"),
+        ("tongueOut", "tongueOut"),
+        ("HeadYaw", "yaw"),
+        ("pitch [degrees]", "pitch"),
+        ("headX_cm", "x"),
+        ("AU12_r", None),
+        ("eyeBlink", None),
+    ],
+)
+def test_a_channel_goes_by_every_spelling(name, channel):
+    assert channel_of(name) == channel
+
+
+def test_every_shape_has_its_short_name():
+    for name in BLENDSHAPES:
+        short = name.replace("Left", "_L").replace("Right", "_R")
+        assert channel_of(f"ARKit.{short}") == channel_of(name.upper()) == name
+
+
+def test_what_is_left_out_is_counted_and_named():
+    assert used_line(["jawOpen", "yaw"], ["b", "a"]) == "1 of 52 channels used; not known: a, b"
+    assert used_line(BLENDSHAPES, []) == "52 of 52 channels used"
+
+
+TURN = np.sin(np.arange(90) / 30)
+
+
+def face_of(**channels):
+    motion = np.zeros((90, 58), dtype=np.float32)
+    for name, values in channels.items():
+        motion[:, CHANNEL_INDEX[name]] = values
+    return motion
+
+
+@pytest.mark.parametrize(
+    ("motion", "line"),
+    [
+        (face_of(yaw=1.2 * TURN, jawOpen=1.1), ""),
+        (face_of(yaw=5.5 * TURN), "angles are taken as degrees"),
+        (face_of(yaw=np.random.default_rng(0).normal(0, 0.3, 90)), "angles are taken as degrees"),  # trembles at 30 Hz
+        (face_of(jawOpen=40 * np.abs(TURN)), "blendshapes are taken as percent"),
+        (face_of(yaw=np.where(np.arange(90) == 50, 3.1, 0.1)), ""),  # a tracker lost its way once
+    ],
+)
+def test_units_are_decided_by_what_a_head_can_do_in_a_file_and_live(motion, line):
+    times_s, live = np.arange(90) / 30, LiveUnits()
+    units = units_of(motion, times_s)
+    assert units.line == line
+    taken = [live.take(row, time_s) for row, time_s in zip(motion, times_s, strict=True)]
+    assert live.units == units and all(each is None for each in taken[:30])
+    for each, row in zip(taken[31:], units.ours(motion)[31:], strict=True):
+        assert each is None or np.array_equal(each, row)
+
+
+def test_a_face_beyond_a_head_is_named():
+    row = np.zeros(58)
+    assert beyond(row) is None
+    for name, value, line in [
+        ("yaw", 20.0, "yaw: expected radians (in degrees?), got 20"),
+        ("z", -600.0, "z: expected metres (in cm or mm?), got -600"),
+        ("jawOpen", 80.0, "jawOpen: expected 0 to 1 (in percent?), got 80"),
+        ("jawOpen", np.nan, "jawOpen is not finite"),
+    ]:
+        wrong = row.copy()
+        wrong[CHANNEL_INDEX[name]] = value
+        assert beyond(wrong) == line

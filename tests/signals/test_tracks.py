@@ -1,6 +1,6 @@
 import gzip
+import json
 import math
-import re
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, ORDERS
+from sfms_robot.signals.rotations import about
 from sfms_robot.signals.tracks import Track, read_track, resample, write_track
 
 JAW, SMILE, BLINK = CHANNEL_INDEX["jawOpen"], CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["eyeBlinkLeft"]
@@ -127,7 +128,7 @@ def test_what_is_not_seen_stays_unknown_after_resampling():
     ("text", "message"),
     [
         ("", "the file is empty"),
-        ("t_s,jawOpen\n", "holds no rows: only a header"),
+        ("t_s,jawOpen\n", "only a header"),
         ("t_s,jawOpne\n0,1\n", "no column is a face channel .*jawOpen"),
         ("jawOpen\n1\n", "no column tells the time .*Timecode"),
         ("t_s,jawOpen\n0,0.5\n0.1,half\n", "row 3, column jawOpen = 'half' is not a number"),
@@ -156,10 +157,14 @@ def test_missing_and_binary_files_are_refused(tmp_path):
 
 FACE = ["t_s", "jawOpen", "eyeBlinkLeft"]
 UNUSABLE = {
-    "percent": (FACE, [[0, 0.1, 0.2], [0.04, 35, 0.2]], "row 3, column jawOpen = 35 is not a blendshape"),
+    "one in percent": (
+        FACE,
+        [[n, 35 * (n == 9), 0.2] for n in range(30)],
+        "row 11, column jawOpen = 35 is not a blend",
+    ),
     "negative": (FACE, [[0, 0.1, -4]], "row 2, column eyeBlinkLeft = -4 is not a blendshape"),
     "enormous": (FACE, [[0, 1e38, 0]], "row 2, column jawOpen = 1e.38 is not a blendshape"),
-    "degrees": (["t_s", "headYaw"], [[0, 35]], r"row 2, column headYaw = 35 is more than a turn: .*_deg"),
+    "one in degrees": (["t_s", "yaw"], [[n, 35 * (n == 9)] for n in range(30)], "row 11, column yaw = 35 is more than"),
     "millimetres": (["t_s", "x"], [[0, 600]], "row 2, column x = 600 is more than 10 m"),
     "too short": (FACE, [[0, 0.1, 0.2], [0.04, 0.1], [0.08, 0.1, 0.2]], "row 3 has 2 cells, the header has 3"),
     "too long": (FACE, [[0, 0.1, 0.2, 0.3]], "row 2 has 4 cells, the header has 3"),
@@ -176,10 +181,12 @@ def test_what_is_in_another_unit_or_ragged_is_one_line(tmp_path, header, rows, t
 
 
 @pytest.mark.parametrize("mark", [";", "\t"])
-def test_a_table_with_other_dividers_is_refused_for_that(tmp_path, mark):
-    (tmp_path / "a.csv").write_text("\n".join(mark.join(row) for row in (["t_s", "jawOpen"], ["0", "0,1"])))
-    with pytest.raises(ConfigError, match=re.escape(f"divided by {mark!r}, a comma is needed")):
-        read_track(tmp_path / "a.csv")
+def test_cells_may_be_divided_by_semicolons_or_tabs_and_decimals_by_a_comma(tmp_path, mark):
+    rows = (["t_s", "jawOpen", "yaw_deg"], ["0", "0,25", "-9,0"], ["0,04", "0.5", ""])
+    (tmp_path / "a.csv").write_text("\r\n".join(mark.join(row) for row in rows))
+    track = read_track(tmp_path / "a.csv")
+    assert track.times_s.tolist() == [0.0, 0.04] and track.motion[0, JAW] == 0.25
+    assert track.motion[0, CHANNEL_INDEX["yaw"]] == pytest.approx(math.radians(-9)) and np.isnan(track.motion[1]).all()
 
 
 def test_a_last_row_that_is_cut_off_is_left_out_and_said(tmp_path, caplog):
@@ -190,3 +197,165 @@ def test_a_last_row_that_is_cut_off_is_left_out_and_said(tmp_path, caplog):
 def test_a_tracker_that_overshoots_is_clipped(tmp_path):
     track = read_track(written(tmp_path / "a.csv", FACE, [0, 1.2, -0.1]))
     assert track.motion[0].max() == 1.0 and track.motion[0].min() == 0.0
+
+
+LIVE_LINK = ["Timecode", "BlendShapeCount", "JawOpen", "HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw"]
+
+
+def warnings(caplog, path):
+    return [record.getMessage().removeprefix(f"{path}: ") for record in caplog.records]
+
+
+def test_other_spellings_are_read_and_what_is_left_out_is_counted_and_named(tmp_path, caplog):
+    header = ["time_s", "frame", "eyeBlink_L", "BlendShape.eyeBlink_R", "mouth_smile_left", "jawOpne", "mood"]
+    file = written(tmp_path / "a.csv", header, *([n / 25, n, 0.9, 0.8, 0.7, 0.5, 1] for n in range(5)))
+    track = read_track(file)
+    assert track.known == {"eyeBlinkLeft", "eyeBlinkRight", "mouthSmileLeft"}
+    np.testing.assert_allclose(track.motion[0, [BLINK, BLINK + 1, SMILE]], [0.9, 0.8, 0.7])
+    assert warnings(caplog, file) == ["3 of 52 channels used; not known: jawOpne, mood"]
+
+
+def test_all_that_the_live_link_app_writes_is_known(tmp_path, caplog):
+    read_track(written(tmp_path / "a.csv", LIVE_LINK, ["10:00:00:00.000", 61, 0.2, 0.1, 0.1, 0.1, 0.1]))
+    assert not caplog.records
+
+
+def test_a_head_in_small_degrees_is_read_as_degrees_over_the_whole_file(tmp_path, caplog):
+    yaw = [5.5 * math.sin(n / 3) for n in range(25)]
+    rows = [[f"10:00:00:{2 * n:02d}.000", 61, 0.2, each, 4.0, 0, 0] for n, each in enumerate(yaw)]
+    file = written(tmp_path / "a.csv", LIVE_LINK, *rows)
+    np.testing.assert_allclose(read_track(file).motion[:, 2], np.radians(yaw), atol=1e-6)
+    assert len(caplog.records) == 1 and "angles are taken as degrees" in caplog.text
+
+
+def test_declared_units_are_believed_beside_undeclared_ones(tmp_path):
+    header = ["t_s", "yaw", "pitch_rad", "roll_deg"]
+    motion = read_track(written(tmp_path / "a.csv", header, *([n / 25, 20, 0.3, 3] for n in range(9)))).motion
+    np.testing.assert_allclose(motion[:, :3], np.tile([math.radians(3), 0.3, math.radians(20)], (9, 1)), rtol=1e-6)
+
+
+def test_percent_is_read_as_percent(tmp_path, caplog):
+    track = read_track(written(tmp_path / "a.csv", FACE, *([n / 25, 40, 0.5] for n in range(5))))
+    assert track.motion[0, JAW] == pytest.approx(0.4) and track.motion[0, BLINK] == pytest.approx(0.005)
+    assert "blendshapes are taken as percent" in caplog.text
+
+
+@pytest.mark.parametrize("counts", [48, 50, 100])
+def test_a_timecode_of_any_count_is_even_and_of_the_right_rate(tmp_path, counts):
+    rows = [[f"00:00:{n // counts:02d}:{n % counts:02d}.{n % 1000:03d}", 0.5] for n in range(130, 2 * counts + 140)]
+    times_s = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows)).times_s
+    np.testing.assert_allclose(np.diff(times_s), 1 / counts, rtol=0.01)
+
+
+@pytest.mark.parametrize("counts", [30, 60])
+def test_drop_frame_timecode_runs_on_over_a_minute_at_29_97(tmp_path, counts):
+    labels = [(59, n) for n in range(counts)] + [(60, n) for n in range(counts // 15, counts)]
+    rows = [[f"00:{second // 60:02d}:{second % 60:02d};{n:02d}", 0.5] for second, n in labels]
+    times_s = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows)).times_s
+    np.testing.assert_allclose(np.diff(times_s), 1.001 / counts, rtol=1e-6)
+
+
+def test_a_timecode_that_counts_otherwise_is_refused(tmp_path):
+    rows = [[f"00:00:{n // 40:02d}:{n % 40:02d}.000", 0.5] for n in range(200)]
+    with pytest.raises(ConfigError, match="column Timecode: expected 24, 25, .* counts a second, got 40$"):
+        read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows))
+
+
+def test_a_doubled_row_is_left_out_and_many_are_refused(tmp_path, caplog):
+    rows = [[n / 25, 0.1, 0.2] for n in (0, 1, 1, 2)]
+    assert len(read_track(written(tmp_path / "a.csv", FACE, *rows)).times_s) == 3
+    assert "rows with the time of the row before are left out: 1" in caplog.text
+    with pytest.raises(ConfigError, match="column t_s: 18 of 20 rows have the time of the row before"):
+        read_track(written(tmp_path / "b.csv", FACE, *([n // 10, 0.1, 0.2] for n in range(20))))
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "unit"),
+    [("timestamp", 0.04, ""), ("timestamp", 40, "ms"), ("time", 40_000, "us"), ("t_ms", 40, "")],
+)
+def test_a_time_is_in_the_unit_that_makes_frames_of_it(tmp_path, caplog, name, step, unit):
+    file = written(tmp_path / "a.csv", [name, "jawOpen"], *([n * step, 0.1] for n in range(5)))
+    np.testing.assert_allclose(read_track(file).times_s, np.arange(5) / 25)
+    assert warnings(caplog, file) == ([f"column {name} is taken as {unit}: call it {name}_{unit}"] if unit else [])
+
+
+def test_a_count_of_frames_is_no_time(tmp_path):
+    with pytest.raises(ConfigError, match="no column tells the time .*; frame counts: add a column time_s of frame / "):
+        read_track(written(tmp_path / "a.csv", ["frame", "jawOpen"], [0, 0.1], [1, 0.1]))
+
+
+MEDIAPIPE = (
+    '{"timestamp": 0, "faceBlendshapes": [{"categories": [{"index": 25, "score": 0.2, "categoryName": "jawOpen"},'
+    ' {"index": 44, "score": 0.6, "categoryName": "mouthSmileLeft"}]}]}'
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'[{MEDIAPIPE}, {{"timestamp": 40, "faceBlendshapes": []}}]',
+        f'{{"fps": 25, "frames": [{MEDIAPIPE}, {{"timestamp": 40}}]}}',
+        '[{"time_s": 0, "blendshapes": {"jawOpen": 0.2, "mouthSmile_L": 0.6}}, {"time_s": 0.04, "blendshapes": null}]',
+        '[{"time_s": 0, "JawOpen": 0.2, "mouthSmileLeft": 0.6}, {"time_s": 0.04}]',
+    ],
+)
+def test_json_is_read_as_a_table(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    track = read_track(tmp_path / "a.json")
+    np.testing.assert_allclose(track.motion[0, [JAW, SMILE]], [0.2, 0.6], rtol=1e-6)
+    assert np.isnan(track.motion[1]).all() and track.times_s.tolist() == [0.0, 0.04]
+
+
+TURNED = about(1, 0.3) @ about(0, 0.2) @ about(2, -0.1)  # a camera's axes: yaw about y, pitch about x, roll about z
+MATRIX = np.block([[TURNED, np.array([[3.0], [-5.0], [-40.0]])], [np.array([0.0, 0.0, 0.0, 1.0])]])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("facialTransformationMatrixes", [{"rows": 4, "columns": 4, "data": MATRIX.T.ravel().tolist()}]),  # in browsers
+        ("facial_transformation_matrixes", [MATRIX.tolist()]),  # in Python
+        ("transformation_matrix", MATRIX.ravel().tolist()),
+    ],
+)
+def test_the_transformation_matrix_of_mediapipe_is_the_head_pose(tmp_path, key, value):
+    shapes = {"faceBlendshapes": [{"categories": [{"categoryName": "jawOpen", "score": 0.2}]}]}
+    points = {"faceLandmarks": [[{"x": 0.5, "y": 0.4, "z": 0.01}]]}
+    frames = [{"time_s": n / 25, key: value, **shapes, **points} for n in range(3)] + [{"time_s": 0.12, key: []}]
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    track = read_track(tmp_path / "a.json")
+    np.testing.assert_allclose(track.motion[0, :6], [-0.1, 0.2, 0.3, 0.0, 0.0, 0.0], atol=1e-6)  # it stands still
+    assert track.motion[0, JAW] == pytest.approx(0.2) and np.isnan(track.motion[3]).all()
+
+
+def test_a_matrix_that_is_none_is_named_and_the_face_is_used(tmp_path, caplog):
+    frames = [{"time_s": n / 25, "jawOpen": 0.2, "transformMatrix": [1, 2, 3]} for n in range(3)]
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    assert read_track(tmp_path / "a.json").motion[2, JAW] == pytest.approx(0.2)
+    assert "not known: transformMatrix" in caplog.text
+
+
+@pytest.mark.parametrize("text", ["[", "{}", "[1, 2]", '[{"a": "b"}]', "[" * 100_000])
+def test_other_json_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"a\.json: (cannot be read as JSON|expected a list of frames)") as caught:
+        read_track(tmp_path / "a.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_openface_turns_and_its_action_units_are_read(tmp_path, caplog):
+    header = "frame, timestamp, confidence, success, pose_Tz, pose_Rx, pose_Ry, pose_Rz, AU12_r, AU23_r, AU45_r, AU12_c"
+    rows = [[n, n / 25, 0.98, n != 2, 600, 0.1, 0.0, 0.0, 2.0, 0, 5.0, 1] for n in range(4)]
+    rows[3][5:8] = [0.0, 0.2, 0.3]
+    rows = [[int(each) if isinstance(each, bool) else each for each in row] for row in rows]
+    track = read_track(written(tmp_path / "a.csv", header.split(","), *rows))
+    np.testing.assert_allclose(track.motion[0, :3], [0.0, 0.1, 0.0], atol=1e-6)  # nose down
+    np.testing.assert_allclose(track.motion[3, :3], [-0.3, 0.0, -0.2], atol=1e-6)  # to the own right, left ear down
+    np.testing.assert_allclose(track.motion[0, [SMILE, BLINK]], [0.4, 1.0])
+    assert np.isnan(track.motion[2]).all() and "not known: AU23_r" in caplog.text
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"PK\x03\x04" + bytes(400))
+    with pytest.raises(ConfigError, match=r"expected a face track, got an archive \(zip\): unpack it first"):
+        read_track(tmp_path / "a.csv")

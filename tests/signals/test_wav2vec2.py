@@ -102,5 +102,5 @@ def test_folder_that_is_no_model_is_one_clear_line(tmp_path, config, message):
 
 def test_missing_extra_names_the_install(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'sfms-robot\[wav2vec2\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install -e '.*\[wav2vec2\]'"):
         wav2vec2.Wav2Vec2(tmp_path)

@@ -20,6 +20,7 @@ from sfms_robot.sources.live_face import (
     SILENT_S,
     UNHEARD_S,
     Datagram,
+    Decoder,
     LiveFace,
     RestingFace,
     UdpSight,
@@ -191,14 +192,11 @@ def test_the_strongest_blink_since_the_last_question_is_seen():
 # --- packets ------------------------------------------------------------------------------------------------------
 
 
-class Bytes:
+class Bytes(Decoder):
     """A protocol of one byte: the first pose channel in percent; 255 is none of it."""
 
     def __init__(self):
         self.times_s = []
-
-    def restart(self):
-        pass
 
     def decode(self, data, time_s):
         self.times_s.append(time_s)
@@ -207,9 +205,6 @@ class Bytes:
         out = np.zeros(MOTION_DIM, np.float32)
         out[0] = data[0] / 100
         return out
-
-    def statistics(self):
-        return {}
 
 
 def free_port():
@@ -249,6 +244,16 @@ def test_a_second_sender_is_refused_once_in_the_log_until_the_first_is_silent(si
     feed(sight, FIRST, SILENT_S + 0.1)
     assert counts(sight) == {"faces": 2, "refused": 4, "malformed": 0}
     assert sight.statistics()["sender"] == "192.0.2.2:2"
+
+
+def test_a_new_port_for_each_packet_is_one_sender_and_two_programs_of_one_machine_are_two(sight):
+    for number in range(10):
+        feed(sight, ("192.0.2.1", 100 + number), number / 30)
+    assert counts(sight) == {"faces": 10, "refused": 0, "malformed": 0}
+    for number in range(10, 20):
+        feed(sight, ("192.0.2.1", 109 + number % 2), number / 30)
+    assert counts(sight) == {"faces": 16, "refused": 4, "malformed": 0}
+    assert sight.statistics()["sender"] == "192.0.2.1:109"
 
 
 def test_the_rest_of_another_sender_is_learned_from_its_first_face_on(sight):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES
-from sfms_robot.sources.live_voice import LiveVoice, SampleClock
+from sfms_robot.sources.live_voice import LiveVoice, Pace, SampleClock
 from sfms_robot.sources.paired import LONGEST_WAIT_S
 
 ORIGIN_S = 5000.0
@@ -229,3 +229,40 @@ def test_the_clock_is_the_line_under_all_callbacks(ppm, jitter_s, before, seed):
     assert clock.drift_ppm == pytest.approx(ppm, abs=30)
     assert clock.time_s(640_000) == pytest.approx(before + 640_000 / true_hz, abs=0.001)
     assert clock.count_at(clock.time_s(1234)) == pytest.approx(1234, abs=0.01)
+
+
+# --- the pace of what is handed over --------------------------------------------------------------------------------
+
+
+def problem_of(times_s, piece_s):
+    pace = Pace()
+    for time_s in times_s:
+        pace.observe(piece_s, time_s)
+    return pace.problem
+
+
+@pytest.mark.parametrize("rate", [0.87, 0.97, 1.2])
+@pytest.mark.parametrize("piece_s", [0.02, 0.5])
+def test_sound_that_comes_at_another_rate_than_time_passes_is_named_with_the_rate(rate, piece_s):
+    jitter = np.random.default_rng(0)
+    times_s = np.arange(0, 20, piece_s / rate) + jitter.uniform(0, 0.01, len(np.arange(0, 20, piece_s / rate)))
+    way = "falls behind" if rate < 1 else "is ahead"
+    assert problem_of(times_s, piece_s) == (
+        f"sound comes at {rate:.2f} of real time: its sender {way}; pace it by the clock"
+    )
+
+
+@pytest.mark.parametrize("together", [15, 40])
+def test_sound_in_bursts_is_named_with_their_distance(together):
+    times_s = [0.02 * together * (index // together) for index in range(1000)]
+    expected = f"sound comes in bursts, up to {20 * together} ms apart: send it as it is recorded"
+    assert problem_of(times_s, 0.02) == expected
+
+
+@given(st.sampled_from([0.01, 0.02, 0.1, 1.0]), st.floats(0, 0.06), st.floats(-200, 200), st.integers(0, 99))
+def test_sound_in_its_time_is_not_named_whatever_its_pieces_and_pauses(piece_s, jitter_s, ppm, seed):
+    rng = np.random.default_rng(seed)
+    times_s = np.arange(0, 30, piece_s) * (1 + ppm * 1e-6) + rng.uniform(0, jitter_s, len(np.arange(0, 30, piece_s)))
+    assert problem_of(times_s, piece_s) is None
+    talks = np.sin(times_s * 3.0) > -0.8  # a caller whose pauses are not sent
+    assert problem_of(times_s[talks], piece_s) is None or piece_s > 0.5

@@ -6,7 +6,14 @@ import pytest
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, SpeechFrames
+from sfms_robot.sources.microphone import (
+    LINES,
+    LONGEST_WAIT_S,
+    REFERENCE_WAIT_S,
+    FrontEnd,
+    Microphone,
+    SpeechFrames,
+)
 
 ORIGIN_S = 1000.0
 PIECE_S = 0.01
@@ -114,3 +121,23 @@ def test_what_is_no_voice_is_turned_down_while_joints_move_and_passes_while_they
         frames = record(front_end, 1.0)
         levels.append(np.abs(np.concatenate([frame.audio for frame in frames[5:]])).max())
     assert levels[0] > 0.15 and levels[1] < 0.01
+
+
+class Sends(list):
+    """A worker that has sent these messages."""
+
+    def messages(self, now_s):
+        sent = list(self)
+        self.clear()
+        return sent
+
+    def statistics(self):
+        return {"state": "running"}
+
+
+def test_what_is_wrong_with_a_device_is_logged_once_in_the_run(caplog):
+    slow = {"mix": "", "pace": "cheap: gives 0.90 s of sound a second"}
+    sends = Sends(["cheap", {"pace": 0.9, LINES: slow}, {"pace": 0.91, LINES: {**slow, "pace": "cheap: gives 0.91 s"}}])
+    microphone = Microphone(sends)
+    assert [record.getMessage() for record in caplog.records] == [f"{slow['pace']} (said once)"]
+    assert microphone.statistics()["pace"] == 0.91 and LINES not in microphone.statistics()

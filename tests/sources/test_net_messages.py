@@ -36,7 +36,7 @@ def test_sound_is_read_as_it_was_written(kind, rate_hz, sent_s, at_s, values):
 
 @given(TIMES, st.integers(0, 99), st.none() | st.floats(0, 1, width=32))
 def test_a_face_is_read_as_it_was_written(at_s, seed, attention):
-    motion = np.random.default_rng(seed).uniform(-1, 1, 58).astype(np.float32)
+    motion = np.random.default_rng(seed).uniform(-0.5, 1, 58).astype(np.float32)
     told = parse_message(face_message(1.0, at_s, motion, attention))
     assert isinstance(told, SeenMessage) and told.attention == attention
     np.testing.assert_array_equal(told.motion, motion)
@@ -56,7 +56,18 @@ def test_a_hello_says_what_it_feeds_and_wants():
     [
         (b"", "of 0 bytes, shorter than a header"),
         (bytes(23), "of 23 bytes"),
-        (bytes(LONGEST + 1), "more than 262144 bytes"),
+        (bytes(LONGEST + 1), "of 1048577 bytes, more than 1048576: send it in pieces"),
+        (bytes(960), r"no header \(raw PCM\?\): sound comes in binary messages"),
+        (np.full(480, 8000, "<i2").tobytes(), "raw PCM"),
+        (b"UklGRiQAAABXQVZF" * 100, r"a text that is not a JSON object \(base64\?\): sound comes in binary"),
+        (b"[1, 2]", "not a JSON object"),
+        (b"RIFF" + bytes(99), "a WAV file: sound comes in"),
+        (HEADER.pack(VOICE, 1, 0, 16000, 0, 0) + b"RIFF" + bytes(40), "a WAV file behind the header: send its samples"),
+        (b'{"type": "session.update", "session": {}}', "'session.update' is an event of the OpenAI Realtime API"),
+        (
+            b'{"event_id": "e", "type": "input_audio_buffer.append", "audio": "' + b"A" * 9000 + b'"}',
+            "'input_audio_buffer.append' is an event of the OpenAI Realtime API, .*: sound comes in binary messages",
+        ),
         (HEADER.pack(VOICE, 2, 0, 16000, 0, 0), "version 2, not 1"),
         (HEADER.pack(9, 1, 0, 16000, 0, 0), r"kind 9, which a robot is not sent \(voice, face, speech\)"),
         (HEADER.pack(VOICE, 1, 7, 16000, 0, 0), "kind 1"),
@@ -66,6 +77,8 @@ def test_a_hello_says_what_it_feeds_and_wants():
         (HEADER.pack(VOICE, 1, 0, 16000, 0, 5), "a time without the time of sending"),
         (HEADER.pack(FACE, 1, 0, 0, 0, 0) + bytes(4 * 57), "a face of 228 bytes, not of 58 or 59 float32"),
         (HEADER.pack(FACE, 1, 0, 0, 0, 0) + np.full(58, np.inf, "<f4").tobytes(), "not finite"),
+        (face_message(0, 0, [20.0] * 58), r"a face left out: roll: expected radians \(in degrees\?\), got 20"),
+        (face_message(0, 0, [0.0] * 6 + [80.0] * 52), r"expected 0 to 1 \(in percent\?\), got 80"),
         (b'{"type": "hello"', "Invalid JSON: EOF"),
         (b'{"a":' * 700, "Invalid JSON: recursion limit"),
         (b"{" + b" " * 5000, "JSON of more than 4096 bytes"),

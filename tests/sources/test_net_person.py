@@ -257,6 +257,45 @@ def test_malformed_messages_are_counted_and_said_once_the_next_is_read_and_too_m
     assert run.told["malformed"] == net_server.MOST_MALFORMED + 1
 
 
+@BOTH
+def test_each_wrong_message_is_answered_by_an_error_to_its_sender(run, Program):
+    program = joined(Program(run, feeds=["voice"]))
+    for data, said in (
+        (SECOND[:480].tobytes(), "no header (raw PCM?)"),
+        (b'{"type": "input_audio_buffer.append", "audio": "AAAA"}', "'input_audio_buffer.append' is an event of"),
+        (SECOND[:480].tobytes(), "no header (raw PCM?)"),
+    ):
+        program.send(data)
+        told = json.loads(program.receive())
+        assert told["type"] == "error" and told["error"].startswith(said)
+    for _ in range(5):
+        program.send(sound_message(VOICE, 16000, 0, 0, SECOND))
+    told = json.loads(program.receive())
+    assert told["error"].startswith("voice left out: 1 s came faster than time passes")
+    all_looked_at(program)
+    assert (run.told["malformed"], run.told["too_fast"]) == (3, 3)
+
+
+def test_a_program_whose_sound_comes_in_bursts_is_told_so_once(run):
+    program = joined(Tcp(run, feeds=["voice"]))
+    for number in range(40):
+        run.now_s += 0.4
+        for _ in range(4):
+            program.send(sound_message(VOICE, 16000, 0, 0, SECOND[:1600]))
+        looked_at(run, 4 * number + 5)
+    assert json.loads(program.receive())["error"].startswith("sound comes in bursts, up to 400 ms apart")
+    all_looked_at(program)
+
+
+def test_a_sentence_in_one_message_is_said_and_one_that_is_too_long_is_sent_back(run):
+    program = joined(WebSocket(run, feeds=["speech"]))
+    program.send(sound_message(SPEECH, 24000, 0, 0, np.full(24000 * 20, 8000, np.int16)))
+    program.send(sound_message(SPEECH, 24000, 0, 0, np.full(24000 * 22, 8000, np.int16)))
+    assert json.loads(program.receive())["error"].endswith("more than 1048576: send it in pieces")
+    all_looked_at(program)
+    assert run.speech.take(490).all() and not run.speech.take(520).any()
+
+
 def test_a_run_misses_whose_program_has_gone_but_not_a_silent_assistant(run):
     assert not run.voice.lost
     all_looked_at(joined(Tcp(run, feeds=["voice", "face", "speech"])))

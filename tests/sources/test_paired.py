@@ -59,6 +59,14 @@ def test_what_is_left_out_is_said_once_and_counted(caplog):
     assert "frame 0: voice left out: values that are not finite" in caplog.text
 
 
+def test_a_face_in_other_units_is_left_out_and_said_once(caplog):
+    face = FaceFrame(0.04, np.array([0, 0, 20, 0, 0, 0], np.float32), np.zeros(52, np.float32))
+    source = JudgedSource(Own(*[SpeakerFrame(0.0, np.zeros(0, np.float32), face)] * 3))
+    assert [source.read(0.0)[0].face for _ in range(3)] == [None] * 3
+    assert source.statistics()["left_out"] == {"face": 3} and len(caplog.records) == 1
+    assert "frame 0: face left out: yaw: expected radians (in degrees?), got 20" in caplog.text
+
+
 def test_good_frames_go_through_as_they_are():
     audio = np.linspace(-1, 1, FRAME_SAMPLES, dtype=np.float32)
     face = FaceFrame(0.04, np.ones(6, dtype=np.float32), np.full(52, 0.5, dtype=np.float32))

@@ -74,7 +74,10 @@ def test_the_grid_never_slips_and_every_frame_is_whole_or_empty(moves):
 def test_bytes_integers_floats_and_channels_mean_the_same():
     pcm = (np.sin(np.arange(3200) / 9) * 9000).astype(np.int16)
     outs = []
-    for way in (pcm.tobytes(), pcm, pcm / 32768, np.stack([pcm, pcm], axis=1), (pcm / 32768).astype(np.float32)):
+    two = np.stack([pcm, pcm], axis=1)
+    data, full = pcm.tobytes(), pcm / 32768
+    ways = (data, bytearray(data), memoryview(data), pcm, full, full.tolist(), two, two.T, full[None])
+    for way in (*ways, full.astype(np.float32)):
         person = Person()
         person.voice.hear(way, 16000)
         outs.append(heard(person.read(0.4)))
@@ -90,6 +93,17 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
         (b"abc", 16000, "3 bytes is not of 16-bit"),
         (np.zeros(9, dtype=np.int64), 16000, "pcm is int64"),
         (np.zeros((2, 2, 2)), 16000, r"shape \(2, 2, 2\)"),
+        (np.zeros((9, 9)), 16000, r"shape \(9, 9\): expected \(n, channels\) or \(channels, n\)"),
+        (np.zeros((40, 480)), 16000, r"shape \(40, 480\): .* at most 32 channels"),
+        (np.full(9, 8000.0), 16000, r"pcm: holds samples up to 8000, full scale is 1: .* by 32768"),
+        (np.zeros(9), "16000", "rate_hz = '16000': expected a rate of speech"),
+        (np.zeros(9), None, "rate_hz = None"),
+        (np.zeros(9, np.uint8), 16000, "pcm is uint8"),
+        (np.zeros(9, ">i2"), 16000, "pcm is >i2"),
+        (np.zeros(9, complex), 16000, "pcm is complex128"),
+        ("UklGRg==", 16000, "pcm is <U8"),
+        (None, 16000, "pcm is object"),
+        ((0, 1), 16000, "pcm is int64"),
     ],
 )
 def test_what_is_no_sound_is_refused_and_leaves_no_trace(pcm, rate_hz, told):
@@ -103,7 +117,7 @@ def test_what_is_no_sound_is_refused_and_leaves_no_trace(pcm, rate_hz, told):
 
 def test_what_is_not_finite_becomes_silence_and_is_counted():
     person = Person()
-    person.speech.say(np.r_[np.full(638, 0.5), np.nan, 1e300], 16000)
+    person.speech.say(np.r_[np.full(638, 0.5), np.nan, np.inf], 16000)
     person.voice.hear(np.full(1600, np.nan), 16000)
     frame = person.read(0.4)[0]
     assert frame.agent_audio[:638].all() and not frame.agent_audio[638:].any() and not frame.audio.any()
@@ -124,6 +138,30 @@ def test_a_caller_that_is_faster_than_time_fills_no_memory_and_delays_only_until
     assert person.voice.statistics()["delay_ms"] == 20.0
 
 
+def test_a_program_that_falls_behind_is_named_once(caplog):
+    person = Person()
+    for index in range(600):
+        person.read(index * 0.023)
+        person.voice.hear(np.zeros(320), 16000)
+    assert [record.getMessage() for record in caplog.records] == [
+        "hear(): sound comes at 0.87 of real time: its sender falls behind; pace it by the clock (said once)"
+    ]
+    assert person.source.statistics()["voice"]["pace"] == pytest.approx(0.87, abs=0.001)
+
+
+def test_bursts_are_named_and_then_heard_whole(caplog):
+    person, frames = Person(), []
+    for burst in range(30):
+        frames += person.read(burst * 0.4)
+        for piece in range(20):
+            person.voice.hear((burst * 6400 + piece * 320 + np.arange(320)) / 250_000, 16000)
+    sound = heard(frames[125:])
+    assert len(sound) == 640 * len(frames[125:])
+    assert np.diff(sound) == pytest.approx(1 / 250_000, abs=1e-5)
+    (said,) = caplog.records
+    assert said.getMessage().startswith("hear(): sound comes in bursts, up to 400 ms apart")
+
+
 def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     person = Person()
     person.sight.see(FaceFrame(123.0, np.ones(6, dtype=np.float32), np.full(52, 0.5, dtype=np.float32)))
@@ -138,6 +176,24 @@ def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     assert [frame.face is not None for at_s in (0.445, 0.52) for frame in source.read(at_s)] == [True, False, False]
     with pytest.raises(ConfigError, match=r"face has the shape \(52,\)"):
         person.sight.see(np.zeros(52))
+    with pytest.raises(ConfigError, match=r"shape \(1, 58\)"):
+        person.sight.see(np.zeros((1, 58)))
+
+
+def test_a_face_by_names_is_seen_and_one_in_other_units_is_refused():
+    person = Person()
+    person.sight.see({"eyeBlink_L": 0.5, "JawOpen": 0.25, "head_yaw": 0.1})
+    face = person.sight.at(0.0).face
+    assert face.motion[[2, 6 + 8]].tolist() == pytest.approx([0.1, 0.5]) and np.count_nonzero(face.motion) == 3
+    for wrong, told in (
+        ({"jawOpne": 1.0}, "'jawOpne' is not a channel; did you mean 'jawOpen'"),
+        ({"yaw": 20.0}, r"yaw: expected radians \(in degrees\?\), got 20"),
+        (FaceFrame.of(0.0, np.r_[np.zeros(6), np.full(52, 80.0)]), r"browDownLeft: expected 0 to 1 \(in percent\?\)"),
+        (np.full(58, np.nan), "roll is not finite"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            person.sight.see(wrong)
+    assert person.sight.at(0.0).face is not None
 
 
 def played(speech, frames):

@@ -130,10 +130,12 @@ def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     for flag, choices in (
-        ("audio", "mic, push, browser, FILE.wav"),
+        ("audio", "mic, push, browser, ros2, FILE.wav"),
         ("face", "live-link, vmc, webcam, push"),
         ("agent_audio", "device, tcp, FILE.wav"),
     ):
         said = f"--{flag.replace('_', '-')} nothing-so: no such file .{choices}"
         with pytest.raises(ConfigError, match=said):
             check_source(**{flag: "nothing-so"})
+    with pytest.raises(ConfigError, match="--audio -: sound is not read from a pipe: write it to a file .mic, push"):
+        check_source("-")

@@ -108,10 +108,10 @@ def test_a_piece_came_when_its_device_says_so_where_that_can_be(first_age_s, exp
 
 
 @pytest.mark.parametrize("channels", [1, 2, 16])
-def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
+def test_of_many_channels_the_one_with_the_voice_is_heard(channels, caplog):
     """Pieces as PortAudio hands them over, at a rate that no voice needs, with what is no sound in one of them."""
     capture = Capture(SoundDevice(name="array", number=3, channels=channels, rate_hz=192_000.0), 192_000.0, channels)
-    voice, origin_s = LiveVoice(), time.monotonic() - 0.5
+    voice, origin_s = LiveVoice(name="array"), time.monotonic() - 0.5
     voice.start(origin_s)
     piece = np.zeros((9_600, channels), np.float32)
     piece[:, 0], piece[:, 1:] = 0.25, -0.05
@@ -123,9 +123,21 @@ def test_of_many_channels_the_first_is_heard_and_of_two_the_mean(channels):
         capture._called(samples, len(samples), no_stamp, SimpleNamespace(input_overflow=False))
     capture.pass_on(voice, 0.0)
     told = voice.statistics()
-    assert told["rate_hz"] == 192_000 and told["not_finite"] == 4_800 * (2 if channels == 2 else 1)
+    assert told["rate_hz"] == 192_000 and told["not_finite"] == 4_800 * channels
     heard = np.concatenate([frame for frame in map(voice.take, range(40)) if frame is not None])
-    assert np.abs(heard).max() == pytest.approx(0.1 if channels == 2 else 0.25, abs=0.06) and heard.any()
+    assert np.abs(heard).max() == pytest.approx(0.25, abs=0.06) and heard.any()
+    line = f"array: the mean of {channels} channels loses the voice"
+    assert caplog.text.count(line) == (channels > 1) and (line in voice.mix.line) == (channels > 1)
+
+
+@pytest.mark.parametrize(("rate", "told"), [(0.9, "gives 0.90 s"), (1.0, ""), (1.004, ""), (1.1, "gives 1.10 s")])
+def test_a_device_whose_own_clock_is_wrong_is_named(rate, told):
+    capture = Capture(SoundDevice(name="cheap", number=3, channels=1, rate_hz=16_000.0), 16_000.0, 1)
+    for number in range(1_000):
+        capture.pace.observe(0.01 * rate, 0.01 * number)
+    assert capture.problem.startswith(f"cheap: {told} of sound a second" if told else "") and bool(told) == bool(
+        capture.problem
+    )
 
 
 def test_a_device_that_gives_no_more_sound_went_away():

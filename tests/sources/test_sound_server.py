@@ -1,5 +1,6 @@
 """`--audio mic` and `--play` on the real path: PortAudio, ALSA and a sound server, in real time."""
 
+import logging
 import time
 from contextlib import closing
 
@@ -123,6 +124,7 @@ def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
 
 @pytest.mark.slow
 def test_an_unplugged_microphone_is_lost_and_comes_back(hear, sound_server, caplog):
+    caplog.set_level(logging.INFO, "sfms_robot")
     hearing = hear("mic:person.monitor")
     hearing.seconds(0.4)
     assert not hearing.microphone.lost
@@ -306,6 +308,7 @@ def test_a_hush_silences_the_sound_server(sound_server):
 
 @pytest.mark.slow
 def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
+    caplog.set_level(logging.INFO, "sfms_robot")
     said = noise(60.0)
     with closing(open_source("none", "none", agent=RecordedVoice(said), play="person")) as source:
         origin_s = time.monotonic()

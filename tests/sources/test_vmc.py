@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES
+from sfms_robot.sources.live_face import Datagram
 from sfms_robot.sources.vmc import VmcDecoder, elements, open_vmc, turn_of_unity
 
 LEVEL = (0.0, 0.0, 0.0)
@@ -98,8 +99,51 @@ def test_presets_count_until_an_arkit_shape_moves():
 
 def test_names_that_say_nothing_are_counted():
     decoder = VmcDecoder()
-    shown(blend("Ahoge", 1.0), blend("Ahoge", 0.5), blend("Tail", 1.0), APPLY, decoder=decoder)
+    assert shown(blend("Ahoge", 1.0), blend("Ahoge", 0.5), blend("Tail", 1.0), APPLY, decoder=decoder) is None
     assert decoder.statistics()["unknown_names"] == 2
+    assert shown(blend("Joy", 1.0), APPLY, decoder=decoder) is not None
+    assert decoder.remark() == "4 of 52 channels used; not known: Ahoge, Tail"
+
+
+@pytest.mark.parametrize("written", ["mouthSmile_L", "BlendShape.mouthSmileLeft", "MOUTHSMILE_L", "mouth_smile_left"])
+def test_names_go_by_the_spellings_of_files(written):
+    motion = shown(blend(written, 0.5), blend("jawOpen", 0.25), APPLY)
+    assert motion[CHANNEL_INDEX["mouthSmileLeft"]] == 0.5 and motion[SHAPES].sum() == 0.75
+
+
+# --- faces that nothing completes -------------------------------------------------------------------------------
+
+
+def faces_of(rounds, pack, decoder=None):
+    """The jaw of each face that comes out of rounds of blendshapes a 30th of a second apart, and what is due then."""
+    decoder, jaws = decoder or VmcDecoder(), []
+    for number, value in enumerate(rounds):
+        values = [blend("jawOpen", value), blend("eyeBlinkLeft", 1.0 - value)]
+        for data in [bundle(*values)] if pack else [each.dgram for each in values]:
+            jaws += [decoder.decode(data, number / 30)]
+    jaws += [decoder.due(number / 30 + 0.05), decoder.due(number / 30 + 0.11)]
+    return [(jaw[CHANNEL_INDEX["jawOpen"]], jaw[CHANNEL_INDEX["eyeBlinkLeft"]]) for jaw in jaws if jaw is not None]
+
+
+@pytest.mark.parametrize("pack", [True, False])
+def test_without_apply_a_face_is_complete_when_the_next_begins_or_after_100_ms(pack):
+    assert faces_of([0.25, 0.5, 0.75], pack) == [(0.25, 0.75), (0.5, 0.5), (0.75, 0.25)]
+
+
+def test_with_apply_bundles_of_one_face_are_one_face():
+    decoder = VmcDecoder()
+    shown(blend("jawOpen", 0.5), APPLY, decoder=decoder)
+    assert shown(blend("jawOpen", 0.75), decoder=decoder) is None
+    assert shown(blend("eyeBlinkLeft", 0.75), decoder=decoder) is None
+    assert shown(APPLY, decoder=decoder)[CHANNEL_INDEX["jawOpen"]] == 0.75
+
+
+def test_a_sender_without_blendshapes_is_told_what_to_switch_on():
+    decoder = VmcDecoder()
+    shown(message("/VMC/Ext/OK", 1), decoder=decoder)
+    assert decoder.remark().startswith("neither blendshapes (/VMC/Ext/Blend/Val) nor the bone Head")
+    shown(bone("Head", IDENTITY), decoder=decoder)
+    assert decoder.remark().startswith("the head's pose and no blendshapes")
 
 
 # --- bones ------------------------------------------------------------------------------------------------------
@@ -187,6 +231,13 @@ def test_messages_of_wrong_types_are_counted_and_change_nothing(wrong):
         (bundle(APPLY)[:-4], "cut off"),
         (bundle(*[APPLY] * 1100), "without end"),
         (message("/tuio/2Dcur", "alive").dgram, "VMC"),
+        (message("/W", 3, 0.3).dgram, "Face Cap in live mode, which has no VMC: use Live Link Face"),
+        (bundle(message("/HR", 1.0, 2.0, 3.0)), "Face Cap"),
+        (message("/avatar/parameters/v2/JawOpen", 0.5).dgram, "VRCFaceTracking .* VRCFTtoVMCP"),
+        (b"mouthSmile_R-42|jawOpen-12|=head#-21,-6,-6,-0,-0,-0|", "iFacialMocap.*switch on sending of VMC Protocol"),
+        (b"mouthSmile_R&42|jawOpen&12|", "iFacialMocap"),
+        (b"\x06\0\0\0\x24$0000" + bytes(300), "--face live-link takes it"),
+        (b'{"FaceFound": true}', "JSON, which is not read here"),
     ],
 )
 def test_what_is_no_packet_is_refused(data, reason):
@@ -227,21 +278,58 @@ def test_a_damaged_frame_is_refused_or_finite(damage):
         motion = VmcDecoder().decode(bytes(data), 0.0)
     except PacketError:
         return
-    assert motion is None or (np.isfinite(motion).all() and motion[SHAPES].min() >= 0 and motion[SHAPES].max() <= 1)
+    assert motion is None or np.isfinite(motion).all()
 
 
 # --- over a socket ----------------------------------------------------------------------------------------------
 
 
-def test_avatar_software_on_this_machine_is_seen():
+def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.bind(("127.0.0.1", 0))
-        port = out.getsockname()[1]
-    sight = open_vmc(str(port))
+        return out.getsockname()[1]
+
+
+@pytest.fixture
+def sight():
+    opened = open_vmc(str(free_port()))
+    opened.start(0.0)
+    yield opened
+    opened.close()
+
+
+def test_avatar_software_on_this_machine_is_seen(sight):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.sendto(bundle(blend("jawOpen", 0.0), APPLY), sight.address)
+    while not sight.statistics()["packets"]:
         sight.at(1e9)
-        out.sendto(bundle(blend("jawOpen", 0.5), APPLY), sight.address)
-        assert sight.at(1e9).face.blendshapes[BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5, abs=0.01)
-    assert sight.address == ("127.0.0.1", port)
-    sight.close()
+    for later_s, jaw in ((1.0, 0.0), (0.1, 0.5)):
+        sight.feed(Datagram(bundle(blend("jawOpen", jaw), APPLY), sight._sender, sight._heard_s + later_s))
+        seen = sight.at(1e9)
+    assert seen.face.blendshapes[BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("apply", [[APPLY], []])
+def test_percent_and_a_new_port_for_each_packet_are_taken_and_the_units_said_once(sight, apply, caplog):
+    for number in range(90):
+        data = bundle(blend("jawOpen", 50.0 + 50.0 * math.sin(number / 5)), *apply)
+        sight.feed(Datagram(data, ("192.0.2.1", 1000 + number), number / 30))
+        sight.at(number / 30)
+        assert not sight.lost
+    assert 58 <= sight.statistics()["faces"] <= 60 and sight.statistics()["refused"] == 0
+    assert sight.at(3.0).face.blendshapes.max() <= 1.0
+    assert sum("blendshapes are taken as percent" in record.message for record in caplog.records) == 1
+
+
+def test_packets_without_a_face_are_a_loss_with_its_reason(sight, caplog):
+    for number in range(90):
+        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", 1)), ("192.0.2.1", 1), number / 30))
+        sight.at(number / 30)
+    assert sight.lost and sum("neither blendshapes" in record.message for record in caplog.records) == 1
+
+
+def test_a_sender_that_lost_its_person_is_not_lost(sight):
+    for number in range(90):
+        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", 1, 3, 0, 0)), ("192.0.2.1", 1), number / 30))
+        sight.at(number / 30)
+        assert not sight.lost

@@ -103,7 +103,7 @@ def test_what_cannot_be_opened_is_one_line(argument, error, text):
 
 def test_without_the_extra_the_install_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", None)
-    with pytest.raises(MissingExtra, match=r"--face webcam needs .*pip install 'sfms-robot\[webcam\]'"):
+    with pytest.raises(MissingExtra, match=r"--face webcam needs .*pip install -e '.*\[webcam\]'"):
         next(watch("0"))
 
 

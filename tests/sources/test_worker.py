@@ -106,7 +106,7 @@ def test_waiting_ends_after_its_limit_and_takes_nothing_away(start):
 
 
 def test_a_silent_worker_is_named_once_and_started_again_with_the_newest_message(start, caplog):
-    caplog.set_level(logging.WARNING)
+    caplog.set_level(logging.INFO, "sfms_robot")
     worker = start(answers)
     worker.tell(41)
     assert first_of(worker, 0.0) == 42

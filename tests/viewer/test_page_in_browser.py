@@ -187,7 +187,7 @@ def test_the_table_of_servos_has_no_column_that_says_nothing(page):
         "[[...document.querySelectorAll('thead th')].map((each) => each.textContent),"
         " [...document.querySelectorAll('tbody tr')].map((row) => [...row.children].map((each) => each.textContent))]"
     )
-    assert {"read °", "mA", "°C", "V"} <= set(titles) and "load %" not in titles  # XM430s tell a current
+    assert {"is at °", "mA", "°C", "V"} <= set(titles) and "load %" not in titles  # XM430s tell a current
     for column, title in enumerate(titles):
         assert any(row[column] != "–" for row in cells), title
 
@@ -418,3 +418,5 @@ def test_a_run_that_has_ended_stays_as_its_replay(tmp_path):
             page.until("!page.connection.open")
             assert page.ask("document.getElementById('state-name').textContent") == "ended"
             assert page.ask("document.getElementById('notice').textContent") == "The run has ended. This is its replay."
+            page.until("document.body.classList.contains('gone')")  # its program too
+            assert not page.ask("document.getElementById('controls').checkVisibility()")

@@ -12,6 +12,8 @@ from sfms_robot.errors import InputError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Listener
+from sfms_robot.signals.audio import check_scale
+from sfms_robot.signals.spaces import beyond
 
 
 def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListener:
@@ -78,7 +80,7 @@ class ListenerStream:
             face: the person's face at the end of the frame, as (58,) motion or a FaceFrame; None where it is not seen.
             agent_audio: (640,) the robot's own speech during the next frame; None when it does not speak.
 
-        Raises InputError for another number of samples or channels, and for values that are not finite.
+        Raises InputError for another number of samples or channels, and for values in other units, or not finite.
         """
         time_s = (self._frames + 1) / FRAME_HZ
         said = None if agent_audio is None else _checked("agent_audio", agent_audio)
@@ -100,4 +102,8 @@ def _checked(name: str, values: ArrayLike) -> Floats:
         raise InputError(f"{name}: expected shape ({size},) ({what}), got {found.shape}")
     if not np.isfinite(found).all():
         raise InputError(f"{name}[{int(np.argmin(np.isfinite(found)))}] is not finite")
+    if name != "face":
+        check_scale(name, found)
+    elif problem := beyond(found):
+        raise InputError(f"face: {problem}")
     return found

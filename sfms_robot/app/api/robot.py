@@ -16,13 +16,14 @@ from typing import Any, Final, Self
 from sfms_robot.app.api.servos import Background, Driven, Report, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, RunOptions
+from sfms_robot.app.options import SIM, RunOptions, record_format_named
 from sfms_robot.app.session import RunControls, run
 from sfms_robot.config import Calmness, Head, load_head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.thread import ListenerThread
+from sfms_robot.outputs.registry import check_outputs
 from sfms_robot.ports import Listener, Source
 from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.sources.paired import JudgedSource, PairedSource
@@ -42,7 +43,7 @@ class Robot(Driven):
     and `stop` wait for the loop.
 
     Args:
-        head: shipped name, folder, or what `load_head` gave.
+        head: shipped name, folder, or what `load_head` gave; "none": no servos, `outputs` alone show the face.
         port: "sim" for emulated servos, "auto", a device, or NAME=DEVICE[,NAME=DEVICE].
         listener: shipped name, folder, zenoh/NAME, a name that another package registers; or an object that implements
             `Listener`, which is then stepped in a thread of this process.
@@ -56,10 +57,12 @@ class Robot(Driven):
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
         seed: of everything that is drawn at random.
         record: folder for the recording; `overwrite` for one that has a recording already.
+        record_format: "json", or "ros2" for tools of ROS.
         yes: hobby servos may jump when they come on.
         without: joints that are left alone.
         intensity, style: of regions, as in `knobs`.
         calmness, addressed: as in `calm`.
+        outputs: KIND or KIND:ADDRESS each, as `run --output`: "vmc:127.0.0.1:39539".
 
     Raises ConfigError, PortError, InputError for what cannot be right, before anything is opened.
     """
@@ -79,6 +82,7 @@ class Robot(Driven):
         fast: bool = False,
         seed: int = 0,
         record: Path | str | None = None,
+        record_format: str = "json",
         overwrite: bool = False,
         yes: bool = False,
         without: Sequence[str] = (),
@@ -87,6 +91,7 @@ class Robot(Driven):
         calmness: Mapping[str, float] | None = None,
         addressed: str = "sense",
         engine: EngineName = "auto",
+        outputs: Sequence[str] = (),
     ) -> None:
         pushed = source is None and audio == PUSH
         if pushed and (face, agent_audio) != ("auto", "none"):
@@ -114,9 +119,12 @@ class Robot(Driven):
             style=_turned(style),
             calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
             record=None if record is None else Path(record),
+            record_format=record_format_named(record_format),
             overwrite=overwrite,
+            outputs=tuple(outputs),
         )
         prepare_head(self._options)
+        check_outputs(self._options.outputs)
         self._listener = own
         self._person = (PushedVoice(), PushedSight()) if pushed else None
         hears = source is None and split_kind(self._options.hears)[0] == "mic" and agent_audio == "none"
@@ -124,7 +132,7 @@ class Robot(Driven):
         self._source: Source | None = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
-        self._controls = RunControls(load_head(self._options.head), self._options)
+        self._controls = RunControls(load_head(self._options.head, servos=False), self._options)
         self._controls.speech = self._speech
 
     def __enter__(self) -> Self:
@@ -177,16 +185,17 @@ class Robot(Driven):
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
         """Hand over the person's voice: the next piece of sound, of any length. Never blocks.
 
-        (n,) or (n, channels), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It counts from
-        this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the newest is
-        kept. Raises ConfigError for another type, shape or rate.
+        (n,), (n, channels) or (channels, n), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It
+        counts from this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the
+        newest is kept. Raises ConfigError for another type, shape, scale or rate.
         """
         self._pushed("hear")[0].hear(pcm, rate_hz)
 
-    def see(self, face: FaceFrame | Floats | None) -> None:
-        """Hand over the person's face now, a FaceFrame or motion (58,); None when it is lost. It holds for 250 ms.
+    def see(self, face: FaceFrame | Floats | Mapping[str, float] | None) -> None:
+        """Hand over the person's face now: a FaceFrame, motion (58,) or channels by name; None when it is lost.
 
-        Never blocks. Raises ConfigError for another shape.
+        It holds for 250 ms. Never blocks. Raises ConfigError for another shape, an unknown channel, and values that are
+        not radians or 0 to 1.
         """
         self._pushed("see")[1].see(face)
 

@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from sfms_robot.app.open_head import build_bus, build_motion, fastest_hz, identify
+from sfms_robot.app.open_head import build_bus, build_motion, doctor_command, fastest_hz, identify
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.servo.move import SPEED_DEG_S
 from sfms_robot.app.wiring import Opened, calibration_of, open_wires
@@ -27,6 +28,7 @@ from sfms_robot.config.overlay import (
     CalibrateLayer,
     Identity,
     Measured,
+    check_writable,
     head_hash,
     layered,
     load_overlay,
@@ -38,6 +40,7 @@ from sfms_robot.errors import BusError, ConfigError, RobotError, ServoError, Tor
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.families import family_named
+from sfms_robot.servo.policy import BusServo
 
 LEAST_TRAVEL_DEG: Final = 2.0
 ARRIVED_DEG: Final = 3.0  # a held servo sags a little
@@ -94,9 +97,9 @@ def calibrate(
     Emulated servos (`sim`) are for practice: their measurements are kept apart and never used. `again`: also joints
     that are measured already. Raises RobotError.
     """
-    head = load_head(name)
+    head, guide = load_head(name), Guide(say, ask, date.today(), doctor_command(name, port))
+    file = check_writable(overlay_file(head.name, practice=port == SIM))
     with open_wires(head, HeadOptions(head=name, port=port)) as where:
-        file, guide = overlay_file(head.name, practice=port == SIM), Guide(say, ask, date.today())
         return calibrate_on(name, where, RealClock(), guide, file, joints=joints, again=again)
 
 
@@ -131,8 +134,8 @@ def calibrate_on(
                 if identity is None:
                     raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
                 by_hand = guide.asks_how(family_named(head.buses[config.bus].family).board)
-                stored, unconfirmed = identity.stored, outcome.torque_unconfirmed
-                with probe(head, joint, where[config.bus], clock, stored=stored, unconfirmed=unconfirmed) as at:
+                alone = partial(probe, stored=identity.stored, unconfirmed=outcome.torque_unconfirmed)
+                with alone(head, joint, where[config.bus], clock, doctor=guide.doctor) as at:
                     found = guide.measure_until_right(config, identity, at, by_hand)
             except (BusError, ServoError) as reason:
                 outcome.skipped[joint] = str(reason)
@@ -154,11 +157,15 @@ def calibrate_on(
 
 @dataclass(frozen=True)
 class Guide:
-    """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the lines."""
+    """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the lines.
+
+    `doctor`: the command that a message about a stored value names, see `BusServo`.
+    """
 
     say: Say
     ask: Ask
     today: date
+    doctor: str = BusServo.doctor
 
     def keeps_old(self) -> bool:
         """Ask whether measurements for an older head file are kept."""
@@ -328,7 +335,14 @@ class JointProbe:
 
 @contextmanager
 def probe(
-    head: Head, name: str, where: Chain | str, clock: Clock, *, stored: Mapping[str, int], unconfirmed: list[str]
+    head: Head,
+    name: str,
+    where: Chain | str,
+    clock: Clock,
+    *,
+    stored: Mapping[str, int],
+    unconfirmed: list[str],
+    doctor: str,
 ) -> Iterator[JointProbe]:
     """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
 
@@ -341,7 +355,7 @@ def probe(
     # A person thinks longer than a watchdog waits.
     config = head.buses[joint.bus].model_copy(update={"watchdog_ms": 0})
     alone = head.model_copy(update={"joints": {name: joint}, "buses": {joint.bus: config}})
-    bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True)
+    bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True, doctor=doctor)
     try:
         bus.connect()
         yield JointProbe(name, joint, bus, clock)

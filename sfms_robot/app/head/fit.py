@@ -18,11 +18,21 @@ import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.report import failure
-from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.replay.run_file import read_recording
+from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.replay.run_file import RunRecording, read_recording
+from sfms_robot.app.session import Panel
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import drives
-from sfms_robot.config.overlay import FitLayer, Fitted, head_hash, layered, load_overlay, overlay_file, save_overlay
+from sfms_robot.config.overlay import (
+    FitLayer,
+    Fitted,
+    check_writable,
+    head_hash,
+    layered,
+    load_overlay,
+    overlay_file,
+    save_overlay,
+)
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
@@ -49,14 +59,18 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
-def babble(options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0) -> dict[str, Any]:
+def babble(
+    options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0, panel: Panel | None = None
+) -> dict[str, Any]:
     """Move, and record the run in a folder. Block until then; return its report.
 
-    Raises RobotError, the head at rest.
+    Raises RobotError, the head at rest; ConfigError before it moves where the fit could not be written.
     """
-    blind = HeadRetargeter(load_head(options.head)).blind_channels
+    head = load_head(options.head)
+    check_writable(overlay_file(head.name, practice=options.port == SIM))
+    blind = HeadRetargeter(head).blind_channels
     faces = random_faces([i for i, shape in enumerate(BLENDSHAPES) if shape not in blind], 60.0 * minutes, seed)
-    report = faces.play(options, record=record)
+    report = faces.play(options, panel, record=record)
     if (error := failure(report)) is not None:
         raise error
     return report
@@ -83,19 +97,20 @@ def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceT
 # --- fit --------------------------------------------------------------------------------------------------------------
 
 
-def fit_head(name: str, recording: Path, practice: bool = False) -> dict[str, Any]:
+def fit_head(name: str, recording: Path) -> dict[str, Any]:
     """Learn from a recording, write the overlay's fit layer, and report both. Raises ConfigError for a bad recording.
 
     Errors are rms in joint units on held-out frames, of the seen value against the commanded one: `before` with the
     drive of the file, `after` with the response learnt; None for a joint that hardly moved. `file`: that was written.
 
-    `practice`: the track is of the virtual head; the overlay goes beside that of the real one and is never used.
+    `practice`: the recording is of emulated servos; its fit goes beside that of the real head and is never used.
     """
-    shipped, sha256 = load_head(name), head_hash(name)
-    file = overlay_file(shipped.name, practice)
+    shipped, sha256, run = load_head(name), head_hash(name), read_recording(recording)
+    practice = run.about.get("port") == SIM
+    file = check_writable(overlay_file(shipped.name, practice))
     overlay = load_overlay(shipped, file)
     head = layered(shipped, overlay.model_copy(update={"fit": None}), sha256).head
-    angles_rad, shapes, delay_s = read_pairs(head, recording)
+    angles_rad, shapes, delay_s = read_pairs(head, recording, run)
     units = Units.of(head)
     has, looks = units.values(angles_rad), looks_like(head, shapes)
     held_out = np.arange(len(has)) // _BLOCK % 5 == 4
@@ -116,7 +131,8 @@ def fit_head(name: str, recording: Path, practice: bool = False) -> dict[str, An
     layered(shipped, changed := overlay.model_copy(update={"fit": layer}), sha256)  # refuses what is not sound
     save_overlay(changed, file)
     both = {key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")}
-    return {"head": head.name, "frames": len(has), "delay_s": delay_s, **both, "joints": rows, "file": str(file)}
+    facts = {"head": head.name, "frames": len(has), "delay_s": delay_s, **both, "joints": rows}
+    return {**facts, "file": str(file), "practice": practice}
 
 
 def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[dict[str, Any]]:
@@ -130,12 +146,11 @@ def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks:
     return rows
 
 
-def read_pairs(head: Head, folder: Path) -> tuple[Doubles, Floats, float]:
+def read_pairs(head: Head, folder: Path, run: RunRecording) -> tuple[Doubles, Floats, float]:
     """Return angles (N, J) [rad] and faces (N, 52) at the N instants of a recording's face track, and its delay [s].
 
-    Raises ConfigError.
+    `run`: the recording of `folder`. Raises ConfigError.
     """
-    run = read_recording(folder)
     if missing := [joint for joint in head.joints if joint not in run.joints]:
         recorded = run.about.get("head", "?")
         raise ConfigError(f"{folder}: is of head {recorded!r}, without joint {missing[0]!r} of {head.name!r}")

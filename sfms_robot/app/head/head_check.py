@@ -25,6 +25,7 @@ from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head, remarks
 from sfms_robot.config.head import drives
@@ -66,7 +67,8 @@ def check(
 ) -> dict[str, Any]:
     """Check a head by shipped name or folder, on the bundled faces or those in a folder; return the report.
 
-    A head with `problems` has no other values. `remarks`: what is allowed and probably not meant. For each of `joints`
+    A head with `problems` has no other values. `remarks`: what is allowed and probably not meant, and
+    the parts of its picture that are not drawn. For each of `joints`
     there are the `channels` that move it, by its drive or by the neck; `used`: share of its range that the recorded
     faces move it through; `clipped`: share of the time that it is at an end of its range that is not its rest;
     `speed`, `jerk`: 99th percentile of the demand, as a share of its limit, over 1 the limiter lags. `neck`: reach
@@ -91,8 +93,6 @@ def check(
         scene = scene_of(head, packages)
     except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
         return report | {"problems": [str(error)]}
-    if scene.left_out:
-        return report | {"problems": scene.left_out}
     clips = [clip for _, clip in named_faces(data)]
     return report | {
         "joints": _rows(head, retargeter, [_angles(retargeter, _at_ticks(clip)) for clip in clips]),
@@ -100,7 +100,7 @@ def check(
         "dead_joints": retargeter.dead_joints,
         "neck": _neck(retargeter.neck, clips) if retargeter.neck else None,
         "calibrate_first": head.calibrate_first,
-        "remarks": remarks(head),
+        "remarks": [*remarks(head), *scene.left_out],
         "seconds": round(sum(len(clip) for clip in clips) * FRAME_S, 1),
         "limitation": limited,
     }
@@ -241,7 +241,7 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, A
     faces: dict[str, list[Floats]] = {}
     for face, clip in named_faces(data):
         faces.setdefault(face, []).append(clip)
-    return {"version": 1, "rows": [row for name in names for row in _fidelity(name, faces)]}
+    return {"version": 1, "rows": [row for name in tracked(names, "showing faces") for row in _fidelity(name, faces)]}
 
 
 def _fidelity(name: str, faces: dict[str, list[Floats]]) -> list[dict[str, Any]]:

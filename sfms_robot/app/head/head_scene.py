@@ -29,7 +29,7 @@ def main() -> None:
     """See `viewer.page_child`."""
     from sfms_robot.viewer import page_child  # of the page's process alone
 
-    page_child.main(lambda head, packages: scene_of(load_head(head), packages))
+    page_child.main(lambda head, packages: scene_of(load_head(head, servos=False), packages))
 
 
 def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, Any]:

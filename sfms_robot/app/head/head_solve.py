@@ -13,7 +13,7 @@ from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
-from sfms_robot.signals.tracks import csv_cells, csv_numbers
+from sfms_robot.signals.face_tables import csv_cells, csv_numbers
 
 POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
 BODY_COLUMN = "body_yaw_rad"

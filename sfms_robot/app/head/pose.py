@@ -27,6 +27,8 @@ from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.5
 MOVED_DEG: Final = 0.1
+_ANGLES: Final = ("roll", "pitch", "yaw")
+_TURN: Final = 360.0
 _BOUNDS: Final = {"roll": 1.0, "pitch": 1.0, "yaw": 1.6, "x": 0.1, "y": 0.1, "z": 0.1}  # rad and m, either way
 
 
@@ -76,19 +78,26 @@ def parse_face(words: Sequence[str]) -> Floats:
         except ValueError:
             value = math.nan
         if not low <= value <= high:
-            raise ConfigError.at("head pose", name, text, "is not a number in its range", [f"{low:g}..{high:g}"])
+            unit = "rad" if name in _ANGLES else "m" if name in _BOUNDS else ""
+            meant = (
+                f"; {value:g} deg is {name}={math.radians(value):.3g}" if unit == "rad" and abs(value) < _TURN else ""
+            )
+            problem = f"is not a number in its range{f', in {unit}' if unit else ''}{meant}"
+            raise ConfigError.at("head pose", name, text, problem, [f"{low:g}..{high:g}"])
         motion[CHANNEL_INDEX[name]] = value
     return motion
 
 
-def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0) -> dict[str, Any]:
+def pose_head(
+    options: HeadOptions, words: Sequence[str], hold_s: float = 2.0, panel: Panel | None = None
+) -> dict[str, Any]:
     """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
     Blocks until then. Raises any other RobotError, the head at rest.
     """
     face, head = parse_face(words), load_head(options.head)
     furthest = Furthest(head)
-    report = held_face(face, hold_s).play(options, observers=[furthest])
+    report = held_face(face, hold_s).play(options, panel, observers=[furthest])
     error = failure(report)
     if error is not None and str(error) != str(TorqueError(report["torque_unconfirmed"])):
         raise error

@@ -15,12 +15,13 @@ from sfms_robot.app import session
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.options import RunOptions, open_browser
 from sfms_robot.config import load_head
+from sfms_robot.data import speaker_names
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
-FOLDER: Final = "sfms-demo"
+FOLDER: Final = Path("runs", "demo")
 PLOT, SHEET = "run.png", "head.png"
 _KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "seed", "duration_s")
 
@@ -30,23 +31,26 @@ def demo(
 ) -> dict[str, Any]:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
-    Blocks for the length of the run and some seconds; with a page for as long as a visitor looks at it. Further runs
-    that visitors choose there are not recorded. Without the packages that a picture needs, it is left out and
-    `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
+    Blocks for the length of the run and some seconds; with a page until the last visitor leaves it: another bundled
+    person talks meanwhile, then the next. Further runs are not recorded. Without the packages that a picture needs, it
+    is left out and `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
     """
-    folder = folder if folder is not None else free_folder(Path(FOLDER))
+    folder = folder if folder is not None else free_folder(FOLDER)
     options = replace(_with_voice(options), record=folder)
     seen = False
     if page is None:
         report = session.run(options, panel)
     else:
         with page_session(page, options, choices=True) as pages:
-            opened = open_browser(page.url)
+            open_browser(page.url)
             report = pages.run(panel)
             with suppress(KeyboardInterrupt):  # which ends the page; the head rests
-                while pages.next(stay=report["exit"] == "done" or pages.released):
+                while pages.next(
+                    stay=report["exit"] == "done" or pages.released,
+                    speaker=next_speaker(pages.options.audio) if report["exit"] == "done" else None,
+                ):
                     report = pages.run(panel)
-            seen = opened or page.visited.is_set()
+            seen = page.visited.is_set()
     pictures: list[str] = []
     shown = {
         **_summary(options, report),
@@ -66,6 +70,12 @@ def demo(
     except MissingExtra as error:
         shown["missing"] = str(error)
     return shown
+
+
+def next_speaker(speaker: str) -> str:
+    """Return the bundled person after `speaker`, in turn."""
+    names = speaker_names()
+    return names[(names.index(speaker) + 1) % len(names) if speaker in names else 0]
 
 
 def _with_voice(options: RunOptions) -> RunOptions:
@@ -106,7 +116,7 @@ def free_folder(folder: Path) -> Path:
 
 def _summary(options: RunOptions, report: dict[str, Any]) -> dict[str, Any]:
     """Return what a person in front of the head would have seen."""
-    head = load_head(options.head)
+    head = load_head(options.head, servos=False)
     retargeter = HeadRetargeter(head)
     neck = [retargeter.joints[int(column)] for column in retargeter.neck_columns]
     travel_rad = sum(report["joints"][joint]["travel_rad"] for joint in neck if joint in report["joints"])

@@ -184,6 +184,8 @@ class PageObserver(Observer):
 
     def _rare_json(self, seen: Tick) -> bytes:
         faults = {joint: reading.fault for joint, reading in seen.readings.items() if reading.fault}
+        if seen.busy:
+            faults["this computer"] = seen.busy
         key = (seen.state, seen.why, faults, self._hazards_hz)
         if key != self._rare[0]:
             self._rare = (key, rare_json(*key))

@@ -8,6 +8,7 @@ visitor.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -26,7 +27,7 @@ from sfms_robot.app.listen.report import run_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
-from sfms_robot.errors import InputError
+from sfms_robot.errors import NOTE, InputError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Observer, Tick
@@ -37,6 +38,7 @@ from sfms_robot.viewer.page_process import PageProcess
 
 AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
 LEFT_S: Final = 30.0
+PAUSE_S: Final = 3.0  # at rest, before the next recorded person talks
 BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it
 _FEEDS: Final = ("voice", "face")  # of a person
 _LOOK_S: Final = 0.5
@@ -66,6 +68,7 @@ class PageSession:
         self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
         self._visitor = PageVisitor()
         self._wanted: RunOptions | None = None
+        self._further = False  # the present run is not the first
         self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
         page.answered_by(self)
@@ -77,7 +80,7 @@ class PageSession:
 
         `feed`: a listener of these options that loads already.
         """
-        options, head = self.options, load_head(self.options.head)
+        options, head = self.options, load_head(self.options.head, servos=False)
         joints, by_visitor = list(head.joints), _taken_of_visitors(options)
         controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
         self.released = False
@@ -86,7 +89,7 @@ class PageSession:
         with ExitStack() as stack:
             scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
             for line in scene.left_out:
-                logger.warning("%s; the page leaves it out", line)
+                logger.warning("picture of the head: %s", line)
             speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
             facts = page_facts(
                 head,
@@ -102,9 +105,9 @@ class PageSession:
             stack.callback(self.recorder.close)
             self.reach = controls
             stack.callback(self._ended)
-            lonely = EndsAlone(self.page, controls.interrupt)
+            lonely = EndsAlone(self.page, controls.interrupt, LEFT_S if by_visitor else AWAY_S)
             watchers: list[Observer] = [watcher, self.recorder, *observers]
-            if by_visitor and self._choices:  # nothing else would end it
+            if self._choices and (by_visitor or self._further):  # only visitors keep it running
                 watchers.append(lonely)
             report = session.run(
                 options, panel, feed=feed, observers=watchers, controls=controls,
@@ -116,16 +119,19 @@ class PageSession:
             self.page.say("end", report=report)
         return report
 
-    def next(self, stay: bool) -> bool:
-        """Return whether a visitor has chosen another run, now in `options`; what visitors turned stays turned.
+    def next(self, stay: bool, speaker: str | None = None) -> bool:
+        """Return whether another run is to begin, now in `options`; what visitors turned stays turned.
 
-        `stay`: wait for a choice while there are visitors. Blocks until then, or until there are none for `AWAY_S`.
+        `stay`: wait for a choice while there are visitors. Blocks until then, or until there are none for `AWAY_S`;
+        with a `speaker`, who talks where no visitor has chosen, for `PAUSE_S`.
         """
         if stay and self.page.visited.is_set():
-            stay_for_visitors(self.page, self._chosen)
+            stay_for_visitors(self.page, self._chosen, math.inf if speaker is None else PAUSE_S)
+            if speaker is not None and self._wanted is None and self.page.visitors:
+                self._wanted = replace(self.options, record=None, audio=speaker, face="auto")
         if self._wanted is None:
             return False
-        self.options, self._wanted = replace(self._wanted, **self._set), None
+        self.options, self._wanted, self._further = replace(self._wanted, **self._set), None, True
         return True
 
     def _ended(self) -> None:
@@ -217,14 +223,14 @@ class PageSession:
 
 
 class EndsAlone(Observer):
-    """Ends a run that has had no visitors for `LEFT_S`.
+    """Ends a run that has had no visitors for `left_s`.
 
     Attributes:
         ended: it has done so.
     """
 
-    def __init__(self, page: PageProcess, interrupt: Interrupt) -> None:
-        self._page, self._interrupt = page, interrupt
+    def __init__(self, page: PageProcess, interrupt: Interrupt, left_s: float = LEFT_S) -> None:
+        self._page, self._interrupt, self._left_s = page, interrupt, left_s
         self.ended = False
         self._seen_s = 0.0
 
@@ -232,16 +238,16 @@ class EndsAlone(Observer):
         """Count the time without visitors."""
         if self._page.visitors or self._interrupt():
             self._seen_s = seen.time_s
-        elif seen.time_s - self._seen_s > LEFT_S:
+        elif seen.time_s - self._seen_s > self._left_s:
             self.ended = True
             self._interrupt.ask()
 
 
-def stay_for_visitors(page: PageProcess, over: threading.Event) -> None:
-    """Block until `over` is set, or the page has had no visitors for `AWAY_S`."""
-    alone_s = 0.0
-    while alone_s < AWAY_S and not over.wait(_LOOK_S):
-        alone_s = 0.0 if page.visitors else alone_s + _LOOK_S
+def stay_for_visitors(page: PageProcess, over: threading.Event, longest_s: float = math.inf) -> None:
+    """Block until `over` is set, there are visitors after `longest_s`, or there have been none for `AWAY_S`."""
+    alone_s = stayed_s = 0.0
+    while alone_s < AWAY_S and not (page.visitors and stayed_s >= longest_s) and not over.wait(_LOOK_S):
+        alone_s, stayed_s = 0.0 if page.visitors else alone_s + _LOOK_S, stayed_s + _LOOK_S
 
 
 @contextmanager
@@ -251,7 +257,7 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
     Raises PortError, ConfigError where it cannot.
     """
     page.wait()
-    logger.warning("page: %s", page)
+    logger.log(NOTE, "page: %s", page)
     with TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
         yield PageSession(page, options, Path(folder), choices)
 

@@ -39,6 +39,7 @@ PERIOD_S: Final = 0.25
 JOIN_S: Final = 1.0  # a terminal that is held (Ctrl-S) takes nothing: the run ends without it
 _QUIET_DB: Final = -60.0  # an empty meter; 0 is full scale
 _METER: Final = 20  # characters, fewer on a narrow terminal
+_BEGINS: Final = {"frame_to_wire": "picture and sound", "speech_to_wire": "speech begins"}
 _FAULTS: Final = 4  # named; the others are counted
 _COLORS: Final[Mapping[str, str]] = {
     "starting": "cyan",
@@ -222,7 +223,7 @@ def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool 
     seen = "  seen" if person.get("seen") else ""
     rates = "" if not tick else "in virtual time"
     if tick.get("achieved_hz") is not None:
-        rates = f"{tick['achieved_hz']:.1f} of {tick['target_hz']:g} Hz, {tick['late']} late"
+        rates = f"{tick['achieved_hz']:.1f} of {tick['target_hz']:g} a second, {tick['late']} late"
     for name, text in (
         ("", document.get("note")),
         (
@@ -231,11 +232,18 @@ def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool 
             + (seen if attention is None else f"  attention {attention:.0%}"),
         ),
         ("robot", _level(person.get("own_voice_db"), meter, console)),
-        ("face", ", ".join(f"{count} {name}" for name, count in (document.get("motion") or {}).items())),
+        (
+            "face",
+            ", ".join(
+                f"{count} {name.removesuffix('s') if count == 1 else name}"
+                for name, count in (document.get("motion") or {}).items()
+            ),
+        ),
         ("intensity", _intensity(document.get("intensity") or {})),
-        ("ticks", rates),
-        ("latency", _latency(document.get("latency_ms") or {})),
+        ("goals", rates),
+        ("answers", _latency(document.get("latency_ms") or {})),
         ("hottest", hottest and f"{hottest['joint']} {hottest['temperature_C']:.0f} C"),
+        ("outputs", ", ".join(map(_output, document.get("outputs") or ()))),
         ("faults", _faults(document.get("faults") or {})),
     ):
         if text:
@@ -272,13 +280,18 @@ def _intensity(regions: Mapping[str, float]) -> str:
     return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
 
 
+def _output(sent: Mapping[str, Any]) -> str:
+    rate = f"{sent['frames_per_s']:.0f} a second" if sent["state"] == "sending" else sent["state"]
+    return f"{sent['kind']}:{sent['peer']} {rate}"
+
+
 def _latency(latency_ms: Mapping[str, Mapping[str, float | None]]) -> str:
-    """Return medians, and in brackets the last percentiles."""
+    """Return the medians in words."""
     parts = []
     for name, ms in latency_ms.items():
-        middle, *tails = [f"{value:.0f}" for value in ms.values() if value is not None] or [""]
-        if middle:
-            parts.append(f"{name.replace('_', ' ')} {middle} ms" + "".join(f" ({tail})" for tail in tails))
+        middle = next((value for value in ms.values() if value is not None), None)
+        if middle is not None:
+            parts.append(f"{middle:.0f} ms after {_BEGINS.get(name, name.replace('_', ' '))}")
     return ", ".join(parts)
 
 

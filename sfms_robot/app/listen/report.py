@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -180,15 +180,21 @@ def limitation(listener: str) -> str | None:
 # --- messages to the programs that a run works with -----------------------------------------------------------------
 
 
+def event_watch(callback: Callable[[ListenerEvent], object]) -> EventWatch:
+    """Return an observer that calls `callback` with events of all kinds, in a thread of its own."""
+    watch = EventWatch()
+    for kind in EVENT_KINDS:
+        watch.on(kind, callback)
+    return watch
+
+
 class OutletObserver:
     """An `Observer` that sends sound, planned events and changes of state to one outlet of a source."""
 
     def __init__(self, outlet: Outlet) -> None:
         self._outlet = outlet
         self._state: tuple[str, tuple[str, ...]] | None = None
-        self._events = EventWatch()
-        for kind in EVENT_KINDS:
-            self._events.on(kind, self._event)
+        self._events = event_watch(self._event)
 
     def tick(self, seen: Tick) -> None:
         state = (seen.state, seen.why)

@@ -16,6 +16,7 @@ import numpy as np
 
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.output_paths import FAINT, INK, checked_png, new_figure, plain, save
+from sfms_robot.app.progress import tracked
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
@@ -93,10 +94,9 @@ def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> d
         if png is not None:
             checked_png(png, option)
     recording = read_recording(folder)
-    if plot_png is not None:
-        plot(recording, plot_png)
-    if sheet_png is not None:
-        sheet(recording, sheet_png)
+    drawn = [(png, draw) for png, draw in ((plot_png, plot), (sheet_png, sheet)) if png is not None]
+    for png, draw in tracked(drawn, "drawing"):
+        draw(recording, png)
     return summary(recording)
 
 

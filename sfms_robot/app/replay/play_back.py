@@ -117,7 +117,7 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
 
 def _facts(recording: RunRecording) -> dict[str, Any]:
     about = recording.about
-    head = load_head(about["head"])
+    head = load_head(about["head"], servos=False)
     if tuple(head.joints) != recording.joints:
         raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
     speaker = about.get("audio")

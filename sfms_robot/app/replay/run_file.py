@@ -23,7 +23,8 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
 from sfms_robot.runtime.loop import AWAY_S
-from sfms_robot.runtime.recorder import RUN_FILE, parts_of
+from sfms_robot.runtime.recorder import ROS2_TOPICS, RUN_FILE, parts_of
+from sfms_robot.signals.ros2_messages import STRING, from_cdr
 
 _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
 _FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
@@ -169,14 +170,21 @@ def summary(recording: RunRecording) -> dict[str, Any]:
 
 
 def _records(file: Path) -> Iterator[tuple[str, Any]]:
-    """Yield (topic, body), ("about", metadata) and, when the file has one, ("end", None)."""
-    topics: dict[int, str] = {}
+    """Yield (topic, body), ("about", metadata) and, when the file has one, ("end", None).
+
+    Of the format "ros2" the JSON texts are read; what ROS's own types repeat of them is left out.
+    """
+    topics: dict[int, str | None] = {}
+    in_ros2 = False
+    ours = {name: topic for topic, name in ROS2_TOPICS.items()}
     with file.open("rb") as stream:
         for record in StreamReader(stream, validate_crcs=True).records:
             if isinstance(record, Channel):
-                topics[record.id] = record.topic
+                in_ros2 = record.message_encoding == "cdr"
+                topics[record.id] = ours.get(record.topic) if in_ros2 else record.topic
             elif isinstance(record, Message):
-                yield topics[record.channel_id], json.loads(record.data)
+                if (topic := topics[record.channel_id]) is not None:
+                    yield topic, json.loads(from_cdr(STRING, record.data)["data"] if in_ros2 else record.data)
             elif isinstance(record, Metadata) and record.name == "run":
                 yield "about", record.metadata
             elif isinstance(record, Footer):
@@ -196,7 +204,7 @@ def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
             return body["time_s"], np.array(
                 [(each["goal_rad"], each["present_rad"], each["age_s"], each["fault"] is not None) for each in servos],
                 np.float32,
-            )
+            ).reshape(-1, 4)
         case "/speaker":
             jaw_rad = np.array(body["jaw_rad"] or [None] * 3, np.float32)
             sound, said = (body[key] and _pcm16(body[key]) for key in ("audio_pcm16", "agent_audio_pcm16"))

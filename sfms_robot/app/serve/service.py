@@ -21,9 +21,11 @@ from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sfms_robot.app.progress import bar
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
+from sfms_robot.frames import FRAME_S
 from sfms_robot.listeners.capacity import Capacity
 from sfms_robot.listeners.remote import ROOT, down_key, join_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
@@ -266,7 +268,8 @@ def serve(
             "priority": zenoh.Priority.REAL_TIME,
             "express": True,
         }
-        pool = WorkerPool(served, lambda to, message: session.put(down_key(name, to), message, **now), processes)
+        with bar(f"loading {name}, and measuring how many heads it answers in time"):
+            pool = WorkerPool(served, lambda to, message: session.put(down_key(name, to), message, **now), processes)
         stack.callback(pool.close)
 
         def join(query: zenoh.Query) -> None:
@@ -282,8 +285,8 @@ def serve(
             figures.begin(pool.statistics)
             say(f"metrics: {figures.url}")
         say(
-            f"{name}: a plan every {pool.hop} frames, up to {pool.most} heads in {DEADLINE_S * 1e3:.0f} ms here, "
-            f"by {len(pool.capacities)} processes"
+            f"{name}: a plan every {pool.hop * FRAME_S * 1e3:.0f} ms for up to {pool.most} heads, each answered within "
+            f"{DEADLINE_S * 1e3:.0f} ms, by {len(pool.capacities)} processes"
         )
         service_manager.ready(f"{name}: up to {pool.most} heads")
         while pool.problem is None and not over.wait(service_manager.every_s):

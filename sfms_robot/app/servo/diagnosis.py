@@ -91,6 +91,7 @@ class Line:
     Attributes:
         shown: Its name in commands.
         ports: The ports of the whole head, as `--port` named them.
+        control: Of an emulator, which confirms silences there.
     """
 
     device: str
@@ -102,6 +103,7 @@ class Line:
     bus: str | None = None
     head: str | None = None
     ports: str | None = None
+    control: str | None = None
     crc: bool = False
 
     @property
@@ -116,14 +118,14 @@ class Line:
     @property
     def fix(self) -> str:
         """The command that mends stored values against the head's file."""
-        return f"sfms-robot doctor --port {self.ports or self.shown}{self._of_head or self._of_family} --fix"
+        return f"sfms-robot doctor --port {quote(self.ports or self.shown)}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         """Return a `servo` command for this port."""
         rate = f" --baud {baud}" if baud is not None else ""
         # Which emulated servos there are, and at what rate, is their head's to say.
         which = self._of_head if self.shown == SIM and self.head else f"{rate}{self._of_family}"
-        return f"sfms-robot servo {words} --port {self.shown}{which}"
+        return f"sfms-robot servo {words} --port {quote(self.shown)}{which}"
 
     def name(self, servo: int) -> str:
         """Return a servo with its joint, for people."""
@@ -177,6 +179,12 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
         yield Finding("warning", device.path, problem, fix)
 
 
+def judge_rivals(path: str, found: Iterable[tuple[str, str]]) -> Iterator[Finding]:
+    """Yield what else uses a port, or takes it when it is plugged in (`discovery.rivals`)."""
+    for problem, fix in found:
+        yield Finding("warning", path, problem, fix)
+
+
 def udev_rule(device: SerialDevice) -> str | None:
     """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
@@ -217,7 +225,8 @@ def judge_presence(
         if (seen := here.get(servo)) is not None:
             if want.model_number is not None and seen.model_number not in (None, want.model_number):
                 said = f"the head says {want.model} ({want.model_number})"
-                problem = f"{seen.model} ({seen.model_number}) answers, {said}"
+                number = f" ({seen.model_number})" if seen.table is not None else ""  # an unknown model has it already
+                problem = f"{seen.model}{number} answers, {said}"
                 fix = "two cables swapped, or the head's file names the wrong model or id"
         elif servo in elsewhere:
             rate = elsewhere[servo].baud
@@ -234,11 +243,11 @@ def judge_presence(
             yield Finding("warning", line.name(servo), problem, servo=servo)
 
 
-def judge_duplicate_ids(ids: Sequence[int]) -> Iterator[Finding]:
+def judge_duplicate_ids(ids: Sequence[int], line: Line) -> Iterator[Finding]:
     """Yield the ids to which two servos seem to answer."""
     for servo in ids:
         problem = "two servos seem to answer to this id (or the wire is disturbed)"
-        fix = f"unplug all but one of them, then: sfms-robot servo set-id {servo} NEW"
+        fix = f"unplug all but one of them, then: {line.servo(f'set-id {servo} NEW')}"
         yield Finding("error", f"id {servo}", problem, fix, servo=servo)
 
 
@@ -400,7 +409,9 @@ def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> It
         return
     reached = f"{usual['hz']:.0f} Hz of {line.rate_hz:g}"
     if fast_works and budget["fast"] and budget["fast"]["hz"] >= least_hz:
-        yield Finding("note", "bus", f"plain reads reach {reached}, fast sync read {budget['fast']['hz']:.0f}")
+        yield Finding(
+            "note", "bus", f"each servo read: {reached}; all in one answer, as a run does: {budget['fast']['hz']:.0f}"
+        )
         return
     set_baud = line.servo("set-baud ID RATE", budget["baud"])
     slow, _, fix = max(
@@ -427,10 +438,10 @@ def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> It
     yield Finding("warning", "bus", f"reaches {reached} with {done} ({slow} takes most)", fix)
 
 
-def judge_board(family: str, channels: int, answers: bool, device: SerialDevice) -> Iterator[Finding]:
-    """Yield what can be said of a bus of hobby servos. `answers`: whether the board did."""
-    if not answers:
-        yield Finding("error", "bus", f"no {family} board answers", _BOARD_HELP[family])
+def judge_board(family: str, channels: int, problem: str | None, device: SerialDevice) -> Iterator[Finding]:
+    """Yield what can be said of a bus of hobby servos. `problem`: of what answers on its port (`board_problem`)."""
+    if problem is not None:
+        yield Finding("error", "bus", problem, _BOARD_HELP[family])
     elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
         yield Finding("note", "bus", "a Maestro on USB has two ports: the first takes commands, the second is its TTL")
     unknown = f"which of its {channels} servos are there, nor where they stand"

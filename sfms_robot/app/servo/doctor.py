@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, Final, cast
 
+from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.app.servo.diagnosis import (
     SEVERITIES,
     Budget,
@@ -25,25 +27,35 @@ from sfms_robot.app.servo.diagnosis import (
     judge_port,
     judge_presence,
     judge_rate,
+    judge_rivals,
     judge_servo,
     stored_contradictions,
     udev_rule,
     wire_budget,
 )
-from sfms_robot.app.servo.serial_line import SIM, Confirm, FoundServo, Wire, check_baud, only_port, protocol_hint
-from sfms_robot.app.servo.single_servo import Progress, ServoState, no_progress, read_all, scan
-from sfms_robot.config import Head, load_head
+from sfms_robot.app.servo.serial_line import (
+    SIM,
+    Confirm,
+    FoundServo,
+    Wire,
+    check_baud,
+    only_port,
+    other_wires,
+    protocol_hint,
+)
+from sfms_robot.app.servo.single_servo import ServoState, read_all, scan
+from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.boards import RateLimitedPort
+from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
-from sfms_robot.servo.codecs import maestro, ssc32
-from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports
+from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports, rivals
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
+from sfms_robot.servo.registers import Table
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
@@ -81,7 +93,8 @@ def examine(
     clock = RealClock()
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
-        buses = [examine_line(line, clock, lambda d, b: SerialPort(d, b, clock), progress, fix) for line in lines]
+        controls = {line.device: line.control for line in lines}
+        buses = [examine_line(line, clock, partial(_port, controls, clock), progress, fix) for line in lines]
     codes = {bus["exit_code"] for bus in buses}
     return {
         "version": 1,
@@ -93,6 +106,15 @@ def examine(
     }
 
 
+def _port(controls: Mapping[str, str | None], clock: Clock, device: str, baud: int) -> Port:
+    """Open a device, on emulated servos as a run does: a silence is one only if the emulator confirms it."""
+    if (control := controls[device]) is None:
+        return SerialPort(device, baud, clock)
+    from sfms_robot.app.wiring import EmulatedPort
+
+    return EmulatedPort(device, control, baud, clock)
+
+
 def examine_line(
     line: Line, clock: Clock, open_port: OpenPort, progress: Progress = no_progress, fix: Confirm | None = None
 ) -> dict[str, Any]:
@@ -101,12 +123,14 @@ def examine_line(
     report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
     if problem is not None:
-        return _finished(report, [judge_port(path, problem, group_of(path), list_ports())], PORT_FAILED)
+        failed = judge_port(path, problem, group_of(path), list_ports())
+        return _finished(report, [failed, *judge_rivals(path, rivals(path))], PORT_FAILED)
+    others = list(judge_rivals(path, rivals(path)))
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port(path, line.first_baud)
     except PortError as error:
-        return _finished(report, judge_opening(path, str(error), held_by), PORT_FAILED)
+        return _finished(report, [*judge_opening(path, str(error), held_by), *others], PORT_FAILED)
     with closing(port):
         adapter = describe(path)  # after opening, which may have set the latency
         report["adapter"] = asdict(adapter)
@@ -119,7 +143,7 @@ def examine_line(
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
         else:
             report |= {**facts, "udev_rule": udev_rule(adapter)}
-    return _finished(report, [*judge_adapter(adapter, held_by), *found])
+    return _finished(report, [*judge_adapter(adapter, held_by), *others, *found])
 
 
 def _finished(report: dict[str, Any], findings: Iterable[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
@@ -156,6 +180,7 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
             bus=name,
             head=head,
             ports=port,
+            control=None if isinstance(each, str) else each.control,
             crc=bus.crc,
         )
 
@@ -188,7 +213,7 @@ def _look(
     """Return findings and facts that need the open port."""
     here, elsewhere = _present(wire, line, progress)
     baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
-    hint = "" if here or elsewhere else protocol_hint(wire)
+    hint = "" if here or elsewhere else protocol_hint(other_wires(wire))
     findings = list(judge_presence(line, here, elsewhere, baud, hint))
     fixed: list[str] = []
     states: list[ServoState] = []
@@ -207,7 +232,7 @@ def _look(
             level = seen.table.role("status_level") if seen.table else None
             cure = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
             findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
-    findings += judge_duplicate_ids(double)
+    findings += judge_duplicate_ids(double, line)
     for state in states:
         findings += judge_servo(state, line)
     members = [state for state in states if state.seen.id in here and state.seen.table is not None]
@@ -229,7 +254,8 @@ def _present(wire: Wire, line: Line, progress: Progress) -> tuple[Found, Found]:
         found = scan(wire, None, progress)
         usual = max({each.baud for each in found}, key=lambda b: sum(s.baud == b for s in found), default=0)
         return {s.id: s for s in found if s.baud == usual}, {s.id: s for s in found if s.baud != usual}
-    here = _at_this_rate(wire, line, list(line.wanted))
+    wanted = list(line.wanted)
+    here = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # one lost packet hides no bus
     elsewhere: dict[int, FoundServo] = {}
     for step, _ in enumerate(wire.reachable()):
         missing = [servo for servo in line.wanted if servo not in here and servo not in elsewhere]
@@ -319,7 +345,8 @@ def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: Seria
 def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
     want = line.wanted.get(state.seen.id)
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
-    return {**state.seen.row(), "joint": want and want.joint, **measured, **state.health()}
+    row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the bus has it
+    return {**row, "joint": want and want.joint, **measured, **state.health()}
 
 
 # --- a board of hobby servos ----------------------------------------------------------------------------------------
@@ -329,19 +356,10 @@ def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[
     """Return what can be said of a board, whose port could be opened."""
     channels = max(1, len(line.wanted))
     budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)
-    answers = _board_answers(line, port)
-    found = judge_board(line.family, len(line.wanted), answers, adapter)
+    table = Table.of(load_firmware_map(next(iter(line.wanted.values())).model))
+    wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
+    problem = board_problem(table, board_for(table, line.crc), wire)
+    found = judge_board(line.family, len(line.wanted), problem, adapter)
     findings = [*found, *judge_rate(budget, line)]
     facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
     return findings, facts
-
-
-def _board_answers(line: Line, port: Port) -> bool:
-    """Return whether the board answers the one question that it has, and not before its CRC where the head has one."""
-    wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
-    question, size = ssc32.query_moving(), 1
-    if line.family == "maestro":
-        question, size = maestro.addressed(maestro.get_errors()), 2
-    parts = [question, bytes([maestro.crc7(question)])] if line.crc else [question]
-    answers = [wire.exchange(part, size) for part in parts]
-    return answers.pop() is not None and not any(answers)

@@ -87,8 +87,9 @@ def until_stopped(chains: Mapping[str, Chain]) -> None:
     def leave(number: int, frame: FrameType | None) -> None:
         sys.exit(0)  # unwinds, so that chains and links are removed
 
-    for each in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(each, leave)
+    for each in ("SIGTERM", "SIGINT", "SIGHUP"):
+        if hasattr(signal, each):  # Windows has no SIGHUP
+            signal.signal(getattr(signal, each), leave)
     raise BusError(f"the emulated chain {wait(list(chains.values())).device} has ended")
 
 

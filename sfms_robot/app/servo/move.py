@@ -111,7 +111,7 @@ def _check_mode(seen: FoundServo) -> None:
     if mode is not None and wanted is not None and (now := seen.read(mode)) != wanted:
         raise ServoError(
             f"id {seen.id} is in operating mode {now}, not in position control: "
-            f"sfms-robot servo write {seen.id} {mode.name} {wanted}"
+            f"{seen.wire.command(f'write {seen.id} {mode.name} {wanted}')}"
         )
 
 

@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final
 
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
@@ -20,7 +21,7 @@ from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, ping_replies, verified_write
-from sfms_robot.servo.discovery import access_problem, is_address, list_ports
+from sfms_robot.servo.discovery import check_device, list_ports
 from sfms_robot.servo.families import BusFamily, family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Field, Table
@@ -46,6 +47,7 @@ class FoundServo:
     baud: int
     model_number: int | None
     firmware: int | None
+    firmware_minor: int | None = None
     table: Table | None
     twice: bool = False
     wire: Wire = field(repr=False, compare=False)
@@ -88,7 +90,9 @@ class FoundServo:
             "model": self.model,
             "model_number": self.model_number,
             "firmware": self.firmware,
+            "firmware_minor": self.firmware_minor,
             "baud": self.baud,
+            "family": self.wire.family,
             "note": note,
         }
 
@@ -118,7 +122,7 @@ class FoundServo:
         """
         torque = None if mute else self.registers().role("torque_enable")
         if torque is not None and self.read(torque):
-            cure = f"sfms-robot servo write {self.id} {torque.name} 0"
+            cure = self.wire.command(f"write {self.id} {torque.name} 0")
             raise ServoError(f"id {self.id} has torque on, its EEPROM is closed: {cure}")
         ask(f"id {self.id} ({self.model}): {what}", confirm)
 
@@ -136,10 +140,18 @@ class Wire:
         family: A name of `servo_families`.
         baud: The port's rate now; with `fixed` no other rate is looked at.
         model: The model of every servo, whatever its number; None goes by the number.
+        place: Options that lead a command here; by default those of the port.
     """
 
     def __init__(
-        self, port: Port, family: str, clock: Clock, baud: int, fixed: bool = False, model: str | None = None
+        self,
+        port: Port,
+        family: str,
+        clock: Clock,
+        baud: int,
+        fixed: bool = False,
+        model: str | None = None,
+        place: str | None = None,
     ) -> None:
         self.port = port
         self.family = family
@@ -150,6 +162,12 @@ class Wire:
         self.bauds = (baud,) if fixed else (baud, *(each for each in self.kind.bauds if each != baud))
         self.baud = baud
         self.link = self._link(baud)
+        which = "" if family == "dynamixel2" else f" --family {family}"
+        self._place = f"--port {quote(port.name)}{which}" if place is None else place
+
+    def command(self, words: str) -> str:
+        """Return a `servo` command for this wire."""
+        return f"sfms-robot servo {words} {self._place}"
 
     def at(self, baud: int) -> RegisterLink:
         """Change to another rate; return the link. Raises PortError when the adapter cannot do it."""
@@ -188,7 +206,7 @@ class Wire:
             if seen is not None:
                 return seen
         rates = ", ".join(str(baud) for baud in self.bauds)
-        raise BusError(f"{self.port.name}: no answer from id {servo} at {rates} baud (look: sfms-robot servo scan)")
+        raise BusError(f"{self.port.name}: no answer from id {servo} at {rates} baud (look: {self.command('scan')})")
 
     def reachable(self) -> Iterator[int]:
         """Yield every rate to look at, the wire set to it. Rates that the adapter cannot do are skipped."""
@@ -212,9 +230,8 @@ class Wire:
             raise ConfigError.at("servo", what, servo, "is not a servo id", [f"0..{self.kind.max_id}"])
 
     def _identified(self, servo: int, found: Found) -> FoundServo:
-        number, firmware = found
-        table = self._table or table_of(self.family, number, firmware)
-        return FoundServo(id=servo, baud=self.baud, model_number=number, firmware=firmware, table=table, wire=self)
+        table = self._table or table_of(self.family, found.model_number, found.firmware)
+        return FoundServo(id=servo, baud=self.baud, **found._asdict(), table=table, wire=self)
 
     def _link(self, baud: int) -> RegisterLink:
         link: RegisterLink = self.kind.link_class()(self.port, baud, PATIENCE_S)
@@ -227,24 +244,29 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
 
     `baud` None: look at every rate. Raises PortError, ConfigError.
     """
-    kind, clock = _family(family), RealClock()
+    kind, clock, place = _family(family), RealClock(), None
     check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
-            from sfms_robot.app.wiring import plugged_in  # its numerics take longer to load than most tools to run
+            from sfms_robot.app.wiring import (
+                EmulatedPort,
+                plugged_in,
+            )  # its numerics take longer to load than most tools to run
 
             described = load_head(head)
             board = family_named(next(iter(described.buses.values())).family)
             if board.board:
                 raise ConfigError(f"--head {head}: its servos are on a {board.title}, which has no ids or registers")
             servos = next(iter(plugged_in(head, described).values()))
-            device, first = stack.enter_context(launch(servos)).device, servos[0].baud
+            chain, first = stack.enter_context(launch(servos)), servos[0].baud
+            line: Port = EmulatedPort(chain.device, chain.control, baud or first, clock)
+            place = f"--port {SIM} --head {quote(head)}"
         else:
             device, first = port or only_port(), kind.bauds[0]
             check_device(device)
-        line = SerialPort(device, baud or first, clock)
+            line = SerialPort(device, baud or first, clock)
         stack.callback(line.close)
-        yield Wire(line, family, clock, baud or first, baud is not None, model)
+        yield Wire(line, family, clock, baud or first, baud is not None, model, place)
 
 
 def check_baud(family: str, baud: int | None) -> None:
@@ -262,16 +284,6 @@ def only_port() -> str:
         return names[0]
     there = "several serial ports" if names else "no serial port here"
     raise ConfigError(f"--port: {there}, say which ({', '.join([*names, SIM])})")
-
-
-def check_device(device: str) -> None:
-    """Raise PortError for a path that cannot be a serial port, before anything is opened."""
-    problem = access_problem(device)
-    if problem is not None and is_address(device):
-        raise PortError(f"{device}: {problem}")
-    if problem is not None and "permission" not in problem:  # opening says what to do about permissions
-        there = ", ".join(each.by_id or each.path for each in list_ports()) or "none"
-        raise PortError(f"{device}: {problem} (serial ports here: {there})")
 
 
 def table_of(family: str, number: int | None, firmware: int | None, model: str | None = None) -> Table | None:
@@ -313,25 +325,28 @@ _ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
 _RATES: Final = 3  # of each family, those met most often
 
 
-def protocol_hint(wire: Wire) -> str:
-    """Return the `--family` to type where servos answer to another protocol, or nothing.
+def other_wires(wire: Wire) -> Iterator[Wire]:
+    """Yield the same port for each other family whose servos answer, at the rate at which they do.
 
-    Each family is tried at its usual rates, the wire's own first: by a broadcast ping, or for protocol 1, whose frames
-    the families share, by the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
+    Each family is tried at its usual rates: by a broadcast ping, or for protocol 1, whose frames the families share, by
+    the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
     """
     before = wire.baud
     try:
-        for name in sorted(servo_families(), key=lambda name: name != wire.family):
-            family = servo_families()[name]
-            for baud in family.bauds[:_RATES]:
+        for name, family in servo_families().items():
+            for baud in family.bauds[:_RATES] if name != wire.family else ():
                 with suppress(PortError):  # of an adapter that cannot do this rate
                     wire.at(baud)
                     other = Wire(wire.port, name, wire.clock, baud, fixed=True)
                     other.link.silence_s = _ID_S
                     ids = None if family.protocol == 2 else range(1, _FIRST_IDS + 1)
                     if any(seen.table is not None for seen in other.answering(ids)):
-                        same = name == wire.family
-                        return "" if same else f"these servos answer {family.title} at {baud} baud: --family {name}"
+                        yield other
+                        break
     finally:
         wire.at(before)
-    return ""
+
+
+def protocol_hint(wires: Iterable[Wire]) -> str:
+    """Return the `--family` to type for servos that answer to another protocol (`other_wires`); empty for none."""
+    return "; ".join(f"servos answer {each.kind.title} at {each.baud} baud: --family {each.family}" for each in wires)

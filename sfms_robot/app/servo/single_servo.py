@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,14 +16,13 @@ from typing import Any, Final, Literal
 import yaml
 
 from sfms_robot.app.output_paths import checked_file
-from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask
+from sfms_robot.app.progress import Progress, no_progress, tracked
+from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask, other_wires, protocol_hint
 from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
 from sfms_robot.servo.registers import Field
-
-Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is looked at
 
 BACK_S: Final = 2.0  # a servo that restarts is back by then
 _STEP_S: Final = 0.1
@@ -39,10 +38,6 @@ _WATCHED: Final = (
     "voltage",
     "temperature",
 )
-
-
-def no_progress(done: int, total: int, what: str) -> None:
-    """Show no progress."""
 
 
 # --- finding ----------------------------------------------------------------------------------------------------
@@ -65,6 +60,23 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
             found += [replace(seen, twice=wire.has_duplicate(seen.id)) for seen in wire.answering(some)]
     progress(total, total, f"{len(found)} found")
     return found
+
+
+def scan_all(
+    wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_progress
+) -> tuple[list[FoundServo], str]:
+    """Return the servos of `scan` and those of other families on the same wire, and the `--family` of these.
+
+    Families of protocol 1 share their frames: a servo is listed under the one that knows its model.
+    """
+    others = list(other_wires(wire))
+    found: list[FoundServo] = []
+    for each in (wire, *others):
+        wire.at(each.baud)  # one port for all
+        found += scan(each, ids, progress)
+    known = {(seen.id, seen.baud) for seen in found if seen.table is not None}
+    listed = [seen for seen in found if seen.table is not None or (seen.id, seen.baud) not in known]
+    return listed, protocol_hint(others)
 
 
 def checked_ids(text: str) -> list[int]:
@@ -311,25 +323,35 @@ def reboot(seen: FoundServo, confirm: Confirm) -> FoundServo:
 
 
 def factory_reset(seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
-    """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud."""
+    """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud.
+
+    Protocol 1 resets everything; what is to be kept is written back.
+    """
     if keep not in _RESETS:
         raise ConfigError.at("servo", "factory reset", keep, "is unknown", _RESETS)
-    wire, identity, rate = seen.wire, seen.registers().role("id"), seen.registers().default_baud
-    new_id = seen.id if keep != "all" or identity is None else identity.initial
+    wire, table, home = seen.wire, seen.registers(), seen.wire.baud
+    identity, rate, whole = table.role("id"), table.default_baud, keep == "all" or table.protocol == 1
+    new_id = seen.id if not whole or identity is None else identity.initial
+    taken = new_id != seen.id and wire.ping(new_id) is not None  # at this rate, which need not be the factory's
     if new_id != seen.id:
-        home = wire.baud
         if rate is not None and wire.at(rate).ping(new_id) is not None:
             raise ConfigError(f"id {new_id}, which a new servo has, is taken by another one at {rate} baud: unplug it")
         wire.at(home)
     seen.guard(f"every setting of id {seen.id} to its factory value ({keep})", confirm)
-    _accepted(seen, wire.link.factory_reset(seen.id, _RESETS[keep]), "the reset")
-    expected = wire.baud if keep == "keep-id-and-baud" or rate is None else rate
-    for baud in dict.fromkeys((expected, wire.baud)):
+    _accepted(seen, wire.link.factory_reset(seen.id, _RESETS["all" if whole else keep]), "the reset")
+    expected = home if rate is None or (keep == "keep-id-and-baud" and not whole) else rate
+    for baud in dict.fromkeys((expected, expected if taken else home)):
         wire.at(baud)
-        back = _wait_for(wire, new_id)
-        if back is not None:
-            return back
+        if (back := _wait_for(wire, new_id)) is not None:
+            return _as_before(back, None if keep == "all" else seen.id, home if keep == "keep-id-and-baud" else None)
     raise ServoError(f"id {seen.id} was reset and does not answer as {new_id} at {expected} baud")
+
+
+def _as_before(seen: FoundServo, servo: int | None, baud: int | None) -> FoundServo:
+    """Give a servo that was reset its id and its rate again, if they are to be kept."""
+    if servo not in (None, seen.id):
+        seen = set_id(seen, servo, lambda question: True, in_chain=True)
+    return seen if baud in (None, seen.baud) else set_baud(seen, baud, lambda question: True)
 
 
 def _accepted(seen: FoundServo, answer: Any, what: str) -> None:
@@ -383,7 +405,7 @@ class Dump(Model):
 def dump(servos: Sequence[FoundServo]) -> Dump:
     """Read every register of `servos`. Raises ConfigError for a model without a firmware map, ServoError."""
     found = []
-    for seen in servos:
+    for seen in tracked(servos, "reading registers"):
         who = {"id": seen.id, "model": seen.registers().model, "model_number": seen.model_number}
         seen.wire.at(seen.baud)
         found.append(DumpedServo(**who, firmware=seen.firmware, registers=read_all(seen).values))

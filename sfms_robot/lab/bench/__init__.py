@@ -71,6 +71,10 @@ BENCHES: Final[Mapping[str, Bench]] = {
         "view_bench:measure", "a page that three clients read, beside the share allowed; a halt from click to wire",
         in_all=False, takes=("say",),
     ),
+    "outputs": Bench(
+        "view_bench:outputs", "four outputs of a run, beside the share allowed, and its late ticks beside none",
+        in_all=False, takes=("say",),
+    ),
     "throttle": Bench(
         "throttle_bench:measure", "a run on a quarter of one core, beside the same on all of this machine; exit code 1 "
         "where a command leaves its limits or the states are not those of docs/safety.md", takes=("say",),

@@ -12,7 +12,7 @@ from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.frames import FRAME_S, MOTION_DIM, Floats, Plan
 from sfms_robot.lab.bench.measure import HEAD, Row, row, times
 from sfms_robot.motion.calibration import Calibration
-from sfms_robot.runtime.loop import difference
+from sfms_robot.motion.limits import difference
 
 _RATE_HZ = 100.0
 _TICKS = 2000

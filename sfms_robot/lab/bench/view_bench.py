@@ -1,19 +1,24 @@
-"""`bench view`: the cost of three visitors of the page, and the delay of a halt from the page.
+"""`bench view` and `bench outputs`: the cost of showing a run elsewhere.
+
+`bench view`: the cost of three visitors of the page, and the delay of a halt from the page.
 
 The default head runs on emulated servos with its page, and three plain WebSocket clients in a separate process read all
 that the page sends. The cost is the processor time of the page's process and of the threads of the run that send to it,
 by windows. The loop's own part, some microseconds of packing 25 times a second, and the processes of listener, servos
 and clients are not counted. A halt counts from the click, a message of a fourth client, until the goals of the first
 braking tick are written.
+
+`bench outputs`: late ticks of a run with four outputs beside the same without, and the processor time of their threads.
 """
 
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Final
 
@@ -22,12 +27,14 @@ from websockets.sync.client import ClientConnection, connect
 
 from sfms_robot.app.listen.page_session import page_session
 from sfms_robot.app.options import RunOptions, begin_page
+from sfms_robot.app.session import run
+from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.lab.bench.measure import HEAD, BenchResult, processor_time_s, row
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import Child, ParentPipe
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
-from sfms_robot.viewer.page_process import THREAD, PageProcess
+from sfms_robot.viewer.page_process import THREAD
 
 _SETTLE_S: Final = 5.0
 _WINDOW_S: Final = 4.0
@@ -35,6 +42,7 @@ _WINDOWS: Final = 10
 _HALTS: Final = 8
 _CLIENTS: Final = 3
 _MOST_CPU: Final = 3.0  # % of a core
+_MOST_OUTPUTS_CPU: Final = 5.0  # % of a core
 _MOST_HALT_MS: Final = 100.0
 _BETWEEN_S: Final = 2.3  # a halt and the way back to the face; not a multiple of a tick
 _LIMIT_S: Final = 60.0
@@ -59,7 +67,7 @@ def measure(say: Callable[[str], None], windows: int = _WINDOWS, halts: int = _H
     def visit() -> None:
         if watch.settled.wait(_LIMIT_S):
             for _ in range(windows):
-                shares.append(_share(page))
+                shares.append(_share(lambda: processor_time_s(page.process_id) + _threads_s(THREAD)))
             _click(page.url, watch, halts, halts_ms)
 
     options = RunOptions(head=HEAD, audio=DEFAULT_SPEAKER, duration_s=duration_s)
@@ -77,6 +85,47 @@ def measure(say: Callable[[str], None], windows: int = _WINDOWS, halts: int = _H
     found = BenchResult.of_rows({"view.cpu": cost, "view.halt": halt})
     late = report["tick"]["late"]
     return BenchResult({**found.figures, "late_ticks": late}, found.table, [f"{late} of {report['ticks']} ticks late"])
+
+
+def outputs(say: Callable[[str], None], windows: int = _WINDOWS) -> BenchResult:
+    """Measure a run without outputs, then with four, one of them read by clients; takes a minute and a half.
+
+    The processor time is that of the outputs' threads. Linux only. Raises ConfigError, BusError.
+    """
+    shares: list[float] = []
+    watch = _Watch()
+    with ExitStack() as stack:
+        places = []
+        for _ in range(4):
+            receiver = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+            receiver.bind((LOOPBACK, 0))  # packets that nothing reads are dropped by the system
+            places.append(receiver.getsockname()[1])
+        kinds = ("json", "vmc", "vmc-single", "live-link")
+        chosen = tuple(f"{kind}:{port}" for kind, port in zip(kinds, places, strict=True))
+
+        def read() -> None:
+            if watch.settled.wait(_LIMIT_S):
+                readers = Child(f"{__name__}:clients", f"http://{LOOPBACK}:{places[0]}/", name="clients")
+                shares.extend(_share(lambda: _threads_s("output")) for _ in range(windows))
+                readers.close(_CLOSE_S)
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        late = []
+        for four, observers in (((), []), (chosen, [watch])):
+            say(f"{windows} times {_WINDOW_S:g} s with {len(four)} outputs")
+            options = RunOptions(
+                head=HEAD, audio=DEFAULT_SPEAKER, duration_s=_SETTLE_S + (windows + 1) * _WINDOW_S, outputs=four
+            )
+            report = run(options, observers=observers)
+            if report["exit"] != "done":
+                raise BusError(f"bench outputs: the run ended early: {report['exit']} {report['error'] or ''}")
+            late.append(100 * report["tick"]["late"] / report["ticks"])
+        reader.join(_LIMIT_S)
+    cost = row(shares, [_MOST_OUTPUTS_CPU], "% of a core, 4 outputs", "the share that is allowed")
+    lines = [f"{late[1]:.3g} % of ticks late with four outputs, {late[0]:.3g} % without"]
+    found = BenchResult.of_rows({"outputs.cpu": cost})
+    return BenchResult({**found.figures, "late_percent": late[1], "late_percent_without": late[0]}, found.table, lines)
 
 
 class _Watch(Observer):
@@ -100,13 +149,14 @@ class _Watch(Observer):
             self.settled.set()
 
 
-def _share(page: PageProcess) -> float:
-    """Return the processor time of the page and of what sends to it over one window, in % of a core. Blocks."""
+def _threads_s(name: str) -> float:
+    """Return the processor time of the threads of this process whose names begin with `name`."""
+    found = [each.native_id for each in threading.enumerate() if each.name.startswith(name)]
+    return sum(processor_time_s(os.getpid(), each) for each in found)
 
-    def used_s() -> float:
-        senders = [each.native_id for each in threading.enumerate() if each.name == THREAD]
-        return processor_time_s(page.process_id) + sum(processor_time_s(os.getpid(), one) for one in senders)
 
+def _share(used_s: Callable[[], float]) -> float:
+    """Return the processor time that `used_s` counts over one window, in % of a core. Blocks."""
     began_s, before_s = time.monotonic(), used_s()
     time.sleep(_WINDOW_S)
     return 100 * (used_s() - before_s) / (time.monotonic() - began_s)

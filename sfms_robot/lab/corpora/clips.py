@@ -15,11 +15,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, MOTION_DIM, SPACE_CHANNELS, Floats, ListenerEvent
-from sfms_robot.lab.corpora.action_units import FAU_VALUE
+from sfms_robot.frames import (
+    AUDIO_HZ,
+    BLENDSHAPES,
+    FRAME_HZ,
+    MOTION_DIM,
+    SPACE_CHANNELS,
+    Doubles,
+    Floats,
+    ListenerEvent,
+)
 from sfms_robot.signals import mel as log_mel
+from sfms_robot.signals.face_tables import SHAPES_OF_UNIT
 from sfms_robot.signals.tracks import Take
 
+# Facial action units (FACS: Ekman, Friesen and Hager 2002), one intensity for both sides of the face. Shapes without a
+# unit stay 0, and units without a shape of their own are left out; `data check` and `data convert` report both.
+# The 24 columns of `FAUValue` of Seamless Interaction. The data set does not say their order; this is the one that
+# software written for it uses, and `lab.corpora.external.seamless` compares it with the key points of the files.
+FAU_VALUE: Final = (1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 14, 15, 16, 17, 18, 20, 22, 23, 24, 25, 26, 28, 30, 43)
+FULL: Final = 2.0  # the intensity at which its columns saturate: shown as 1
+# 23 (lip tightener) and 25 (lips part) have no shape of their own, 30 (jaw sideways) does not tell the side.
+WITHOUT_SHAPE: Final = tuple(unit for unit in FAU_VALUE if unit not in SHAPES_OF_UNIT)
+WITHOUT_UNIT: Final = tuple(
+    shape for shape in BLENDSHAPES if not any(shape in shapes for shapes in SHAPES_OF_UNIT.values())
+)
+_PLACES: Final = [
+    (column, [BLENDSHAPES.index(shape) for shape in SHAPES_OF_UNIT[unit]])
+    for column, unit in enumerate(FAU_VALUE)
+    if unit in SHAPES_OF_UNIT
+]
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
 # Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
@@ -295,3 +320,15 @@ def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
     for split, item in items:
         parts[split].append(item)
     return parts
+
+
+def blendshapes_of(intensities: Floats | Doubles) -> Floats:
+    """Return blendshapes (N, 52) within 0..1 of intensities (N, 24) in the order of `FAU_VALUE`.
+
+    Raises ValueError for another width."""
+    if intensities.ndim != 2 or intensities.shape[1] != len(FAU_VALUE):
+        raise ValueError(f"action units are {intensities.shape}, not (N, {len(FAU_VALUE)})")
+    out = np.zeros((len(intensities), len(BLENDSHAPES)), np.float32)
+    for column, places in _PLACES:
+        out[:, places] = np.clip(intensities[:, column] / FULL, 0.0, 1.0)[:, None]
+    return out

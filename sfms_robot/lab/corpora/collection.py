@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, overload
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, Dyad
@@ -147,7 +148,7 @@ class Dataset(Sequence[Dyad]):
 def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
     """Yield every dyad that can be read; the others are counted and named in one warning at the end."""
     left_out = []
-    for index in range(len(dyads)):
+    for index in tracked(range(len(dyads)), "reading dyads"):
         try:
             dyad = dyads[index]
         except ClipError as error:

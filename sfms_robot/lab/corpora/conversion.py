@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Doubles, Floats
-from sfms_robot.lab.corpora.action_units import FAU_VALUE, FULL, WITHOUT_SHAPE, blendshapes_of
-from sfms_robot.lab.corpora.clips import Dyad, at_rate, samples_of
+from sfms_robot.lab.corpora.clips import FAU_VALUE, FULL, WITHOUT_SHAPE, Dyad, at_rate, blendshapes_of, samples_of
 from sfms_robot.signals.mel import ROWS_PER_FRAME
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import SPACES, FlameMatrix, decode, encode, limitation

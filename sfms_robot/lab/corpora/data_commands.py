@@ -6,17 +6,16 @@ Of a checked set every clip is read once, and nothing is skipped in silence.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.progress import track
 
+from sfms_robot.app.progress import bar, tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS, Doubles
 from sfms_robot.lab.corpora import clips, formats
@@ -26,18 +25,10 @@ from sfms_robot.lab.corpora.compose.composed import compose_folder
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, Residual, names, to_ours
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
-_T = TypeVar("_T")
-
-
-def _shown(items: Sequence[_T], what: str) -> Iterable[_T]:
-    """Iterate under a progress bar on stderr, if that is a terminal."""
-    console = Console(stderr=True)
-    return track(items, what, console=console, transient=True, disable=not console.is_terminal)
-
 
 def _scanned(layout: Layout, place: Path, split: str, order: Order | None) -> Dataset:
     """Read names and headers of a split, with a message: of many files even these take some time."""
-    with Console(stderr=True).status(f"{split}: headers"):
+    with bar(f"{split}: headers"):
         return formats.scan_split(layout, place, split, order)
 
 
@@ -45,11 +36,12 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: b
     """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
-    with Console(stderr=True).status("reading") as status:
+    with bar("composing dyads") as moved:
 
         def told(name: str, wanted: float, done: float) -> None:
-            status.update(f"composing {name}: {done:.0f} of {wanted:.0f} minutes")
+            moved(done, wanted, f"{name}, {done:.0f} of {wanted:.0f} minutes")
 
+        moved(0, 0, "reading")
         return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite))
 
 
@@ -93,7 +85,7 @@ def _checked(layout: Layout, place: Path, split: str, order: Order | None, windo
             problems=(Problem("unreadable", str(place), str(error)),),
         )  # fmt: skip
     tally, kept, problems = _Tally(), list[Clip](), list(dataset.problems)
-    for index, clip in enumerate(_shown(dataset.clips, split)):
+    for index, clip in enumerate(tracked(dataset.clips, split)):
         try:
             if clip.frames < (least := max(1, window)):
                 raise ClipError.of("too short", clip.name, f"{clip.frames} frames, a window needs {least}")
@@ -259,7 +251,7 @@ def _converted(
     if said := formats.wrong_order(dataset, order):
         raise ConfigError(f"{dataset.split}: {said}")
     problems, seconds, written = list(dataset.problems), 0.0, 0
-    for index in _shown(range(len(dataset)), dataset.split):
+    for index in tracked(range(len(dataset)), dataset.split):
         try:
             dyad = dataset[index]
             ours = guarded(dyad.name, partial(to_ours, dyad, residual, flame))

@@ -119,7 +119,8 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
     if layout != "auto" and layout not in LAYOUTS:
         raise ConfigError(f"--layout {layout}: is not known (auto, {', '.join(LAYOUTS)})")
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
+        problem = "expected a folder, got a file (unpack an archive first)" if folder.exists() else "no such folder"
+        raise ConfigError(f"{folder}: {problem}")
     tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
     # Our own first: converted dyads keep the names of their files, and these may be another layout's.
     for candidate in sorted(tried, key=lambda one: one is not COMPOSED):

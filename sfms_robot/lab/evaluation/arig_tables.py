@@ -18,6 +18,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find, load_training
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -28,7 +29,7 @@ from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.intervals import Chosen, jackknife, people_of
 from sfms_robot.lab.evaluation.listener_tables import collect, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
-from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts, tracked
+from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts
 from sfms_robot.lab.evaluation.tokenizer_tables import TABLES as TOKENIZER_TABLES
 from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table, needed
 from sfms_robot.lab.learning.arig.features import open_scenes

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
@@ -18,7 +19,7 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
 from sfms_robot.lab.evaluation.phrase_timing import near
-from sfms_robot.lab.evaluation.rollout import Rollout, rollouts, tracked
+from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from sfms_robot import config
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SPACE_CHANNELS, Doubles
@@ -36,7 +37,6 @@ from sfms_robot.lab.evaluation.rollout import (
     offline_rollout,
     rollout,
     rollouts,
-    tracked,
     whole_clips,
 )
 from sfms_robot.lab.learning.corpus import in_space
@@ -240,7 +240,10 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     return {
         "listener": name,
         "window": model.tokenizer.window,
-        "rows": [{"name": each, "mse": reconstruction_error(model, corpus, each)} for each in placements],
+        "rows": [
+            {"name": each, "mse": reconstruction_error(model, corpus, each)}
+            for each in tracked(placements, "restoring motion")
+        ],
     }
 
 

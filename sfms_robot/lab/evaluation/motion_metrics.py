@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles
 from sfms_robot.lab.corpora.reading import npy
@@ -65,7 +66,7 @@ def evaluate_metrics(
     """
     scored = _read(truth, prediction, speaker, space, frames)
     rows: list[dict[str, Any]] = []
-    for part, where in PARTS.get(scored.space, {}).items():
+    for part, where in tracked(PARTS.get(scored.space, {}).items(), "scoring motion"):
         rows += [{"part": part} | row for row in _part_rows(scored, part, where, seed)]
     rows += [{"part": "all"} | row for row in _react_rows(scored)]
     if scored.space == "arkit58":

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 from torch import Tensor, nn
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Dyad
@@ -36,7 +37,7 @@ from sfms_robot.lab.corpora.reading import speaks
 from sfms_robot.lab.evaluation.detection import movement, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import ends
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, tracked
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener
@@ -138,7 +139,7 @@ def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_
             frames += speaker
     kept = frames[: round(drift_s * FRAME_HZ)]
     timed = [changed(frame, time_s=(index + 1) * FRAME_S) for index, frame in enumerate(kept)]
-    return np.asarray(rollout(listener, timed, [seed]).motion[0])
+    return np.asarray(rollout(listener, timed, [seed], title="a long run").motion[0])
 
 
 def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:

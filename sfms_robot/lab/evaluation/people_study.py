@@ -29,6 +29,7 @@ import soundfile
 from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Doubles, Floats, SpeakerFrame
@@ -37,7 +38,7 @@ from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
 from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread, tracked
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.study_server import serve_study

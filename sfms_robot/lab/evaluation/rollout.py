@@ -20,10 +20,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
@@ -76,11 +75,6 @@ def run_in_processes(
         for done in tracked(as_completed(waiting), title, len(tasks)):
             done.result()
         return [one.result() for one in waiting]
-
-
-def tracked(items: Iterable[_Task], title: str, total: int | None = None) -> Iterable[_Task]:
-    """Yield the items, with a progress bar on stderr."""
-    return track(items, title, total, console=Console(stderr=True))
 
 
 def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
@@ -154,17 +148,21 @@ def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) 
 
 
 def rollout(
-    listener: Listener, speaker: Sequence[SpeakerFrame], seeds: Sequence[int], events: Sequence[ListenerEvent] = ()
+    listener: Listener,
+    speaker: Sequence[SpeakerFrame],
+    seeds: Sequence[int],
+    events: Sequence[ListenerEvent] = (),
+    title: str = "",
 ) -> Rollout:
     """Play the listener to `speaker` once for every seed, all streams together if it can.
 
-    `events`: for a listener that follows events.
+    `events`: for a listener that follows events. `title`: of a bar; "": none.
     """
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
     states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
     decided: list[list[ListenerEvent]] = [[] for _ in seeds]
-    for index, frame in enumerate(speaker):
+    for index, frame in enumerate(tracked(speaker, title) if title else speaker):
         control = control_at(listener, events, index)
         controls = () if control is None else ([control] * len(seeds),)
         stepped = step_each(listener, [frame] * len(seeds), memories, *controls)

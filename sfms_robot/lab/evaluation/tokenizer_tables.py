@@ -23,9 +23,9 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from torch import Tensor
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
@@ -124,11 +124,10 @@ def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> tuple[d
     truth = _doubles(next(iter(models.values())).standardise(seen.motion))
     clusters = cluster(truth) if len(truth) >= 4 else None
     rows, errors = list[dict[str, Any]](), {}
-    for spec in TABLES[name]:
-        if spec.tokenizer in models:
-            row, wrong = _scored(spec, models[spec.tokenizer], seen, clusters)
-            rows.append(row)
-            errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
+    for spec in tracked([each for each in TABLES[name] if each.tokenizer in models], f"scoring table {name}"):
+        row, wrong = _scored(spec, models[spec.tokenizer], seen, clusters)
+        rows.append(row)
+        errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
     table = {
         "table": int(name),
         "rows": rows,
@@ -327,7 +326,7 @@ def evaluate_table(
             "%d of %d stretches with a face are shorter than a window of %d frames and left out: %s",
             len(short), len(held_out), first.window, ", ".join(dict.fromkeys(short)),
         )  # fmt: skip
-    with Console(stderr=True).status("scoring"), torch.inference_mode():
+    with torch.inference_mode():
         tables = {name: build(name, loaded, seen) for name in chosen}
     if plots is not None:
         draw(plots, loaded, folder, seen.motion, seen.takes, tables["4"][1] if "4" in tables else {})

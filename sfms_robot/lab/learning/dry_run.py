@@ -9,7 +9,6 @@ costs the processor that makes them; and after it the random numbers, which are 
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import torch
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, MOTION_DIM, ListenerEvent
+from sfms_robot.lab.bench.measure import memory_mb
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.learning.arig import features as arig
@@ -159,7 +159,7 @@ def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
         "loss": loss,
         **figures,
         "here_s": round(time.perf_counter() - began_s, 2),
-        "here_peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "here_peak_mb": round(memory_mb("VmHWM"), 1),
         "hours": {gpu: round(steps * _step_s(figures, of, half) / 3600, 3) for gpu, of in GPUS.items()},
     }
 

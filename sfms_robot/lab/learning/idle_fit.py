@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import rollouts, spread, tracked
+from sfms_robot.lab.evaluation.rollout import rollouts, spread
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.idle import FILE, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
 from sfms_robot.listeners.registry import load_folder, one_thread

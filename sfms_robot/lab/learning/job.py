@@ -40,12 +40,12 @@ from typing import Any, Literal
 
 import torch
 import torch.distributed as dist
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TaskID, TextColumn
 from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
 from sfms_robot import config
+from sfms_robot.app.progress import PlainBar, TimeLeft, console, rich_bar
 from sfms_robot.errors import ConfigError, GroupError, optional
 
 PATIENCE = timedelta(minutes=30)  # a process looks at held-out data, or stages files, while others wait
@@ -264,24 +264,34 @@ _CURVES = ("loss", "gradient_norm", "learning_rate", "frames_per_s")
 def progress_bar() -> Iterator[Watch]:
     """Show a bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
     tasks: dict[str, TaskID] = {}
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    ) as bar:
+    lines: dict[str, PlainBar] = {}
+    rests: dict[str, TimeLeft] = {}
+
+    def plain(report: Report) -> None:
+        line = lines.setdefault(report.name, PlainBar(report.name, last=True))
+        line(report.position.step, report.steps, _figures(report))
+
+    if not console().is_terminal:
+        yield plain
+        return
+    with rich_bar(MofNCompleteColumn(), TextColumn("{task.fields[figures]}"), transient=False) as bar:
 
         def watch(report: Report) -> None:
-            at = report.position
-            if report.name not in tasks:  # of a resumed run the time left counts from its checkpoint
-                tasks[report.name] = bar.add_task(report.name, total=report.steps, completed=at.step - 1, figures="")
-            held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
-            figures = f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
-            bar.update(tasks[report.name], completed=at.step, figures=figures)
+            step = report.position.step
+            if report.name not in tasks:
+                tasks[report.name] = bar.add_task(report.name, total=report.steps, figures="", left="")
+                rests[report.name] = TimeLeft()
+            left = rests[report.name](step, report.steps)
+            bar.update(tasks[report.name], completed=step, figures=_figures(report), left=left)
 
         yield watch
+
+
+def _figures(report: Report) -> str:
+    """Return loss, held-out loss and speed, as the bar shows them."""
+    at = report.position
+    held_out = "" if at.held_out is None else f"  held out {at.held_out:.4f} (best {at.best:.4f})"
+    return f"loss {at.loss:.4f}{held_out}  {report.frames_per_s:,.0f} frames/s"
 
 
 @contextmanager

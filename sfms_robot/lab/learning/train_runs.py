@@ -17,13 +17,14 @@ import torch
 from torch import Tensor
 
 from sfms_robot import config
+from sfms_robot.app.progress import Progress, bar, no_progress
 from sfms_robot.config import load_training, parse_training
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import offline_rollout, tracked
+from sfms_robot.lab.evaluation.rollout import offline_rollout
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.corpus import without_gaze
 from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
@@ -186,8 +187,13 @@ def calibrate(training: config.Training, data: Path, out: Path, order: Order | N
     every = open_for(space.name, data, "train", order, [settings.audio])
     some, rounds = _some(every, settings.window_frames), training.predictor.calibration_rounds
     found = corrected(training)
-    for _ in tracked(range(rounds), "calibrating by roll-outs"):
-        found = placing(found, model, some)
+    with bar("calibrating by roll-outs") as moved:
+        for number in range(rounds):
+
+            def played(done: float, dyads: float, what: str, number: int = number) -> None:
+                moved(number * dyads + done, rounds * dyads, f"round {number + 1} of {rounds}, {what}")
+
+            found = placing(found, model, some, played)
     if rounds and found.events:
         found = coursed(found, _some(every, settings.window_frames, COURSE_DYADS))
     checkpoint.save_config(out, found)
@@ -200,17 +206,19 @@ def _some(dyads: Dataset, window: int, count: int = DYADS) -> list[Dyad]:
     return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
 
 
-def placing(settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad]) -> config.Sfms:
+def placing(
+    settings: config.Sfms, model: SfmsModel, dyads: Sequence[Dyad], moved: Progress = no_progress
+) -> config.Sfms:
     """Return `settings` with biases that would have given a roll-out the keyframe rates of the data.
 
     The model is left in evaluation mode.
     """
     listener = SfmsListener(settings, torch_engine(model.eval()))
     wanted = _rates(tokenise(model, gather(dyads, settings.window_frames, listener.space, None, settings)))
-    rolled = [
-        offline_rollout(listener, dyad, range(1 + STREAMS * index, 1 + STREAMS * (index + 1)))
-        for index, dyad in enumerate(dyads)
-    ]
+    rolled = []
+    for index, dyad in enumerate(dyads):
+        moved(index, len(dyads), f"dyad {index + 1} of {len(dyads)}")
+        rolled.append(offline_rollout(listener, dyad, range(1 + STREAMS * index, 1 + STREAMS * (index + 1))))
     rates = _rates(torch.cat([one.tokens.flatten(0, 1) for one in rolled]))
     groups = {}
     for (name, group), has, wants in zip(settings.groups.items(), rates, wanted, strict=True):

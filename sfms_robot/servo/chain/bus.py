@@ -33,7 +33,7 @@ from sfms_robot.frames import Doubles, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
-from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member
+from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member, Notices
 from sfms_robot.servo.chain.poll import TURN_S, StatusPoll
 from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
 from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
@@ -98,7 +98,10 @@ class ChainBus(WireBus[RegisterLink]):
             self.startup(servo, needs, self._warnings, self._coming_back)
             for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)
         ]
-        self._members = [Member(i, each, faults or Faults(), self._faults) for i, each in enumerate(self._startups)]
+        self._notices = Notices(name, len(servos))
+        self._members = [
+            Member(i, each, faults or Faults(), self._faults, self._notices) for i, each in enumerate(self._startups)
+        ]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque)
         self._enabled = False
@@ -188,7 +191,7 @@ class ChainBus(WireBus[RegisterLink]):
             if not member.listed:
                 member.awaited()
                 held.append(member.servo.nearest_to_zero_rad)
-                log.warning("%s does not answer; it comes in when it does", member.servo)
+                self._notices.add(member.servo, "does not answer; it comes in when it does")
                 continue
             self._forget(member)
             self._powered |= {member.id}
@@ -301,6 +304,7 @@ class ChainBus(WireBus[RegisterLink]):
             self._powered -= self._confirm_off(link, torque, limp)
             if watchdog is not None:
                 self._confirm_off(link, watchdog, [servo for servo in armed if servo not in limp])
+        self._notices.log()
 
     def _stop_members(self) -> None:
         self._settings.clear()
@@ -329,7 +333,7 @@ class ChainBus(WireBus[RegisterLink]):
             self._write_off(link, field, rest)
         for servo in self._servos:
             if servo.id in rest:
-                log.warning("%s does not confirm that its %s is off", servo, field.name)
+                self._notices.add(servo, f"does not confirm that its {field.name} is off")
         return frozenset(ids).difference(rest)
 
     def close(self) -> None:
@@ -339,6 +343,7 @@ class ChainBus(WireBus[RegisterLink]):
             self._write_off(link, watchdog, self._settings.changed(BUS_WATCHDOG))
         self._enabled = False
         self._stop_members()
+        self._notices.log()
         super().close()
 
     # --- every tick ---------------------------------------------------------------------------------------------
@@ -443,6 +448,7 @@ class ChainBus(WireBus[RegisterLink]):
             self._bring_back(link, stamp_s)
             self._settings.compare(link, self._poll, stamp_s)
             self._poll.blocks(link, stamp_s)
+        self._notices.log(stamp_s)
         self._peak_mA = max(self._peak_mA, self._telemetry.supply_mA())
         self._update_places()
         return answered

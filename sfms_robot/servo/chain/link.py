@@ -41,10 +41,14 @@ _MOST_READS: Final = 64  # after which a wire that never falls silent is given u
 
 
 class Found(NamedTuple):
-    """The servo that answered a ping. None if the protocol's ping does not report it."""
+    """The servo that answered a ping. None if the protocol's ping does not report it.
+
+    `firmware_minor`: of Feetech, whose firmware has two numbers.
+    """
 
     model_number: int | None
     firmware: int | None
+    firmware_minor: int | None = None
 
 
 class Answer(NamedTuple):
@@ -245,7 +249,11 @@ class RegisterLink(ABC):
         deadline_s = asked_s + first * self._byte_s + allowance_s
         noise_s = NO_PATIENCE * self.silence_s if self._left_s == math.inf else 0.0
         last_s = deadline_s + rest * self._byte_s + noise_s
-        while port.now_s() < last_s and (data := port.read(_CHUNK, min(deadline_s, last_s))):
+        over = False
+        while not over:
+            over = port.now_s() >= last_s  # this computer was busy meanwhile: what has come by now still counts
+            if not (data := port.read(_CHUNK, min(deadline_s, last_s))):
+                break
             deadline_s = port.now_s() + allowance_s
             yield data
         self._left_s = max(0.0, self._left_s - min(allowance_s, port.now_s() - asked_s))

@@ -29,7 +29,7 @@ from sfms_robot.config import Faults
 from sfms_robot.errors import ServoError
 from sfms_robot.servo.chain.link import Silent, Steps
 from sfms_robot.servo.chain.startup import Startup
-from sfms_robot.servo.policy import counts, load_rules
+from sfms_robot.servo.policy import BusServo, counts, load_rules
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,7 @@ MISSES: Final = 2  # single lost answers in a row before a servo counts as silen
 FIRST_PAUSE_S: Final = 0.05  # between two probes of a silent servo
 LONGEST_PAUSE_S: Final = 1.0
 LOGGED_EVERY_S: Final = 10.0  # that a servo is silent: a loose contact comes and goes many times a second
+GATHER_S: Final = 0.25  # messages of one text that come within it are one line
 RETRY_S: Final = 0.2  # after a silence on the way back
 REFUSED_S: Final = 2.0  # after a refusal on the way back
 LIMP_S: Final = 3.0  # a joint that was pinched stays limp so long
@@ -76,6 +77,36 @@ _LIMP: Final = frozenset({MemberState.LIMP, MemberState.GIVEN_UP, MemberState.RE
 _COMING: Final = frozenset({MemberState.RETURNING, MemberState.REBOOTING})
 
 
+class Notices:
+    """Log lines about the servos of one bus. Servos with the same message at about the same time share a line.
+
+    Args:
+        servos: how many the bus has.
+    """
+
+    def __init__(self, bus: str, servos: int) -> None:
+        self._bus, self._servos = bus, servos
+        self._waiting: dict[tuple[int, str], dict[str, int]] = {}  # (level, text) -> servos, each with a count
+        self._since_s: dict[tuple[int, str], float] = {}
+
+    def add(self, servo: BusServo, text: str, level: int = logging.WARNING, times: int = 0) -> None:
+        """Keep a message for `log`. `times`: it was left out so often since the last one."""
+        self._waiting.setdefault((level, text), {})[str(servo)] = times
+
+    def log(self, now_s: float = math.inf) -> None:
+        """Log the messages that have waited for others for `GATHER_S`; all of them without a time."""
+        for key in list(self._waiting):
+            if now_s - self._since_s.setdefault(key, now_s if now_s < math.inf else 0.0) < GATHER_S:
+                continue
+            del self._since_s[key]
+            (level, text), servos = key, self._waiting.pop(key)
+            every = len(servos) == self._servos > 2
+            named = f"bus {self._bus!r}: all {self._servos} servos" if every else ", ".join(servos)
+            most = max(servos.values())
+            times = f" ({'up to ' * (len(servos) > 1)}{most} times since the last message)" if most else ""
+            log.log(level, "%s: %s%s", named, text, times)
+
+
 class Member:
     """One servo. Events come in by methods; its wishes are read from its attributes.
 
@@ -84,6 +115,7 @@ class Member:
         startup: starts it up; has its joint, id, limits, safety and control table.
         faults: which of its faults count.
         reported: faults of the bus, `joint: fault` in the order of appearance, for the report; each is logged once.
+        notices: of the bus.
 
     Attributes:
         state: see the module.
@@ -99,8 +131,11 @@ class Member:
         mismatch: registers that do not hold what was written, in words.
     """
 
-    def __init__(self, index: int, startup: Startup, faults: Faults, reported: dict[str, None]) -> None:
+    def __init__(
+        self, index: int, startup: Startup, faults: Faults, reported: dict[str, None], notices: Notices
+    ) -> None:
         self.index = index
+        self._notices = notices
         self.startup = startup
         self.servo = startup.servo
         self.id = self.servo.id
@@ -254,7 +289,7 @@ class Member:
         """Note that it was silent and answers again."""
         if self._logged_silent:
             self._logged_silent = False
-            log.warning("%s answers again", self.servo)
+            self._notices.add(self.servo, "answers again", logging.INFO)
         if self.state is MemberState.SILENT:
             self._return(now_s)
         elif self._trouble == NO_ANSWER:
@@ -267,8 +302,7 @@ class Member:
         if now_s < self._logged_s + LOGGED_EVERY_S:
             self._unlogged += again
             return
-        times = f" ({self._unlogged} times since the last message)" if self._unlogged else ""
-        log.warning("%s is silent%s", self.servo, times)
+        self._notices.add(self.servo, "silent", times=self._unlogged)
         self._logged_s, self._unlogged, self._logged_silent = now_s, 0, True
 
     # --- what it reports ----------------------------------------------------------------------------------------
@@ -392,7 +426,7 @@ class Member:
         if recalled:
             self.recalled, self._bits, self._named = True, bits, named
         else:
-            log.warning("%s is back and holds where it stands", self.servo)
+            self._notices.add(self.servo, "back, and holds where it stands", logging.INFO)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
@@ -421,7 +455,7 @@ class Member:
             recent.append(now_s)
             self._return(due_s, reboot)
             return
-        log.warning("%s came back %d times in %g s and is left alone", self.servo, len(recent), FORGET_S)
+        self._notices.add(self.servo, f"came back {len(recent)} times in {FORGET_S:g} s, and is left alone")
         self._release(math.inf)
         self.state = MemberState.GIVEN_UP
         self._trouble = GIVEN_UP
@@ -446,5 +480,5 @@ class Member:
     def _report(self, fault: str) -> None:
         named = f"{self.servo.joint}: {fault}"
         if named not in self._reported:
-            log.warning("%s: %s", self.servo, fault)
+            self._notices.add(self.servo, fault)
         self._reported[named] = None

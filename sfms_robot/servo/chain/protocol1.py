@@ -221,7 +221,7 @@ class FeetechLink(Protocol1Link):
         return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)
 
     def _identity(self, data: bytes) -> Found:
-        return Found(int.from_bytes(data[3:5], "big" if data[2] else "little"), data[0])
+        return Found(int.from_bytes(data[3:5], "big" if data[2] else "little"), data[0], data[1])
 
     def broadcast_ping(self) -> dict[int, Found]:
         ids = range(protocol1.MAX_ID + 1)

@@ -14,7 +14,7 @@ from typing import Final, cast
 
 from sfms_robot.config import variant
 from sfms_robot.config.wire_time import FRAMINGS
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import NOTE, ConfigError
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
 from sfms_robot.servo.chain.sdk_packets import read2, sync_read2
@@ -205,7 +205,7 @@ class Dynamixel2Startup(Startup):
             raise self._error(f"stands at {now[present.name]}, beyond one turn, and refuses CLEAR: {refusal}")
         cleared = self.value(present)
         yield 0.0
-        log.warning("%s", self._about(f"was turned past one turn: {now[present.name]} now reads {cleared}"))
+        log.log(NOTE, "%s", self._about(f"was turned past one turn: {now[present.name]} now reads {cleared}"))
         return {**now, present.name: cleared}
 
 

@@ -34,7 +34,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import ClassVar, Final, NamedTuple
 
-from sfms_robot.errors import BusError, ServoError
+from sfms_robot.errors import NOTE, BusError, ServoError
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Steps, finish, verified_write
@@ -222,7 +222,7 @@ class Startup(ABC):
         where = f"stands at {start}, outside its own limits {limits[0]}..{limits[1]}"
         if way is None or not profile:
             raise self._error(f"{where}: torque would make it jump; turn it in by hand")
-        log.warning("%s", self._about(f"{where}: moving it inside at {SPEED_DEG_S:g} deg/s"))
+        log.log(NOTE, "%s", self._about(f"{where}: moving it inside at {SPEED_DEG_S:g} deg/s"))
         torque, usual = self._field("torque_enable"), self.wanted()
         try:
             for name, value in profile.items():
@@ -418,7 +418,7 @@ def _inside(ticks: int, limits: tuple[int, int]) -> bool:
 
 
 def _cure(found: Contradiction, servo: BusServo) -> str:
-    kept = "measure the joint (sfms-robot head calibrate), or record the value if the head's file fits it: "
+    kept = f"measure the joint ({servo.calibrate}), or record the value if the head's file fits it: "
     return f"; {kept * found.in_file}{servo.doctor}" if found.fixable else ""
 
 
@@ -445,7 +445,7 @@ def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: in
         absent = ", ".join(f"{startup.servo.id} ({startup.servo.joint})" for startup in startups)
         raise BusError(
             f"bus {bus!r} on {link.port.name} at {baud} baud: no answer from id {absent}; "
-            f"look for them: sfms-robot servo scan --port {link.port.name}"
+            f"look for them: {startups[0].servo.doctor.removesuffix(' --fix')}"
         )
     return bits
 

@@ -330,6 +330,9 @@ def test_folder_of_nothing_known_lists_what_is_known(tmp_path):
         open_dataset(tmp_path, "train")
     with pytest.raises(ConfigError, match="no such folder"):
         open_dataset(tmp_path / "gone", "train")
+    (tmp_path / "a.zip").write_bytes(b"PK")
+    with pytest.raises(ConfigError, match=r"expected a folder, got a file \(unpack an archive first\)"):
+        open_dataset(tmp_path / "a.zip", "train")
 
 
 def test_manual_and_help_name_every_layout_as_it_is():

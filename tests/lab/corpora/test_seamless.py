@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ
 from sfms_robot.lab.corpora import formats
-from sfms_robot.lab.corpora.action_units import FAU_VALUE, WITHOUT_UNIT, blendshapes_of
+from sfms_robot.lab.corpora.clips import FAU_VALUE, WITHOUT_UNIT, blendshapes_of
 from sfms_robot.lab.corpora.conversion import Residual, in_ours, to_ours
 from sfms_robot.lab.corpora.data_commands import check_data
 from sfms_robot.lab.corpora.external.seamless import stretches

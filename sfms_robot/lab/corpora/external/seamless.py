@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Floats
-from sfms_robot.lab.corpora.action_units import FAU_VALUE, WITHOUT_SHAPE, WITHOUT_UNIT
-from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
+from sfms_robot.lab.corpora.clips import FAU_VALUE, UNREADABLE, WIDTHS, WITHOUT_SHAPE, WITHOUT_UNIT, Dyad, samples_of
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity

@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, ndtri
 from scipy.stats import ks_2samp
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -23,7 +24,6 @@ from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split
 from sfms_robot.lab.corpora.compose.motions import held
 from sfms_robot.lab.evaluation.intervals import DRAWS, added, ends, rounded
 from sfms_robot.lab.evaluation.meetings import tables
-from sfms_robot.lab.evaluation.rollout import tracked
 from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
@@ -198,7 +198,7 @@ def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) ->
     figures, theirs_s = counted(event_trainer.begun_in(one.person.nods, one.listening)[:, 0] for one in judged)
     found = {"people": figures}
     heard = [heard_in(one.scene) for one in judged]
-    for knob in KNOBS:
+    for knob in tracked(KNOBS, "nods decided at each rate"):
         asked = Calmness.model_validate(dict.fromkeys(EVENT_KINDS, 0.0) | {"nod": knob})
         decided = (decisions(model, rows, [at + 1000 * seed], asked)[0] for at, rows in enumerate(heard))
         figures, ours_s = counted(event_spans(each, "nod")[:, 0] for each in decided)

@@ -1,0 +1,1 @@
+"""A Reachy Mini app in which the robot listens."""

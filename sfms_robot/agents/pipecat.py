@@ -1,0 +1,121 @@
+"""A head in a pipecat pipeline (pipecat.ai).
+
+    Pipeline([transport.input(), stt, ..., tts, transport.output(), ListeningHead(robot)])        in and out
+    PipelineWorker(pipeline, observers=[HeadObserver(robot)])                                     in
+
+`ListeningHead` hands the robot the person's and the bot's sound that passes it, and pushes a `ListenerEventFrame`
+both ways for each event that the listener decides, before the servos move. Behind the output transport the bot's
+sound arrives while it is played; behind the text to speech it arrives a sentence at once, which the robot plays out by
+the clock. `HeadObserver` needs no place in the pipeline: it sees the frames of all transports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sfms_robot import ListenerEvent
+from sfms_robot.agents import KINDS, HeadLink
+from sfms_robot.errors import optional
+
+with optional("sfms_robot.agents.pipecat"):
+    from pipecat.frames.frames import (
+        CancelFrame,
+        EndFrame,
+        Frame,
+        InputAudioRawFrame,
+        InterruptionFrame,
+        SpeechOutputAudioRawFrame,
+        StartFrame,
+        SystemFrame,
+        TTSAudioRawFrame,
+    )
+    from pipecat.observers.base_observer import BaseObserver, FramePushed
+    from pipecat.processors.frame_processor import FrameDirection, FrameProcessor
+    from pipecat.transports.base_output import BaseOutputTransport
+
+if TYPE_CHECKING:
+    from sfms_robot import Robot
+
+
+@dataclass
+class ListenerEventFrame(SystemFrame):
+    """An event that the head is about to show.
+
+    Attributes:
+        event: its `kind`, times, `size` and `probability`.
+    """
+
+    event: ListenerEvent
+
+
+class ListeningHead(FrameProcessor):
+    """Processor that hands sound to a robot, and pushes its events as frames. All frames pass it unchanged.
+
+    Args:
+        robot: a robot that is running.
+        kinds: of events that are pushed.
+
+    Raises InputError for an unknown kind.
+    """
+
+    def __init__(self, robot: Robot, kinds: Sequence[str] = KINDS, **of_pipecat: Any) -> None:
+        super().__init__(**of_pipecat)
+        self.robot_link = HeadLink(robot, "pipecat")
+        self.robot_link.on(kinds, self._decided)
+
+    async def process_frame(self, frame: Frame, direction: FrameDirection) -> None:
+        """Hand over the sound of a frame, and pass the frame on."""
+        await super().process_frame(frame, direction)
+        if direction is FrameDirection.DOWNSTREAM:
+            _hand_over(self.robot_link, frame)
+        if isinstance(frame, EndFrame | CancelFrame):
+            self.robot_link.close()
+        await self.push_frame(frame, direction)
+        if isinstance(frame, StartFrame):  # before it, a pipeline drops whatever is pushed
+            self.robot_link.open()
+
+    async def cleanup(self) -> None:
+        """Hand over no further events."""
+        self.robot_link.close()
+        await super().cleanup()
+
+    def _decided(self, event: ListenerEvent) -> None:
+        self.create_task(self.broadcast_frame(ListenerEventFrame, event=event), f"{event.kind}")
+
+
+class HeadObserver(BaseObserver):
+    """Observer that hands a robot what the person says, and what the output transport plays.
+
+    Args:
+        robot: a robot that is running. `Robot.on` and `agents.events` give its events.
+    """
+
+    def __init__(self, robot: Robot, **of_pipecat: Any) -> None:
+        super().__init__(**of_pipecat)
+        self.robot_link = HeadLink(robot, "pipecat")
+        self._newest = -1
+
+    async def on_push_frame(self, data: FramePushed) -> None:
+        """Hand over the sound of a frame, once: each processor pushes it again."""
+        frame = data.frame
+        if data.direction is not FrameDirection.DOWNSTREAM:
+            return
+        if isinstance(frame, InputAudioRawFrame):  # in order: the ids of frames only grow
+            if frame.id <= self._newest:
+                return
+            self._newest = frame.id
+        elif not isinstance(data.source, BaseOutputTransport):
+            return
+        _hand_over(self.robot_link, frame)
+
+
+def _hand_over(link: HeadLink, frame: Frame) -> None:
+    """Hand over sound; drop the speech that waits on an interruption."""
+    if isinstance(frame, InputAudioRawFrame):
+        link.hear(frame.audio, frame.sample_rate, frame.num_channels)
+    elif isinstance(frame, TTSAudioRawFrame | SpeechOutputAudioRawFrame):  # others are music and effects
+        link.say(frame.audio, frame.sample_rate, frame.num_channels)
+    elif isinstance(frame, InterruptionFrame):
+        link.hush()

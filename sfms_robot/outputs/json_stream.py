@@ -1,0 +1,209 @@
+"""Face and pose as JSON to WebSocket clients of this machine: `--output json[:PORT]`.
+
+One object a frame, 50 a second, newest first for a client that reads slowly:
+
+    t             loop time [s]
+    state         of the run
+    pose          roll, pitch, yaw [rad], x, y, z [m], axes as in `frames`
+    shapes        the 52 ARKit blendshapes by name, 0..1
+    events        begun since the last frame: kind, start_s, duration_s, size, swings, probability
+    yaw, pitch    of the pose, in degrees
+    ts            loop time [ms], a whole number
+    source, frame "sfms-robot", "base"
+
+The last four are what stackchan-mcp's pose follower reads, beside yaw and pitch.
+
+Limits, those of the page: requests with a name of another machine (Host), or of a page of another site (Origin), are
+refused; a connection that is not open after `CONNECTION_S` is closed, and the oldest of these makes room where there
+are `MOST_CLIENTS`; a client that reads slowly misses frames; one that sends more than `MOST_RECEIVED` messages, which
+are not read, is disconnected.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from typing import Any, Final
+
+import orjson
+from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, listen, origin_problem, port_number
+from sfms_robot.errors import NOTE, ConfigError
+from sfms_robot.frames import BLENDSHAPES, POSE, POSE_CHANNELS, SHAPES
+from sfms_robot.ports import Output, OutputFrame
+
+PORT: Final = 8782
+MOST_CLIENTS: Final = 32
+CONNECTION_S: Final = 10.0
+MOST_RECEIVED: Final = 100
+MOST_UNREAD: Final = 65_536  # bytes that wait for a client; with more it misses frames
+_RECEIVED_S: Final = 0.01  # pause after each message of a client
+_LONGEST: Final = 4096  # bytes of one
+_STOP_S: Final = 1.0
+_SOURCE: Final = "sfms-robot"
+_DEGREES: Final = 57.29577951308232
+
+logger = logging.getLogger(__name__)
+_handshakes = logging.getLogger(f"{__name__}.handshakes")  # those that fail are no trouble of the run
+_handshakes.setLevel(logging.CRITICAL)
+
+
+def json_of(frame: OutputFrame) -> bytes:
+    """Return the object of a frame."""
+    pose = dict(zip(POSE_CHANNELS, (round(value, 5) for value in frame.motion[POSE].tolist()), strict=True))
+    shapes = dict(zip(BLENDSHAPES, (round(value, 4) for value in frame.motion[SHAPES].tolist()), strict=True))
+    events = [
+        {
+            "kind": each.kind,
+            "start_s": each.start_s,
+            "duration_s": each.duration_s,
+            "size": each.size,
+            "swings": each.swings,
+            "probability": each.probability,
+        }
+        for each in frame.events
+    ]
+    return orjson.dumps(
+        {
+            "t": round(frame.time_s, 4),
+            "state": frame.state,
+            "pose": pose,
+            "shapes": shapes,
+            "events": events,
+            "yaw": round(pose["yaw"] * _DEGREES, 3),
+            "pitch": round(pose["pitch"] * _DEGREES, 3),
+            "ts": round(frame.time_s * 1e3),
+            "source": _SOURCE,
+            "frame": "base",
+        }
+    )
+
+
+class JsonStream(Output):
+    """Server of JSON frames. Holds its port from construction on. Raises ConfigError, PortError."""
+
+    kind = "json"
+
+    def __init__(self, argument: str = "") -> None:
+        port = port_number(argument.removeprefix(":")) if argument else PORT
+        if port is None:
+            raise ConfigError(
+                f"--output json:{argument}: expected a TCP port of this machine from 0 to 65535 (0: any free one), "
+                f"got {argument!r}"
+            )
+        self._socket = listen("--output json", LOOPBACK, port)
+        self.peer = address_text(*self._socket.getsockname()[:2])
+        self._counts = dict.fromkeys(("refused", "missed"), 0)
+        self._clients: set[ServerConnection] = set()  # open; for the server's thread
+        self._opening: dict[ServerConnection, None] = {}  # oldest first
+        self._loop = asyncio.new_event_loop()
+        self._closing = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="output json", daemon=True)
+
+    def open(self) -> None:
+        """Take clients from now on. Idempotent."""
+        if self._thread.ident is None:
+            self._thread.start()
+            logger.log(NOTE, "output json: ws://%s/", self.peer)
+
+    def send(self, frame: OutputFrame, now_s: float) -> None:
+        """Send a frame to each client that reads."""
+        if self._clients:
+            message = json_of(frame).decode()
+            with suppress(RuntimeError):  # closed
+                self._loop.call_soon_threadsafe(self._send, message)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return connected clients, refused ones, and frames that slow ones missed."""
+        return {"clients": len(self._clients), **self._counts}
+
+    def close(self) -> None:
+        """Disconnect all clients and give the port back. Idempotent."""
+        if self._thread.ident is None:
+            self._loop.close()
+            self._socket.close()
+        elif self._thread.is_alive():
+            with suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._closing.set)
+            self._thread.join(2 * _STOP_S)
+
+    def _send(self, message: str) -> None:
+        reading = [each for each in self._clients if each.transport.get_write_buffer_size() <= MOST_UNREAD]
+        self._counts["missed"] += len(self._clients) - len(reading)
+        broadcast(reading, message)
+
+    def _run(self) -> None:
+        try:
+            self._loop.run_until_complete(self._serve())
+        finally:
+            self._loop.close()
+            self._socket.close()
+
+    async def _serve(self) -> None:
+        class Client(RoomyConnection):
+            opening = self._opening
+
+        async with serve(
+            self._served,
+            sock=self._socket,
+            process_request=self._problem,
+            create_connection=Client,
+            compression=None,
+            open_timeout=CONNECTION_S,
+            close_timeout=_STOP_S,
+            max_size=_LONGEST,
+            max_queue=1,
+            server_header=None,
+            logger=_handshakes,
+        ):
+            await self._closing.wait()
+
+    def _problem(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the answer to a request that is refused."""
+        host = request.headers.get("Host", "")
+        problem = host_problem(host) or origin_problem(request.headers.get("Origin"), host)
+        if problem is None and len(self._clients) >= MOST_CLIENTS:
+            problem = f"{MOST_CLIENTS} clients are connected already"
+        if problem is None:
+            return None
+        self._counts["refused"] += 1
+        return connection.respond(HTTPStatus.FORBIDDEN, problem + "\n")
+
+    async def _served(self, client: ServerConnection) -> None:
+        """Keep a client until it closes; read and drop what it sends."""
+        self._opening.pop(client, None)
+        self._clients.add(client)
+        try:
+            for _ in range(MOST_RECEIVED):
+                await client.recv()
+                await asyncio.sleep(_RECEIVED_S)
+            await client.close(1008, "this server reads no messages")
+        except ConnectionClosed:
+            return
+        finally:
+            self._clients.discard(client)
+
+
+class RoomyConnection(ServerConnection):
+    """Connection that makes room for itself where too many are still opening. `opening`: those, oldest first."""
+
+    opening: dict[ServerConnection, None]
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Abort the oldest of too many."""
+        super().connection_made(transport)
+        if len(self.opening) >= MOST_CLIENTS:
+            next(iter(self.opening)).transport.abort()
+        self.opening[self] = None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count no longer."""
+        self.opening.pop(self, None)
+        super().connection_lost(exc)

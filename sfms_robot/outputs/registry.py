@@ -1,0 +1,116 @@
+"""Values of `--output`: KIND or KIND:ADDRESS, a head that takes a face or a pose instead of joint angles.
+
+A kind of another package is an entry point of the group `sfms_robot.outputs`: a callable that takes the text behind the
+colon ("" without one) and returns a `ports.Output`. Kinds are imported when they are opened.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Final
+
+from sfms_robot.endpoint import LOOPBACK, port_number
+from sfms_robot.errors import ConfigError
+from sfms_robot.network import LOCAL, Router
+from sfms_robot.plugins import plug_in, plugins
+
+if TYPE_CHECKING:  # numpy, which a look at a name does not need
+    from sfms_robot.ports import Output
+
+GROUP: Final = "sfms_robot.outputs"
+
+
+def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
+    named = {name.replace("_", "-"): place for name, place in kinds.items()}
+    return {name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP) for name, place in named.items()}
+
+
+KINDS: Final[Mapping[str, EntryPoint]] = _ours(
+    json="json_stream:JsonStream",
+    vmc="avatars:VmcOutput",
+    vmc_single="avatars:VmcSingleOutput",
+    live_link="avatars:LiveLinkOutput",
+    vtube_studio="vtube_studio:VtubeStudio",
+    vtube_studio_add="vtube_studio:VtubeStudioAdd",
+    reachy_mini="reachy_mini:ReachyMini",
+    reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
+    furhat="furhat:Furhat",
+    ros2="ros2:Ros2Output",
+)
+
+DESCRIPTIONS: Final[Mapping[str, str]] = {
+    "json": "json[:PORT], 8782: WebSocket server of this machine, a JSON object a frame",
+    "vmc": "vmc[:HOST[:PORT]], 39539: avatar software (VSeeFace, VNyan, Warudo, Blender, Unity)",
+    "vmc-single": "vmc-single[:HOST[:PORT]], 39539: the same, for receivers that read no bundles",
+    "live-link": "live-link[:HOST[:PORT]], 11111: Unreal's MetaHumans, as Live Link Face on an iPhone",
+    "vtube-studio": "vtube-studio[:HOST[:PORT]], 8001: VTube Studio (Live2D), in place of its tracking",
+    "vtube-studio-add": "vtube-studio-add[:HOST[:PORT]], 8001: the same, added to the streamer's own tracking",
+    "reachy-mini": "reachy-mini[:HOST[:PORT]], 8000: Reachy Mini's daemon: head, body and antennas",
+    "reachy-mini-overlay": "reachy-mini-overlay[:HOST[:PORT]], 8000: the same daemon, on top of the app that it runs",
+    "furhat": "furhat[:HOST[:PORT]], 9000: Furhat's Realtime API: face, eyes and neck",
+    "ros2": "ros2[:DOMAIN][,humble], ROS_DOMAIN_ID or 0: a graph of ROS 2 (rmw_zenoh), without ROS installed",
+}
+
+
+def output_kinds(others: Iterable[EntryPoint] | None = None) -> Mapping[str, EntryPoint]:
+    """Return every kind by name, not yet imported; shipped kinds go before those of other packages.
+
+    `others`: those of other packages; None for the installed ones.
+    """
+    found = plugins(GROUP) if others is None else {each.name: each for each in others}
+    return {**found, **KINDS}
+
+
+def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> None:
+    """Check that there are such kinds. Imports and opens nothing. Raises ConfigError with the choices."""
+    kinds = output_kinds(others)
+    for value in values:
+        if value.partition(":")[0] not in kinds:
+            raise ConfigError(f"--output {value}: expected KIND or KIND:ADDRESS (valid: {', '.join(kinds)})")
+
+
+def open_output(value: str, others: Iterable[EntryPoint] | None = None, router: Router = LOCAL) -> Output:
+    """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError.
+
+    router: of ROS 2.
+    """
+    check_outputs([value], others)
+    kind, _, address = value.partition(":")
+    entry = output_kinds(others)[kind]
+    output: Output = plug_in(entry, address, router) if kind == "ros2" else plug_in(entry, address)
+    if not callable(getattr(output, "send", None)):
+        raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
+    return output
+
+
+def open_outputs(
+    values: Sequence[str], others: Iterable[EntryPoint] | None = None, router: Router = LOCAL
+) -> list[Output]:
+    """Return the outputs of a run, in order. Raises ConfigError, also for two that reach one program."""
+    opened: dict[tuple[str, str], Output] = {}
+    for value in values:
+        output = open_output(value, others, router)
+        to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
+        if to in opened:
+            raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")
+        opened[to] = output
+    return list(opened.values())
+
+
+def parse_address(kind: str, text: str, usual_port: int, host: str = LOOPBACK) -> tuple[str, int]:
+    """Return host and port of "", PORT, :PORT, HOST, HOST:PORT, [HOST] or [HOST]:PORT (IPv6 in brackets).
+
+    `host`: where none is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
+    """
+    name, colon, digits = text.rpartition(":")
+    if text.endswith("]") or not (colon or text.isdigit()):  # no port
+        name, digits = text, ""
+    bracketed = name.startswith("[") and name.endswith("]")
+    port = port_number(digits, 1) if digits else usual_port
+    bare = name[1:-1] if bracketed else name
+    odd = not bare if bracketed else any(mark in name for mark in ":[]/@ ") or (colon and not digits)
+    if port is None or odd or not bare.isprintable():
+        raise ConfigError(f"--output {kind}:{text}: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got {text!r}")
+    return bare or host, port

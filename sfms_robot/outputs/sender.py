@@ -1,0 +1,330 @@
+"""Motion on its way to an output: eased, limited, in a thread of its own, over losses of the peer.
+
+    MotionShaper    motion that an output shows, a value passed from step to step: no jump at start, end, halt, return
+    OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument
+    OutputThread    its thread and its rate; takes the newest tick of the loop, which never waits
+    Outputs         all of a run
+
+    phase        motion goes to                     when
+    live         that of the newest tick            the run moves
+    neutral      0                                  before the first tick, at the end; an avatar also in a halt
+    held         where it is                        a halt, where a machine moves
+
+A step to another phase takes `EASE_S`, from the motion shown so far. `Output.open` leaves its peer at neutral, so a
+start and a return begin there.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from sfms_robot.errors import OutputError
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats, ListenerEvent
+from sfms_robot.motion.limits import JerkLimiter, JointLimits, LimiterState, difference
+from sfms_robot.ports import ChannelLimit, Observer, Output, OutputFrame, Tick
+from sfms_robot.signals.minimum_jerk import ease
+
+EASE_S: Final = 1.0
+PAUSES_S: Final = (1.0, 10.0)  # between two tries to connect: the first, doubled each time up to the last
+PROVEN_S: Final = 0.5  # after so long without an error a connection counts: UDP reports a lost peer at a later packet
+RAMP_S: Final = 0.05  # in which a limited channel reaches its highest acceleration
+LAST_S: Final = 4.0  # that the end of all outputs may take: an `open` on its way, then the easing
+_WINDOW_S: Final = 1.0  # over which frames a second are counted
+_MOST_EVENTS: Final = 64  # that wait for their beginning
+_STILL: Final = 1e-4  # motion smaller than this is neutral
+
+logger = logging.getLogger(__name__)
+
+Phase = Literal["live", "neutral", "held"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """Motion that an output shows.
+
+    Attributes:
+        motion: (58,) of the last step.
+        phase, since_s, origin: what motion goes to, since when, and from where (58,).
+        before, here: (58,) two samples of the reference of limited channels.
+        limiter: state of limited channels; None where there are none.
+    """
+
+    motion: Floats
+    phase: Phase
+    since_s: float
+    origin: Floats
+    before: Floats
+    here: Floats
+    limiter: LimiterState | None = None
+
+
+class MotionShaper:
+    """Easing between phases, then one limiter of position, speed and acceleration for channels that have limits."""
+
+    def __init__(self, limits: Mapping[str, ChannelLimit], rate_hz: float) -> None:
+        self._period_s = 1.0 / rate_hz
+        self._columns = [CHANNEL_INDEX[channel] for channel in limits]
+        self._limiter = None
+        if limits:
+            low, high, speed, acceleration = np.array(list(limits.values()), np.float64).T
+            jerk = acceleration / RAMP_S
+            self._limiter = JerkLimiter(JointLimits(low, high, speed, acceleration, jerk), self._period_s)
+
+    def start(self, now_s: float) -> Shown:
+        """Return neutral."""
+        still = np.zeros(MOTION_DIM, np.float32)
+        limiter = None if self._limiter is None else self._limiter.start(np.zeros(len(self._columns)))
+        return Shown(
+            motion=still, phase="neutral", since_s=now_s, origin=still, before=still, here=still, limiter=limiter
+        )
+
+    def step(self, target: Floats, phase: Phase, now_s: float, shown: Shown) -> Shown:
+        """Return what is shown one period later. `target` (58,): of the phase "live"."""
+        if phase != shown.phase:
+            shown = replace(shown, phase=phase, since_s=now_s, origin=shown.motion)
+        if phase == "held":
+            return self._braked(shown)
+        aim = target if phase == "live" else np.zeros_like(target)
+        aim = np.where(np.isfinite(aim), aim, shown.motion)
+        share = np.float32(ease((now_s - shown.since_s) / EASE_S))
+        return self._limited(shown.origin + share * (aim - shown.origin), shown)
+
+    def _limited(self, ahead: Floats, shown: Shown) -> Shown:
+        if self._limiter is None or shown.limiter is None:
+            return replace(shown, motion=ahead)
+        before, here, next_ = np.stack([shown.before, shown.here, ahead])[:, self._columns].astype(np.float64)
+        values, limiter = self._limiter.step(difference(before, here, next_, self._period_s), shown.limiter)
+        motion = ahead.copy()
+        motion[self._columns] = values
+        return replace(shown, motion=motion, before=shown.here, here=ahead, limiter=limiter)
+
+    def _braked(self, shown: Shown) -> Shown:
+        if self._limiter is None or shown.limiter is None:
+            return shown
+        values, limiter = self._limiter.brake(shown.limiter)
+        motion = shown.motion.copy()
+        motion[self._columns] = values
+        return replace(shown, motion=motion, before=motion, here=motion, limiter=limiter)
+
+
+class OutputSender:
+    """One output without its thread: `step` connects or sends, once a period.
+
+    Attributes:
+        name: KIND:ADDRESS, in messages and in `why` of a degraded run.
+        lost: the peer is away.
+        shown: what it shows; None while it is not connected.
+    """
+
+    def __init__(self, output: Output) -> None:
+        self.output = output
+        self.name = f"{output.kind}:{output.peer}"
+        self.lost = False
+        self.shown: Shown | None = None
+        self._shaper = MotionShaper(output.limits, output.rate_hz)
+        self._pause_s, self._retry_s, self._opened_s = PAUSES_S[0], -np.inf, 0.0
+        self._problem: str | None = None
+        self._counts = {"frames": 0, "losses": 0}
+        self._window = (0.0, 0, 0.0)  # begins, frames by then, frames a second of the one before
+
+    @property
+    def settled(self) -> bool:
+        """True if nothing is left to ease: it is neutral, held, or away."""
+        shown = self.shown
+        return shown is None or shown.phase == "held" or bool(np.abs(shown.motion).max() < _STILL)
+
+    def step(self, frame: OutputFrame | None, now_s: float, ending: bool = False) -> None:
+        """Send a frame, or connect. `frame`: None before the first tick. Never raises; blocks as the output does."""
+        frame = frame or OutputFrame(time_s=0.0, motion=np.zeros(MOTION_DIM, np.float32))
+        phase = self._phase(frame.state, ending)
+        if self.shown is None:
+            if ending or phase == "held" or now_s < self._retry_s:  # to connect would move a halted machine
+                return
+            if (started := self._connect(now_s)) is None:
+                return
+            self.shown = started
+        self.shown = self._shaper.step(frame.motion, phase, now_s, self.shown)
+        try:
+            self.output.send(replace(frame, motion=self.shown.motion), now_s)
+        except Exception as error:  # of a plug-in: any
+            self._lose(error, now_s)
+            return
+        self._sent(now_s)
+
+    def statistics(self) -> dict[str, Any]:
+        """Return state, peer, frames, frames a second and losses, and what the output counts. From any thread."""
+        state = "lost" if self.lost else "connecting" if self.shown is None else "sending"
+        return {
+            "kind": self.output.kind,
+            "peer": self.output.peer,
+            "state": state,
+            **self._counts,
+            "frames_per_s": round(self._window[2], 1) if state == "sending" else 0.0,
+            "problem": self._problem,
+            **self._asked(self.output.statistics),
+        }
+
+    def close(self) -> None:
+        """Disconnect the output."""
+        self._asked(self.output.close)
+
+    def _asked(self, method: Callable[[], Mapping[str, Any] | None]) -> Mapping[str, Any]:
+        """Return what a method of the output gives, nothing where it raises."""
+        try:
+            return method() or {}
+        except Exception:  # of a plug-in: any
+            logger.info("output %s raised", self.name, exc_info=True)
+            return {}
+
+    def _phase(self, state: str, ending: bool) -> Phase:
+        if state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
+            return "held"
+        return "neutral" if ending or state in ("starting", "halted") else "live"
+
+    def _connect(self, now_s: float) -> Shown | None:
+        try:
+            self.output.open()
+        except Exception as error:  # of a plug-in: any
+            self._lose(error, now_s)
+            return None
+        self._opened_s, self._window = now_s, (now_s, self._counts["frames"] + 1, 0.0)  # the first frame begins it
+        return self._shaper.start(now_s)
+
+    def _sent(self, now_s: float) -> None:
+        self._counts["frames"] += 1
+        began_s, before, _ = self._window
+        if now_s - began_s >= _WINDOW_S:
+            frames = self._counts["frames"]
+            self._window = now_s, frames, (frames - before) / (now_s - began_s)
+        if self._pause_s != PAUSES_S[0] and now_s - self._opened_s > PROVEN_S:
+            self._pause_s = PAUSES_S[0]
+        if self.lost and now_s - self._opened_s > PROVEN_S:
+            self.lost, self._problem = False, None
+            logger.info("output %s: connected again", self.name)
+
+    def _lose(self, error: Exception, now_s: float) -> None:
+        expected = isinstance(error, (OutputError, OSError))
+        text = (str(error).splitlines() or [""])[0]
+        self._problem = text if expected else f"{type(error).__name__}: {text}"
+        if not expected:
+            logger.info("output %s raised", self.name, exc_info=True)
+        if not self.lost:
+            self._counts["losses"] += 1
+            logger.warning("output %s: %s; it is tried again, the run continues", self.name, self._problem)
+        self.lost, self.shown = True, None
+        self.close()
+        self._retry_s = now_s + self._pause_s
+        self._pause_s = min(2 * self._pause_s, PAUSES_S[1])
+
+
+class OutputThread(Observer):
+    """The thread of one output: sends the newest tick at the output's rate. `joints`: of `Tick.goals_rad`."""
+
+    def __init__(self, output: Output, joints: Sequence[str] = ()) -> None:
+        self.sender = OutputSender(output)
+        self._joints = tuple(joints)
+        self._tick: Tick | None = None
+        self._events: deque[ListenerEvent] = deque(maxlen=_MOST_EVENTS)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name=f"output {output.kind}", daemon=True)
+
+    def start(self) -> None:
+        """Start to connect."""
+        self._thread.start()
+
+    def tick(self, seen: Tick) -> None:
+        self._tick = seen
+
+    def event(self, event: ListenerEvent) -> None:
+        """Take an event that the listener has decided. From any thread."""
+        self._events.append(event)
+
+    def frame(self) -> OutputFrame | None:
+        """Return the frame of the newest tick; None before the first."""
+        if (seen := self._tick) is None:
+            return None
+        begun = []
+        for _ in range(len(self._events)):
+            event = self._events.popleft()
+            if event.start_s <= seen.time_s:
+                begun.append(event)
+            else:
+                self._events.append(event)
+        return OutputFrame(
+            time_s=seen.time_s,
+            motion=seen.motion,
+            state=seen.state,
+            events=tuple(begun),
+            goals_rad=seen.goals_rad,
+            joints=self._joints,
+        )
+
+    def close(self) -> None:
+        """Begin to end: ease to neutral, disconnect. Returns at once; `join` waits."""
+        self._closing.set()
+
+    def join(self, limit_s: float) -> None:
+        """Wait for the end, after `close`."""
+        if self._thread.ident is not None:
+            self._thread.join(limit_s)
+
+    def _work(self) -> None:
+        period_s = 1.0 / self.sender.output.rate_hz
+        due_s = time.monotonic()
+        while not self._closing.wait(max(0.0, due_s - time.monotonic())):
+            now_s = time.monotonic()
+            self.sender.step(self.frame(), now_s)
+            due_s = max(due_s + period_s, now_s + period_s / 2)  # after a late frame the others are not made up for
+        last_s, frame = time.monotonic() + LAST_S, self.frame()
+        while not self.sender.settled and (now_s := time.monotonic()) < last_s:
+            self.sender.step(frame, now_s, ending=True)
+            time.sleep(max(0.0, now_s + period_s - time.monotonic()))
+        self.sender.close()
+
+
+class Outputs(Observer):
+    """The outputs of a run. Starts to connect to them all."""
+
+    def __init__(self, outputs: Sequence[Output], joints: Sequence[str] = ()) -> None:
+        self.threads = [OutputThread(output, joints) for output in outputs]
+        for thread in self.threads:
+            thread.start()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """KIND:ADDRESS of each."""
+        return tuple(each.sender.name for each in self.threads)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of outputs whose peer is away."""
+        return tuple(each.sender.name for each in self.threads if each.sender.lost)
+
+    def tick(self, seen: Tick) -> None:
+        for thread in self.threads:
+            thread.tick(seen)
+
+    def event(self, event: ListenerEvent) -> None:
+        """Take an event that the listener has decided. From any thread."""
+        for thread in self.threads:
+            thread.event(event)
+
+    def statistics(self) -> list[dict[str, Any]]:
+        """Return the figures of each output, as `OutputSender.statistics`."""
+        return [thread.sender.statistics() for thread in self.threads]
+
+    def close(self) -> None:
+        """Lead all outputs to neutral and disconnect them, side by side. Blocks `LAST_S` at most. Idempotent."""
+        for thread in self.threads:
+            thread.close()
+        until_s = time.monotonic() + LAST_S
+        for thread in self.threads:
+            thread.join(max(0.0, until_s - time.monotonic()))

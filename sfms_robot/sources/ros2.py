@@ -1,0 +1,141 @@
+"""A person in a graph of ROS 2, without ROS installed: `--audio ros2:TOPIC`, `--face ros2:FACE_ID`.
+
+TOPIC carries `audio_common_msgs/AudioDataStamped`: 16-bit little-endian samples, which have no rate of their own (16
+kHz and one channel, or `,rate=48000,channels=2`). A face is `/humans/faces/FACE_ID/facs` (REP 155), or a whole topic,
+of `hri_msgs/FacialActionUnits`: intensities of 0 to 1, of units whose confidence is above 0. `,domain=N` is the domain,
+else ROS_DOMAIN_ID, else 0. Messages count from their arrival: the clocks of the machines may differ.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from sfms_robot.endpoint import whole_number
+from sfms_robot.errors import ConfigError, PacketError
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, SHAPES, Floats, Sighting
+from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
+from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
+from sfms_robot.signals.spaces import beyond
+from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, parse_face_argument
+from sfms_robot.sources.live_voice import check_rate
+from sfms_robot.sources.push import PushedVoice
+
+logger = logging.getLogger(__name__)
+
+SILENT_S: Final = 1.0  # a voice that is away for so long is lost: publishers send silence too
+MOST_CHANNELS: Final = 8
+_OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
+_FILES: Final = (b"RIFF", b"ID3", b"OggS", b"fLaC")  # begin sound files
+
+
+def _options(flag: str, argument: str, **given: str) -> tuple[str, dict[str, str]]:
+    """Return what stands before the options of `PLACE,NAME=VALUE`, and these; `given`: defaults. Raises ConfigError."""
+    place, given = argument, {"domain": "", **given}
+    while option := _OPTION.search(place):
+        if option[1] not in given:
+            raise ConfigError(f"{flag}: option {option[1]!r} is not known ({', '.join(given)})")
+        place, given[option[1]] = place[: option.start()], option[2]
+    return place, given
+
+
+class _Subscription:
+    """One topic: its messages, whether they have stopped, and a line where none came.
+
+    take: is handed each message.
+    """
+
+    def __init__(
+        self, flag: str, topic: str, domain: str, router: Router, *, kind: str, take: Callable[[Message], None]
+    ) -> None:
+        self._flag, self._topic = flag, topic
+        self.node = Ros2Node(
+            f"sfms_robot_{flag.split()[0].strip('-')}",
+            ros_domain(domain, flag),
+            router,
+            takes={topic: wire_name(kind)},
+            received=lambda _, wire, data: take(read_message(kind, wire, data)),
+        )
+        self._counted = 0
+        self._heard_s: float | None = None
+        self._said = False
+
+    def lost(self, time_s: float, after_s: float) -> bool:
+        """Return whether messages came before loop time `time_s`, and have stopped for `after_s`."""
+        counted = self.node.counts["received"] - self.node.counts["refused"]
+        if counted > self._counted:
+            self._counted, self._heard_s = counted, time_s
+        if self._heard_s is None and time_s > UNHEARD_S and not self._said:
+            self._said = True
+            logger.warning("%s: nothing came yet: %s", self._flag, self.node.absence(self._topic))
+        return self._heard_s is not None and time_s - self._heard_s > after_s
+
+
+class Ros2Voice(PushedVoice):
+    """`ports.Voice` of `--audio ros2:TOPIC[,rate=HZ][,channels=N][,domain=N]`. Raises ConfigError."""
+
+    _way = "--audio ros2"
+
+    def __init__(self, argument: str, router: Router = LOCAL) -> None:
+        super().__init__()
+        place, given = _options(self._way, argument, rate=str(AUDIO_HZ), channels="1")
+        try:
+            self._sent_hz, self._channels = whole_number(given["rate"]), whole_number(given["channels"])
+            check_rate(self._sent_hz)
+        except ConfigError as error:
+            raise ConfigError(f"{self._way}:{argument}: {error}") from None
+        if not 0 < self._channels <= MOST_CHANNELS:
+            raise ConfigError(f"{self._way}: channels: expected 1 to {MOST_CHANNELS}, got {self._channels}")
+        topic = ros_topic(place, self._way)
+        self._topic = _Subscription(self._way, topic, given["domain"], router, kind=AUDIO, take=self._hear)
+
+    def take(self, index: int) -> Floats | None:
+        self.lost = self._topic.lost((index + 1) * FRAME_S, SILENT_S)
+        return super().take(index)
+
+    def statistics(self) -> Mapping[str, Any]:
+        return {**super().statistics(), **self._topic.node.counts}
+
+    def close(self) -> None:
+        self._topic.node.close()
+
+    def _hear(self, message: Message) -> None:
+        sound = message["audio"]["data"].tobytes()
+        if len(sound) % (2 * self._channels) or sound.startswith(_FILES):
+            what = "a sound file" if sound.startswith(_FILES) else f"{len(sound)} bytes"
+            raise PacketError(f"data: expected 16-bit samples, {self._channels} in a row (format wave), got {what}")
+        samples = np.frombuffer(sound, "<i2").reshape(-1, self._channels)
+        self.hear(samples if self._channels > 1 else samples[:, 0], self._sent_hz)
+
+
+class Ros2Sight(LiveFace):
+    """`ports.Sight` of `--face ros2:FACE_ID|TOPIC[,domain=N][,flip=...]`. Raises ConfigError."""
+
+    def __init__(self, argument: str, router: Router = LOCAL) -> None:
+        flag = "--face ros2"
+        place, given = _options(flag, argument, flip="")
+        super().__init__(parse_face_argument("ros2", f",flip={given['flip']}" if given["flip"] else "")[1])
+        topic = ros_topic(place if "/" in place else f"/humans/faces/{place}/facs", flag)
+        self._topic = _Subscription(flag, topic, given["domain"], router, kind=ACTION_UNITS, take=self._see)
+
+    def at(self, time_s: float) -> Sighting | None:
+        self.lost = self._topic.lost(time_s, LOST_S)
+        return super().at(time_s)
+
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the node's counts of messages."""
+        return dict(self._topic.node.counts)
+
+    def close(self) -> None:
+        self._topic.node.close()
+
+    def _see(self, message: Message) -> None:
+        motion = face_of(message)
+        if (problem := beyond(motion)) is not None:
+            raise PacketError(problem)
+        motion[SHAPES] = np.clip(motion[SHAPES], 0.0, 1.0)
+        self.put(self._now(), motion)

@@ -1,0 +1,93 @@
+import logging
+import sys
+
+import pytest
+
+from sfms_robot.app.progress import PLAIN_EVERY_S, PlainBar, bar, console, in_words, tracked
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Make stderr a terminal for rich."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    console.cache_clear()
+    yield
+    console.cache_clear()
+
+
+def test_without_a_terminal_a_line_every_ten_seconds_estimates_the_rest(capsys):
+    now_s = [0.0]
+    moved = PlainBar("people listening", lambda: now_s[0])
+    for done in range(101):
+        moved(done, 100, f"{done} of 100")
+        now_s[0] += 1.0
+    out, lines = capsys.readouterr()
+    assert not out
+    assert lines.splitlines()[:2] == [
+        "people listening: 10%, 10 of 100, about 90 s left",
+        "people listening: 20%, 20 of 100, about 80 s left",
+    ]
+    assert len(lines.splitlines()) == 100 / PLAIN_EVERY_S - 1  # none when it has ended: the result follows
+
+
+def test_the_rest_of_a_resumed_training_counts_from_its_checkpoint(capsys):
+    now_s = [0.0]
+    moved = PlainBar("tokenizer", lambda: now_s[0])
+    moved(900, 1000, "loss 0.5")
+    now_s[0] = 20.0
+    moved(910, 1000, "loss 0.4")
+    assert capsys.readouterr().err == "tokenizer: 91%, loss 0.4, about 3 min left\n"
+
+
+def test_work_of_unknown_length_says_how_long_it_took_so_far(capsys):
+    now_s = [0.0]
+    moved = PlainBar("composing dyads", lambda: now_s[0])
+    now_s[0] = 30.0
+    moved(0, 0, "reading")
+    assert capsys.readouterr().err == "composing dyads: reading, 30 s so far\n"
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (99, "99 s"), (720, "12 min"), (11_100, "3 h 5 min")])
+def test_lengths_of_time_in_words(seconds, text):
+    assert in_words(seconds) == text
+
+
+def test_short_work_without_a_terminal_is_silent(capsys):
+    assert list(tracked([1, 2, 3], "counting")) == [1, 2, 3]
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.usefixtures("terminal")
+def test_on_a_terminal_a_bar_shows_share_time_and_rest_on_stderr_alone(capsys):
+    with bar("exporting [x] {y}") as moved:
+        moved(0, 4, "graph heads")
+        moved(1, 4, "graph told")
+    out, text = capsys.readouterr()
+    assert not out
+    assert "exporting [x] {y}" in text
+    assert "25 %" in text
+    assert "graph told" in text
+    assert "left" in text
+
+
+@pytest.mark.usefixtures("terminal")
+def test_bars_may_be_nested_and_log_lines_stand_above_them(capsys):
+    handler = logging.StreamHandler(sys.stderr)
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        for name in tracked(["a"], "tables"):
+            for _ in tracked(range(2), name):
+                root.warning("2 clips cannot be read")
+        assert handler.stream is sys.stderr
+    finally:
+        root.removeHandler(handler)
+    text = capsys.readouterr().err
+    assert "\x1b[2K2 clips cannot be read\n" in text  # in a line of its own, which is cleared before
+
+
+def test_a_hidden_bar_shows_nothing(capsys):
+    with bar("looking", hidden=True) as moved:
+        moved(1, 2, "id 1")
+    assert capsys.readouterr() == ("", "")
