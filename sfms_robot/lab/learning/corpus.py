@@ -91,7 +91,8 @@ class Corpus(Generic[Frames]):
 
     def cut(self, starts: Tensor, window: int) -> Frames:
         """Return the windows (B, window, ...) at (B,) starts, on the device of the starts."""
-        return _each(self.frames, lambda part: windows(part, starts.to(part.device), window).to(starts.device))
+        at, to_gpu = starts.device, starts.is_cuda
+        return _each(self.frames, lambda part: windows(part, starts, window).to(at, non_blocking=to_gpu))
 
     def to(self, device: torch.device) -> Corpus[Frames]:
         """Return the same frames on another device; staged ones stay on disk."""
@@ -168,6 +169,7 @@ def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
 
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
     """Cut values (N, ...) at (B,) starts into (B, length, ...)."""
+    starts = starts.to(values.device, non_blocking=values.is_cuda)
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
 
 

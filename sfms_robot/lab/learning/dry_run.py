@@ -3,8 +3,8 @@
 Operations, bytes and calls are counted, not guessed: of a piece of the batch that is small enough for this machine,
 forward and backward, as often as the batch has such pieces, and of the update of all weights. A GPU's time for a step
 is then the longest of three: operations at a share of its peak, bytes at a share of its bandwidth, calls at what one
-costs the processor that makes them; and after it the random numbers, which are drawn on the processor
-(`learning.job`). The shares are assumptions, told with the figures.
+costs the processor that makes them. Random numbers are drawn on the GPU (`learning.job`): bytes and calls like others.
+The shares are assumptions, told with the figures.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ MOST_FRAMES: Final = 1200  # of a piece: what a small machine holds
 REACHED: Final = 0.3  # of a GPU's peak, and `STREAMED` of its bandwidth
 STREAMED: Final = 0.7
 CALL_US: Final = 8.0  # one call of torch from Python
-DRAW_NS: Final = 8.0  # a random number on one core
 _DYADS: Final = 2
 
 
@@ -61,7 +60,7 @@ GPUS: Final = {
 }
 ASSUMED: Final = (
     f"assumed of a GPU: {REACHED:.0%} of its peak, {STREAMED:.0%} of its bandwidth, {CALL_US:g} us a call of torch "
-    f"(nothing compiled); {DRAW_NS:g} ns a random number, on the processor; looks at held-out data are not counted"
+    "(nothing compiled); looks at held-out data are not counted"
 )
 
 
@@ -156,7 +155,7 @@ def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
         "pieces": pieces,
         "params": sum(each.numel() for each in job.model.parameters()),
         "precision": job.phase.precision,
-        "loss": loss,
+        "loss": float(loss),
         **figures,
         "here_s": round(time.perf_counter() - began_s, 2),
         "here_peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
@@ -165,13 +164,10 @@ def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
 
 
 def _step_s(figures: dict[str, int], gpu: Gpu, half: bool) -> float:
-    return (
-        max(
-            figures["operations"] / (REACHED * (gpu.bf16 if half else gpu.fp32)),
-            figures["bytes"] / (STREAMED * gpu.memory),
-            figures["calls"] * CALL_US * 1e-6,
-        )
-        + figures["drawn"] * DRAW_NS * 1e-9
+    return max(
+        figures["operations"] / (REACHED * (gpu.bf16 if half else gpu.fp32)),
+        figures["bytes"] / (STREAMED * gpu.memory),
+        figures["calls"] * CALL_US * 1e-6,
     )
 
 

@@ -64,7 +64,7 @@ class ScoreNetwork(nn.Module):
     def forward(self, seen: Tensor) -> Tensor:
         """Return logits (B, T, outputs) of (B, T, inputs): in the paper standardised motion, one output per group."""
         x = self.linear(self.conv(seen.transpose(1, 2)).transpose(1, 2))
-        x = x + sinusoidal(x.shape[1], self.width).to(x)
+        x = x + sinusoidal(x.shape[1], self.width, x.device).to(x)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.out(self.norm(x))

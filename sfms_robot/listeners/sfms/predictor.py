@@ -97,7 +97,7 @@ class SpeakerEncoder(nn.Module):
         x = torch.where(c.face_known[..., None], self.face_in(c.face), self.no_face)
         voice = c.voice if self.phase_in is None else c.voice + self.phase_in(c.phase)
         y = torch.where(c.heard[..., None], voice, self.no_voice)
-        places = sinusoidal(x.shape[1], x.shape[2]).to(x)  # (P, W)
+        places = sinusoidal(x.shape[1], x.shape[2], x.device).to(x)  # (P, W)
         x, y = x + places, y + places
         for face_layer, voice_layer in zip(self.face, self.voice, strict=True):
             x, y = face_layer(x, y), voice_layer(y, x)
@@ -177,7 +177,7 @@ class Predictor(nn.Module):
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         if self.control_in is not None:
             x = x + self.control_in(control)
-        x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
+        x = x + sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
         for block in self.own:
             x = block(x)
         return x
