@@ -96,15 +96,10 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
                 position = replace(position, finished=impatient or position.step >= phase.steps)
                 now_s = clock()
                 report = Report(
-                    name=job.name,
-                    steps=phase.steps,
-                    position=position,
-                    loss=loss,
-                    gradient_norm=norm,
-                    learning_rate=rate,
+                    name=job.name, steps=phase.steps, position=position, loss=loss, gradient_norm=norm,
+                    learning_rate=rate, looked=is_last and looked,
                     frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
-                    looked=is_last and looked,
-                )
+                )  # fmt: skip
                 for watch in run.watches:
                     watch(report)
             made.clear()
@@ -116,6 +111,11 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             if interrupted:
                 at = f"{job.name}: interrupted after step {position.step} of {phase.steps}, saved in {file}"
                 raise KeyboardInterrupt(f"{at}; the same command with --resume continues")
+    return _ended(job, position, best, began_at if run.resume else None)
+
+
+def _ended(job: Job, position: Position, best: Weights | None, resumed_at: int | None) -> TrainingOutcome:
+    """Put the best weights into the model, and return the outcome."""
     if best is not None:
         job.model.load_state_dict(best)
     return TrainingOutcome(
@@ -123,8 +123,8 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
         held_out=position.best,
         steps=position.step,
         best_step=position.step if best is None else position.best_step,
-        stopped="steps" if position.step == phase.steps else "patience",
-        resumed_at=began_at if run.resume else None,
+        stopped="steps" if position.step == job.phase.steps else "patience",
+        resumed_at=resumed_at,
     )
 
 
@@ -287,9 +287,7 @@ def pieces_of(job: Job, run: Run, file: Path) -> int:
 class Gradients:
     """Gradients of a job's parameters, filled step by step; the same in all processes of the group."""
 
-    def __init__(
-        self, job: Job, group: ProcessGroup, pieces: int, file: Path, read_every: int | None = None
-    ) -> None:
+    def __init__(self, job: Job, group: ProcessGroup, pieces: int, file: Path, read_every: int | None = None) -> None:
         self.job, self.group, self.file = job, group, file
         self._pieces, self._samples = pieces, job.phase.batch // pieces
         self.read_every = read_every or (1 if job.device.type == "cpu" else READ_EVERY)
