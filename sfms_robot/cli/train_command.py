@@ -210,12 +210,13 @@ def compose(
     ),
     seed: int = Option(1, min=0, help="One seed composes the same dyads."),
     overwrite: bool = Option(False, "--overwrite", help="Replace the dyads that --out holds."),
+    jobs: int = Option(1, min=1, max=64, help="Processes, up to 9; the files are the same with any number."),
     json: bool = JSON,
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
     from sfms_robot.lab.corpora.data_commands import compose_dyads
 
-    composed = compose_dyads(data, out, minutes, seed, overwrite)
+    composed = compose_dyads(data, out, minutes, seed, overwrite, jobs)
     show(composed, json, heading=f"minutes of dyads written to {out}")
 
 
