@@ -102,15 +102,13 @@ class BatchEngine(TorchEngine):
         """Return the outputs of a network, see `engine.Engine.run`."""
         streams = max(map(len, inputs))
         size = 1 << (streams - 1).bit_length()
-        module, tensors = self._networks[network], _tensors(inputs)
+        tensors = _tensors(inputs)
         key = (network, size, *(each.shape[1:] for each in tensors))
         with self._enough_memory(streams):
             if key not in self._batches:
-                batch = _NetworkBatch(module, tensors, size, self._device)
-                if self._pool is not None and network != ONE_STREAM and not getattr(module, "free", ()):
+                batch = _NetworkBatch(self._networks[network], tensors, size, self._device)
+                if self._pool is not None and network != ONE_STREAM:
                     batch.capture(self._pool)
-                if getattr(module, "free", ()):  # of any shape: kept for this call
-                    return batch.run(tensors, streams)
                 self._batches[key] = batch
             return self._batches[key].run(tensors, streams)
 

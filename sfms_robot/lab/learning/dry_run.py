@@ -42,6 +42,7 @@ REACHED: Final = 0.3  # of a GPU's peak, and `STREAMED` of its bandwidth
 STREAMED: Final = 0.7
 CALL_US: Final = 8.0  # one call of torch from Python
 _DYADS: Final = 2
+CPU: Final = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,10 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
     return {"stages": stages, "hours": hours, "assumed": ASSUMED, "rows": [_row(stage) for stage in stages]}
 
 
-def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[str, Job, int]]:
+def jobs_of(
+    settings: config.Training | config.ArigTraining, device: torch.device = CPU
+) -> Iterator[tuple[str, Job, int]]:
     """Yield name, job and steps of each stage, on initial weights and made-up frames."""
-    cpu = torch.device("cpu")
     torch.manual_seed(settings.seed)
     listener = settings.listener
     space = MotionSpace.of(listener)
@@ -86,17 +88,17 @@ def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[tuple[s
         dyads = _made_up(phase.window_frames + FRAME_HZ, space, settings.listener.events)
         corpus = arig.gather(dict.fromkeys(arig.SCENES, dyads), phase.window_frames, space, settings.listener)
         arig.fit_scales(student.model, corpus, settings.listener.channels)
-        yield "arig", arig_job(settings, student, corpus, corpus, cpu), phase.steps
+        yield "arig", arig_job(settings, student, corpus, corpus, device), phase.steps
         return
     window = settings.listener.window_frames
     dyads = _made_up(2 * window, space, settings.listener.events)
     plain = sfms.gather(dyads, window, space, None, settings.listener)
     model = SfmsModel(settings.listener)
     sfms.fit_scales(model, plain, settings.listener.channels)
-    yield "tokenizer", tokenizer_job(settings, model, plain, plain, cpu), settings.tokenizer.steps
+    yield "tokenizer", tokenizer_job(settings, model, plain, plain, device), settings.tokenizer.steps
     heard = sfms.gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
-    fit_sound(model, (heard.frames.sound, heard.frames.heard))
-    yield "listener", listener_job(settings, model, heard, heard, cpu), settings.predictor.steps
+    fit_sound(model.cpu(), (heard.frames.sound, heard.frames.heard))
+    yield "listener", listener_job(settings, model, heard, heard, device), settings.predictor.steps
 
 
 def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:

@@ -223,7 +223,7 @@ def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> T
             index = ((torch.arange(count) + 0.5) * t / count).long()
         else:
             index = torch.arange(count) * (t // count)
-        mask[:, index, group] = 1.0
+        mask[:, index.to(mask.device, non_blocking=True), group] = 1.0
     return mask
 
 
