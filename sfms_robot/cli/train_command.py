@@ -30,7 +30,7 @@ _LAYOUTS = (
 Order = Literal["exp-first", "pose-first"]
 DeviceName = Literal["auto", "cpu", "cuda"]
 CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
+DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`), or a `train pack`.")
 OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
 RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
 OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
@@ -166,6 +166,20 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     except KeyboardInterrupt as stopped:
         print(f"sfms-robot: {stopped if stopped.args else 'interrupted'}", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+@app.command()
+def pack(
+    config: Path = CONFIG,
+    data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
+    out: Path = Option(..., metavar="FILE", help="The pack, for --data of a training with the same file."),
+    order: Order | None = ORDER,
+    json: bool = JSON,
+) -> None:
+    """Write what a training reads of its data to one file: a trainer elsewhere begins at once."""
+    from sfms_robot.lab.learning.train_runs import pack_data
+
+    show(pack_data(config, data, out, order), json)
 
 
 @app.command()

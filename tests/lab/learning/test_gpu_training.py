@@ -1,16 +1,18 @@
 """What a GPU needs of training: noise of its own, no step that waits, memory that runs out. No test needs one."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from test_training_loop import same, toy, weights
 from tiny_arig_training import settings, write
 from tiny_sfms_training import configuration
 
 from sfms_robot.config import parse_training
-from sfms_robot.errors import ModelError
+from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.learning.arig.features import fit_scales, gather, open_scenes
 from sfms_robot.lab.learning.arig.trainer import (
     Student,
@@ -23,6 +25,7 @@ from sfms_robot.lab.learning.arig.trainer import (
 from sfms_robot.lab.learning.corpus import Corpus
 from sfms_robot.lab.learning.job import OwnNoise, Run, noise_of
 from sfms_robot.lab.learning.sfms.features import place_all
+from sfms_robot.lab.learning.train_runs import TrainOptions, pack_data, train_listener
 from sfms_robot.lab.learning.training_loop import READ_EVERY, checkpoint_file, fit, peek
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.sfms.model import SfmsModel
@@ -132,3 +135,41 @@ def test_dyads_are_placed_together_as_they_are_alone():
     motion = torch.randn(sum(lengths), 58)
     alone = [place_all(tokenizer, dyad, [len(dyad)]) for dyad in motion.split(lengths)]
     assert torch.equal(place_all(tokenizer, motion, lengths), torch.cat(alone))
+
+
+@pytest.fixture(scope="module")
+def pack(data, tmp_path_factory):
+    """Return a training file and the pack of its data."""
+    folder = tmp_path_factory.mktemp("pack")
+    (folder / "told.yaml").write_text(json.dumps(settings(TOLD).model_dump(mode="json")))
+    found = pack_data(folder / "told.yaml", data, folder / "told.pack")
+    assert found["train"] == {"dyads": 6, "frames": 1800} and found["bytes"] > 1e6
+    return folder / "told.yaml", folder / "told.pack"
+
+
+def test_a_pack_trains_what_its_folder_trains(data, pack, tmp_path):
+    trained = [train_arig(settings(TOLD), place, tmp_path / place.name) for place in (data, pack[1])]
+    assert trained[0] == trained[1]
+    one, two = ((tmp_path / place.name / "model.safetensors").read_bytes() for place in (data, pack[1]))
+    assert one == two
+
+
+def test_a_pack_of_another_version_or_listener_or_no_pack_is_refused_in_one_line(pack, tmp_path):
+    old = tmp_path / "old.pack"
+    save_file({"x": torch.zeros(1)}, old, {"pack": '{"version": 7}'})
+    with pytest.raises(
+        ConfigError, match="^.*old.pack: version: expected 1, got 7; pack again: sfms-robot train pack$"
+    ):
+        train_arig(settings(TOLD), old, tmp_path / "out")
+    with pytest.raises(ConfigError, match="^.*told.pack: events: expected False, got True; pack again"):
+        train_arig(settings(), pack[1], tmp_path / "out")
+    with pytest.raises(ConfigError, match="^.*told.yaml: not a pack of training data"):
+        train_arig(settings(TOLD), pack[0], tmp_path / "out")
+
+
+def test_a_pack_holds_nothing_to_calibrate_with(pack, tmp_path):
+    file, raw = tmp_path / "sfms.yaml", configuration()
+    raw["predictor"]["calibration_rounds"] = 2
+    file.write_text(json.dumps(raw))
+    with pytest.raises(ConfigError, match="calibration_rounds: expected 0 of them, or the folder as --data"):
+        train_listener(TrainOptions(file=file, data=pack[1], out=tmp_path / "out"))

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -19,7 +19,16 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
+from sfms_robot.lab.learning.arig.features import (
+    SCENES,
+    ArigCorpus,
+    LabelledDyad,
+    cut,
+    fit_scales,
+    gather,
+    open_scenes,
+)
+from sfms_robot.lab.learning.corpus import packed
 from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
@@ -49,11 +58,7 @@ def train_arig(
     listener, phase = settings.listener, settings.training
     torch.manual_seed(settings.seed)
     student = Student(ArigModel(listener))
-    space = MotionSpace.of(listener)
-    corpus, held_out = (
-        gather(open_scenes(data, split), phase.window_frames, space, listener, run.staging(split))
-        for split in ("train", "validation")
-    )
+    corpus, held_out = corpora(settings, data, run).values()
     fit_scales(student.model, corpus, listener.channels)
     job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
@@ -66,6 +71,19 @@ def train_arig(
         "held_out_noise": float(parts.motion),
         "held_out_state": float(parts.state),
         "held_out_coarse": float(parts.coarse),
+    }
+
+
+def corpora(settings: config.ArigTraining, data: Path, run: Run) -> dict[str, ArigCorpus]:
+    """Return the frames of training and validation, from a folder or a pack."""
+    listener, window = settings.listener, settings.training.window_frames
+
+    def read(split: str) -> ArigCorpus:
+        return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run.staging(split))
+
+    return {
+        split: packed(data, split, LabelledDyad, listener, window, partial(read, split))
+        for split in ("train", "validation")
     }
 
 

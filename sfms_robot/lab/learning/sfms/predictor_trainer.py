@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import fit_sound, windows
+from sfms_robot.lab.learning.corpus import fit_sound, packed, windows
 from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
+    SfmsFrames,
     context,
     gather,
     held_tokens,
@@ -56,13 +58,8 @@ def train_listener(
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
     """
-    listener, space = settings.listener, MotionSpace.of(settings.listener)
-    dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
-    frontend = AudioFrontend.of(listener)
-    corpus, held_out = (
-        gather(some, listener.window_frames, space, frontend, listener, run.staging(split))
-        for some, split in ((dyads, "train"), (unseen, "validation"))
-    )
+    listener = settings.listener
+    corpus, held_out = corpora(settings, data, run, order).values()
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
@@ -75,6 +72,20 @@ def train_listener(
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
     scores = keyframe_scores(model.cpu(), held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
+
+
+def corpora(settings: config.Training, data: Path, run: Run, order: Order | None) -> dict[str, SfmsCorpus]:
+    """Return the frames of training and validation, from a folder or a pack."""
+    listener, space = settings.listener, MotionSpace.of(settings.listener)
+
+    def read(split: str) -> SfmsCorpus:
+        dyads, frontend = open_for(space.name, data, split, order, [listener.audio]), AudioFrontend.of(listener)
+        return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
+
+    return {
+        split: packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
+        for split in ("train", "validation")
+    }
 
 
 def listener_job(

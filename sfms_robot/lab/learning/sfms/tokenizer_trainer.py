@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import first_frames, windows
+from sfms_robot.lab.learning.corpus import first_frames, packed, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run, noise_of
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, SfmsFrames, fit_scales, gather, place_all
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -60,16 +61,19 @@ def train_tokenizer(
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
         raise ConfigError("listener.quantizer = 'vq' moves its codes beside gradients: one process, one piece a step")
-    dyads = open_for(space.name, data, "train", order)
-    if dyads.fps != FRAME_HZ:
-        log.warning(
-            "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
-            data, dyads.fps, FRAME_HZ,
-        )  # fmt: skip
-    unseen = open_for(space.name, data, "validation", order)
+
+    def read(split: str) -> SfmsCorpus:
+        dyads = open_for(space.name, data, split, order)
+        if dyads.fps != FRAME_HZ and split == "train":
+            log.warning(
+                "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
+                data, dyads.fps, FRAME_HZ,
+            )  # fmt: skip
+        return gather(dyads, listener.window_frames, space, None, listener, run.staging(split))
+
     corpus, held_out = (
-        gather(some, listener.window_frames, space, None, listener, run.staging(split))
-        for some, split in ((dyads, "train"), (unseen, "validation"))
+        packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
+        for split in ("train", "validation")
     )
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
