@@ -1,8 +1,8 @@
 """`bench train`: the share of a training step, on one core, that is not the model.
 
-The model is what lies between the first call of one of its modules and the end of the backward pass, less the random
-numbers drawn in between. The rest draws windows and noise, cuts and changes them, clips and updates. Steps are those of
-the shipped files, on made-up frames (`learning.dry_run`).
+The model is what lies between the first call of one of its modules and the end of the backward pass. The rest draws
+windows and noise, cuts and changes them, clips and updates. Steps are those of the shipped files, on made-up frames
+(`learning.dry_run`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
-from torch.overrides import TorchFunctionMode
 
 from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
@@ -27,7 +26,6 @@ from sfms_robot.lab.learning.training_loop import Gradients, make_step
 FILES: Final = ("arig", "sfms-small")
 STEPS: Final = 12  # measured, after one that is not
 MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
-_DRAWS: Final = frozenset({torch.rand, torch.randn, torch.randint, torch.randperm, torch.multinomial})
 
 
 def measure(say: Callable[[str], None], steps: int = STEPS) -> BenchResult:
@@ -59,12 +57,9 @@ def _measured(job: Job, steps: int) -> Row:
             make_step(timed, step, generator)
             whole_ms.append((time.perf_counter() - began_s) * 1e3)
             beside_ms.append(whole_ms[-1] - timed.model_s * 1e3)
-        timed.begin()
-        with _DrawTime(timed) as drawn:
-            make_step(timed, 0, generator)
     finally:
         hook.remove()
-    return row([each + drawn.spent_s * 1e3 for each in beside_ms[1:]], whole_ms[1:], "ms beside the model", "a step")
+    return row(beside_ms[1:], whole_ms[1:], "ms beside the model", "a step")
 
 
 class _TimedGradients(Gradients):
@@ -90,19 +85,4 @@ class _TimedGradients(Gradients):
         """Return what `Gradients.of` returns."""
         found = super().of(step, generator)
         self.model_s = 0.0 if self.first_s is None else time.perf_counter() - self.first_s
-        return found
-
-
-class _DrawTime(TorchFunctionMode):
-    """Seconds spent on random numbers once the model has been called."""
-
-    def __init__(self, timed: _TimedGradients) -> None:
-        super().__init__()
-        self._timed, self.spent_s = timed, 0.0
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        began_s = time.perf_counter()
-        found = func(*args, **(kwargs or {}))
-        if func in _DRAWS and self._timed.first_s is not None:
-            self.spent_s += time.perf_counter() - began_s
         return found

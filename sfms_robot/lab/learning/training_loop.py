@@ -189,7 +189,7 @@ def _enough_memory(gradients: Gradients, save: Callable[[Path], None], step: int
         if step and gradients.group.first:
             save(file)
         few = f"too little memory on the GPU for a batch of {job.phase.batch} at step {step}"
-        raise ModelError(f"{job.name}: {few}: --accumulate 2 or more, or a smaller batch ({_kept(file)})") from error
+        raise ModelError(f"{job.name}: {few}: begin with --accumulate 2 or more ({_kept(file)})") from error
 
 
 def _saved_at(

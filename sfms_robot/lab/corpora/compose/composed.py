@@ -25,7 +25,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final, Literal
 
@@ -195,14 +195,9 @@ def _written(
             yield from ((of[ended], file, minute) for file, minute in ended.result())
 
 
-@lru_cache(maxsize=1)
-def _read_once(data: Path) -> dict[Split, Material]:
-    return material_of(data)
-
-
 def _whole_part(data: Path, part: Part, folder: Path, seed: int, minutes: float) -> list[tuple[Path, float]]:
-    """Write a part, in a process of a pool, which reads the material once."""
-    return [*write_part(_read_once(data), part, folder, seed, minutes)]
+    """Write a part, in a process of a pool."""
+    return [*write_part(material_of(data), part, folder, seed, minutes)]
 
 
 def write_part(
@@ -210,15 +205,15 @@ def write_part(
 ) -> Iterator[tuple[Path, float]]:
     """Write the dyads of a part; yield the file and minutes of each."""
     name, only = part
-    make: Callable[..., Iterator[tuple[Split, Dyad]]] = dyads if name != "speaking" else monologues
-    scene = {} if name == "speaking" else {"scene": name}
-    for split, dyad in make(material, seed, minutes, only=only, **scene):
+    make: Callable[..., Iterator[tuple[Split, Dyad]]] = partial(dyads, scene=name)
+    for split, dyad in (monologues if name == "speaking" else make)(material, seed, minutes, only=only):
         save(folder / split, [dyad])
         yield folder / split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
 
 
+@lru_cache(maxsize=1)
 def material_of(data: Path) -> dict[Split, Material]:
-    """Return the material in a folder, and the bundled. Raises ConfigError."""
+    """Return the material in a folder, and the bundled, read once. Raises ConfigError."""
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]

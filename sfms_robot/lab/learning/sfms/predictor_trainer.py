@@ -104,7 +104,6 @@ def listener_job(
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
-
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
 
@@ -113,10 +112,7 @@ def listener_job(
         if phase.event_windows and len(eventful):
             busy = torch.rand(batch, generator=generator) < phase.event_windows
             chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
-        gain = None
-        if listener.audio == "mel":  # microphones differ
-            gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
-            gain = gain.to(device, non_blocking=True)
+        gain = _louder(phase, batch, generator, device) if listener.audio == "mel" else None
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
         seen = context(
@@ -156,6 +152,12 @@ def listener_job(
             "tokenizer weights": tokenizer_digest,
         },
     )
+
+
+def _louder(phase: config.PredictorTraining, batch: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Draw how much louder (B,) each window is, in logarithms of power: microphones differ."""
+    gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
+    return gain.to(device, non_blocking=True)
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
