@@ -123,7 +123,9 @@ def test_a_gpu_without_memory_keeps_the_steps_made_so_far(tmp_path, every):
 
     with pytest.raises(ModelError) as ended:
         fit(toy(loss=short, evaluate_every=0), tmp_path, Run(read_every=every))
-    assert "\n" not in str(ended.value) and "for a batch of 4 at step 7: begin with --accumulate 2 or more" in str(ended.value)
+    assert "\n" not in str(ended.value) and "for a batch of 4 at step 7: begin with --accumulate 2 or more" in str(
+        ended.value
+    )
     assert peek(checkpoint_file(tmp_path, "toy"))[0].step == 7
     assert fit(toy(evaluate_every=0), tmp_path, Run(resume=True)).steps == 12
 

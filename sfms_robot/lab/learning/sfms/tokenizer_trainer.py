@@ -400,7 +400,7 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
         chosen = torch.randint(len(starts), (size,), generator=generator)
         batch = windows(motion, starts[chosen], window)
         if kept is not None:
-            return batch, kept[chosen].float()
+            return batch, kept[chosen.to(kept.device, non_blocking=kept.is_cuda)].float()
         if whole is None:
             return batch, _masks(tokenizer, batch)
         mask = windows(whole, starts[chosen], window)
