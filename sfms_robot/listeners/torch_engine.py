@@ -134,12 +134,8 @@ class _NetworkBatch:
 
     def capture(self, pool: Any) -> None:
         """Capture the network as a graph; what it makes once, such as places, is made before."""
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(2):
-                self._network(*self._inputs)
-        torch.cuda.current_stream().wait_stream(side)
+        for _ in range(2):
+            self._network(*self._inputs)
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph, pool=pool):
             self._outputs = self._network(*self._inputs)

@@ -26,7 +26,7 @@ from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.rollout import offline_rollout, tracked
 from sfms_robot.lab.learning.arig.trainer import corpora as arig_corpora
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.corpus import without_gaze, write_pack
+from sfms_robot.lab.learning.corpus import Corpus, without_gaze, write_pack
 from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
@@ -105,7 +105,8 @@ def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> 
     """Write all that the training of a file reads of its data to `out`. Returns dyads, frames and bytes."""
     settings = load_training(file)
     if isinstance(settings, config.ArigTraining):
-        window, found = settings.training.window_frames, arig_corpora(settings, data, Run())
+        window = settings.training.window_frames
+        found: Mapping[str, Corpus[Any]] = arig_corpora(settings, data, Run())
     else:
         window, found = settings.listener.window_frames, listener.corpora(settings, data, Run(), order)
     write_pack(out, found, settings.listener, window)

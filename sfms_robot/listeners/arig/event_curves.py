@@ -57,7 +57,7 @@ def features(row: Tensor, at: Tensor | None = None) -> Tensor:
     size = active * size  # 0 while no such event is under way: then the kind has no features
     curves = torch.cat([size * _hats(over, at[: len(_OVER)]), size * _hats(since, at[len(_OVER) :])], dim=-1)
     swings = [KINDS.index(kind) for kind in SWINGING]
-    sine, cosine = row[..., _EACH * len(KINDS) :].unflatten(-1, (len(SWINGING), 2)).split(1, dim=-1)
+    sine, cosine = torch.unflatten(row[..., _EACH * len(KINDS) :], -1, (len(SWINGING), 2)).chunk(2, dim=-1)
     # sin a, cos a, sin 2a = 2 sin a cos a, cos 2a = cos^2 a - sin^2 a
     waves = torch.cat([sine, cosine, 2 * sine * cosine, cosine.square() - sine.square()], dim=-1)
     found = [torch.ones_like(row[..., :1])]
@@ -71,7 +71,10 @@ def features(row: Tensor, at: Tensor | None = None) -> Tensor:
 
 def _of_kinds(row: Tensor) -> tuple[Tensor, ...]:
     """Return active, since, over and size (..., KINDS, 1) of control rows (..., K): views, no index is made."""
-    return row[..., : _EACH * len(KINDS)].unflatten(-1, (len(KINDS), _EACH)).split(1, dim=-1)
+    found: tuple[Tensor, ...] = torch.unflatten(row[..., : _EACH * len(KINDS)], -1, (len(KINDS), _EACH)).chunk(
+        4, dim=-1
+    )
+    return found
 
 
 def moves(channels: Sequence[str]) -> Tensor:

@@ -21,7 +21,6 @@ the filmed recordings themselves (`speaking.py`). Each is a data set of its own 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
@@ -162,7 +161,7 @@ def compose_folder(
         )
     parts = [(name, split) for name in folders for split in SPLITS]
     found: dict[tuple[str, Split], list[tuple[Path, float]]] = {}
-    done = Counter[str]()
+    done = dict.fromkeys(folders, 0.0)
     for part, file, minute in _written(data, folders, wanted, seed, parts, jobs):
         found.setdefault(part, []).append((file, minute))
         done[part[0]] += minute
@@ -205,8 +204,9 @@ def write_part(
 ) -> Iterator[tuple[Path, float]]:
     """Write the dyads of a part; yield the file and minutes of each."""
     name, only = part
-    make: Callable[..., Iterator[tuple[Split, Dyad]]] = partial(dyads, scene=name)
-    for split, dyad in (monologues if name == "speaking" else make)(material, seed, minutes, only=only):
+    scene: Scene = "interaction" if name == "interaction" else "listening"
+    make = monologues if name == "speaking" else partial(dyads, scene=scene)
+    for split, dyad in make(material, seed, minutes, only=only):
         save(folder / split, [dyad])
         yield folder / split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
 
