@@ -37,6 +37,7 @@ def bench(
     ),
     hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
     data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
+    device: Literal["cpu", "cuda"] | None = Option(None, help="For 'serve': cuda: 64, 256, 1,024 heads on a GPU."),
     write: Path | None = Option(
         None, metavar="FILE", help="Write the rows as a page too (docs/science/performance.md)."
     ),
@@ -56,6 +57,7 @@ def bench(
         "against": against,
         "hours": hours,
         "data": data,
+        "device": device,
     }
     began_s = time.monotonic()
     found = run_bench(

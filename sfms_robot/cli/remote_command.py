@@ -10,7 +10,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from typer import Argument, Context, Exit, Option, Typer
 
@@ -126,6 +126,7 @@ def serve(
     ),
     everybody: bool = Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
     engine: str = Option("auto", metavar="auto|onnx|torch", help="Engine of the listener, as of `run`."),
+    device: Literal["cpu", "cuda"] = Option("cpu", help="cuda: all heads of a process in one batch on the GPU."),
     json: bool = JSON,
 ) -> None:
     """Serve a listener to robots elsewhere, `sfms-robot run --listener zenoh/NAME`, until Ctrl-C."""
@@ -141,6 +142,7 @@ def serve(
         name=name or Path(listener).name,
         server=os.uname().nodename,
         engine=engine_named(engine),
+        device=device,
         hop=hop,
         all_heads=everybody,
     )

@@ -30,7 +30,7 @@ _LAYOUTS = (
 Order = Literal["exp-first", "pose-first"]
 DeviceName = Literal["auto", "cpu", "cuda"]
 CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`).")
+DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`), or a `train pack`.")
 OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
 RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
 OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
@@ -169,6 +169,20 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 @app.command()
+def pack(
+    config: Path = CONFIG,
+    data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
+    out: Path = Option(..., metavar="FILE", help="The pack, for --data of a training with the same file."),
+    order: Order | None = ORDER,
+    json: bool = JSON,
+) -> None:
+    """Write what a training reads of its data to one file: a trainer elsewhere begins at once."""
+    from sfms_robot.lab.learning.train_runs import pack_data
+
+    show(pack_data(config, data, out, order), json)
+
+
+@app.command()
 def events(
     data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
     out: Path | None = Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
@@ -210,12 +224,13 @@ def compose(
     ),
     seed: int = Option(1, min=0, help="One seed composes the same dyads."),
     overwrite: bool = Option(False, "--overwrite", help="Replace the dyads that --out holds."),
+    jobs: int = Option(1, min=1, max=64, help="Processes, up to 9; the files are the same with any number."),
     json: bool = JSON,
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
     from sfms_robot.lab.corpora.data_commands import compose_dyads
 
-    composed = compose_dyads(data, out, minutes, seed, overwrite)
+    composed = compose_dyads(data, out, minutes, seed, overwrite, jobs)
     show(composed, json, heading=f"minutes of dyads written to {out}")
 
 

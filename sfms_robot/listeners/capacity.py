@@ -23,6 +23,7 @@ from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 
 SIZES: Final = (1, 2, 4, 8, 16, 32)
+GPU_SIZES: Final = (*SIZES, 64, 128, 256)  # of batches on a GPU, whose graphs are made by this
 ROUNDS: Final = 3  # plans that are measured at each size, after one that is not
 UNEVEN: Final = 1.2  # of 2 B: what the slowest of a hundred takes, measured
 _BISECTIONS: Final = 20

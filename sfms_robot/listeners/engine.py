@@ -2,7 +2,8 @@
 
 A stream calls networks by name: arrays in, arrays out, no state kept. There are two engines. `OnnxEngine` runs graphs
 in onnxruntime without torch: a tenth of torch's start-up time, and small models in half its time. `TorchEngine`
-(`torch_engine`) runs the modules, for listeners without graphs and for the lab.
+(`torch_engine`) runs the modules, for listeners without graphs and for the lab; its `BatchEngine` many streams at once
+on a GPU.
 
 A listener's folder holds its graphs as onnx/NAME.onnx, without weights, and onnx/graphs.json, which lists the weights
 that each graph needs and the configuration that they belong to. So a graph that is cut short, belongs to another model
@@ -34,6 +35,7 @@ from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
 EngineName = Literal["auto", "torch", "onnx"]
+Device = Literal["cpu", "cuda"]
 
 KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
 ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long

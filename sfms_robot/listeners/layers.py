@@ -18,10 +18,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=32)
 @torch.inference_mode(False)  # the cached tensor serves training as well
-def sinusoidal(length: int, width: int) -> Tensor:
+def sinusoidal(length: int, width: int, device: torch.device | None = None) -> Tensor:
     """Return the sinusoidal positions (length, width) of Vaswani et al. 2017, read-only; `width` is even."""
+    if device is not None and device.type != "cpu":
+        return sinusoidal(length, width).to(device)
     position = torch.arange(length, dtype=torch.float32)[:, None]
     rate = torch.exp(torch.arange(0, width, 2, dtype=torch.float32) * (-math.log(10_000.0) / width))
     return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)

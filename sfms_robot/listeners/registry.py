@@ -8,10 +8,10 @@ from typing import Any, cast
 
 from sfms_robot import config
 from sfms_robot.config.listener import Calmness
-from sfms_robot.errors import optional
+from sfms_robot.errors import ConfigError, optional
 from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import load_config
-from sfms_robot.listeners.engine import Engine, EngineName, OnnxEngine, graphs_to_run
+from sfms_robot.listeners.engine import Device, Engine, EngineName, OnnxEngine, graphs_to_run
 from sfms_robot.listeners.eventful import EventfulListener
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.listeners.idle import FILE as IDLE_FILE
@@ -26,6 +26,7 @@ def load_listener(
     calmness: Calmness | None = None,
     engine: EngineName = "auto",
     threads: int | None = None,
+    device: Device = "cpu",
 ) -> Listener:
     """Return a listener: by its shipped name, from a folder with config.yaml and weights, or from another package.
 
@@ -35,13 +36,16 @@ def load_listener(
         calmness: rates of the events of a listener that decides them.
         engine: what computes its networks (`engine`); auto: onnx where it can be, else torch.
         threads: for its networks; None: one, and with torch as many as it is set to.
+        device: cuda: many streams at once on a GPU (`torch_engine.BatchEngine`).
 
     Raises ConfigError or ModelError.
     """
     folder = listener_folder(str(name))
     if folder is None:
+        if device != "cpu":
+            raise ConfigError(f"--device {device}: {name} is of another package, which computes where it does")
         return load_plugin(str(name))
-    moves = load_folder(folder, engine, threads)
+    moves = load_folder(folder, engine, threads, device)
     listener: Listener = moves
     if moves.settings.events:
         resting = folder / IDLE_FILE
@@ -50,10 +54,14 @@ def load_listener(
     return listener
 
 
-def load_folder(folder: Path, engine: EngineName = "auto", threads: int | None = None) -> SfmsListener | ArigListener:
+def load_folder(
+    folder: Path, engine: EngineName = "auto", threads: int | None = None, device: Device = "cpu"
+) -> SfmsListener | ArigListener:
     """Return the model of motion of a folder with config.yaml and model.safetensors. Raises ConfigError, ModelError."""
     settings = load_config(folder)
-    graphs = graphs_to_run(folder, settings, engine)
+    if device != "cpu" and engine == "onnx":
+        raise ConfigError(f"--engine onnx: computes on processors, --device {device} does not (valid: auto, torch)")
+    graphs = graphs_to_run(folder, settings, engine) if device == "cpu" else None
     runs: Engine
     if graphs is not None:
         runs = OnnxEngine(folder, graphs, threads or 1)
@@ -61,7 +69,7 @@ def load_folder(folder: Path, engine: EngineName = "auto", threads: int | None =
         with optional(f"{folder}: a listener without graphs of engine onnx"):
             from sfms_robot.listeners.torch_engine import load_model, torch_engine
 
-            runs = torch_engine(load_model(folder))
+            runs = torch_engine(load_model(folder), device)
         if threads is not None:
             runs.set_threads(threads)
     if isinstance(settings, config.Sfms):

@@ -348,6 +348,15 @@ class StreamServer:
         self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
         return messages
 
+    def too_many(self, batch: Batch) -> None:
+        """Let a batch wait that the memory did not hold, and take half as many from now on; one alone joins again."""
+        self._most = max(1, len(batch) // 2)
+        if len(batch) == 1:
+            self.failed(batch)
+        for stream, due in batch:
+            stream.waiting.appendleft(due)
+            stream.stepping = False
+
     def failed(self, batch: Batch) -> None:
         """Drop the streams of a batch whose step raised: they join again."""
         for stream, _ in batch:

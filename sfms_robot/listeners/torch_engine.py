@@ -1,9 +1,9 @@
-"""Networks on torch: run as modules, or written as ONNX graphs without weights.
+"""Networks on torch: run as modules, as graphs of a GPU, or written as ONNX graphs without weights.
 
-`TorchEngine` runs a listener's networks. `export` writes them for `engine.OnnxEngine`: torch.export traces a network
-for any number of streams, torch.onnx writes it, onnxscript simplifies it. Weights keep the names that they have in
-model.safetensors and none of their values goes into a graph: so graphs are small, and all weights trained for the same
-configuration run on them. `export` needs the extra `export`.
+`TorchEngine` runs a listener's networks, `BatchEngine` those of many streams together on a GPU. `export` writes them
+for `engine.OnnxEngine`: torch.export traces a network for any number of streams, torch.onnx writes it, onnxscript
+simplifies it. Weights keep the names that they have in model.safetensors and none of their values goes into a graph: so
+graphs are small, and all weights trained for the same configuration run on them. `export` needs the extra `export`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from inspect import signature
 from pathlib import Path
 from typing import Any, Final
@@ -23,14 +24,14 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot import config
-from sfms_robot.errors import ModelError, optional
+from sfms_robot.errors import ConfigError, ModelError, optional
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.arig.networks import networks as arig_networks
 from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
-from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, RunsOnEngine, digest
+from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Device, RunsOnEngine, digest
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -52,12 +53,15 @@ class TorchEngine:
         networks: of the model.
     """
 
-    name = "torch"
-
     def __init__(self, model: nn.Module, networks: Networks) -> None:
         self.model = model.eval()
         self.tensors = {name: value.detach().numpy() for name, value in model.state_dict().items()}
         self._networks = networks
+
+    @property
+    def name(self) -> str:
+        """Return "torch"."""
+        return "torch"
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
@@ -67,6 +71,83 @@ class TorchEngine:
     def set_threads(self, threads: int) -> None:
         """Use this many threads in the whole process: torch has no other setting."""
         torch.set_num_threads(threads)
+
+
+class BatchEngine(TorchEngine):
+    """An engine for many streams: each network is computed for a whole batch at once, on a GPU as one CUDA graph.
+
+    A batch is filled up to the next power of two with rows that are computed and left out, so that few graphs serve all
+    numbers of streams. A graph is captured when its size is first needed. Nothing in a network makes a tensor on the
+    CPU or looks at a value (a law of the tests): that cannot be captured.
+
+    Raises MemoryError, from `run` too, where the GPU has too little memory: no stream has moved then.
+    """
+
+    def __init__(self, model: nn.Module, networks: Networks, device: torch.device) -> None:
+        super().__init__(model, networks)
+        self._device, self._pool = device, None
+        self._batches: dict[tuple[object, ...], _NetworkBatch] = {}
+        with self._enough_memory(1):
+            self.model.to(device)
+            if device.type == "cuda":
+                self._pool = torch.cuda.graph_pool_handle()
+
+    @property
+    def name(self) -> str:
+        """Return "torch" and the device."""
+        return f"torch on {torch.cuda.get_device_name(self._device) if self._device.type == 'cuda' else 'cpu'}"
+
+    @torch.inference_mode()
+    def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
+        """Return the outputs of a network, see `engine.Engine.run`."""
+        streams = max(map(len, inputs))
+        size = 1 << (streams - 1).bit_length()
+        tensors = _tensors(inputs)
+        key = (network, size, *(each.shape[1:] for each in tensors))
+        with self._enough_memory(streams):
+            if key not in self._batches:
+                batch = _NetworkBatch(self._networks[network], tensors, size, self._device)
+                if self._pool is not None and network != ONE_STREAM:
+                    batch.capture(self._pool)
+                self._batches[key] = batch
+            return self._batches[key].run(tensors, streams)
+
+    @contextmanager
+    def _enough_memory(self, streams: int) -> Iterator[None]:
+        try:
+            yield
+        except torch.OutOfMemoryError as error:
+            self._batches.clear()
+            if self._pool is not None:
+                torch.cuda.empty_cache()
+            raise MemoryError(f"too little memory on the GPU for {streams} heads at once") from error
+
+
+class _NetworkBatch:
+    """Inputs of a network for `size` streams, which stay in place, and the graph that makes its outputs from them."""
+
+    def __init__(self, network: nn.Module, like: Sequence[Tensor], size: int, device: torch.device) -> None:
+        self._network = network
+        self._inputs = [torch.zeros((size, *each.shape[1:]), dtype=each.dtype, device=device) for each in like]
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._outputs: tuple[Tensor, ...] = ()
+
+    def capture(self, pool: Any) -> None:
+        """Capture the network as a graph; what it makes once, such as places, is made before."""
+        for _ in range(2):
+            self._network(*self._inputs)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, pool=pool):
+            self._outputs = self._network(*self._inputs)
+
+    def run(self, inputs: Sequence[Tensor], streams: int) -> tuple[Array, ...]:
+        """Return the outputs (streams, ...) of inputs (streams, ...) or (1, ...)."""
+        for kept, each in zip(self._inputs, inputs, strict=True):
+            kept[:streams].copy_(each, non_blocking=True)
+        if self._graph is not None:
+            self._graph.replay()
+        outputs = self._outputs if self._graph is not None else self._network(*self._inputs)
+        return tuple(each[:streams].to("cpu", copy=True).numpy() for each in outputs)
 
 
 class RecordingEngine(TorchEngine):
@@ -107,9 +188,13 @@ def networks_of(model: SfmsModel | ArigModel) -> Networks:
     return arig_networks(model) if isinstance(model, ArigModel) else sfms_networks(model)
 
 
-def torch_engine(model: SfmsModel | ArigModel) -> TorchEngine:
-    """Return an engine for a model in memory."""
-    return TorchEngine(model, networks_of(model))
+def torch_engine(model: SfmsModel | ArigModel, device: Device = "cpu") -> TorchEngine:
+    """Return an engine for a model in memory; on a GPU one that batches. Raises ConfigError without a GPU."""
+    if device == "cpu":
+        return TorchEngine(model, networks_of(model))
+    if not torch.cuda.is_available():
+        raise ConfigError(f"--device {device}: torch sees no CUDA device here (valid: cpu)")
+    return BatchEngine(model, networks_of(model), torch.device(device))
 
 
 def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:

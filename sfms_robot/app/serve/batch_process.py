@@ -28,9 +28,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sfms_robot.config.hop import Latencies, choose_hop
-from sfms_robot.errors import ConfigError, RobotError
-from sfms_robot.listeners.capacity import measure_capacity
-from sfms_robot.listeners.engine import EngineName
+from sfms_robot.errors import ConfigError, ModelError, RobotError
+from sfms_robot.listeners.capacity import GPU_SIZES, SIZES, measure_capacity
+from sfms_robot.listeners.engine import Device, EngineName
 from sfms_robot.listeners.process import plan_times_s
 from sfms_robot.listeners.stream_server import StreamServer
 from sfms_robot.ports import Listener
@@ -53,7 +53,7 @@ class Served:
         listener: shipped name or folder.
         name: by which robots request it.
         server: name of this server.
-        engine: what computes its networks.
+        engine: what computes its networks; device: where.
         hop: None for the one that a robot would choose by what a plan takes here.
         all_heads: admit all, whatever they cost.
     """
@@ -62,6 +62,7 @@ class Served:
     name: str
     server: str = "server"
     engine: EngineName = "auto"
+    device: Device = "cpu"
     hop: int | None = None
     all_heads: bool = False
 
@@ -79,9 +80,10 @@ def main() -> None:
         from sfms_robot.listeners.registry import at_hop
 
         listener = at_hop(listener, hop)
-        capacity = measure_capacity(listener)
-    except RobotError as error:
-        parent.send(("error", error))
+        capacity = measure_capacity(listener, SIZES if served.device == "cpu" else GPU_SIZES)
+    except (RobotError, MemoryError) as error:
+        told = error if isinstance(error, RobotError) else ModelError(f"{served.listener}: {error}")
+        parent.send(("error", told))
         return
     parent.send(("ready", capacity))
     server = StreamServer(listener, served.name, None if served.all_heads else capacity, served.server)
@@ -92,7 +94,7 @@ def _loaded(served: Served) -> Listener:
     """Return the listener at the hop it would be served with; blocks for seconds. Raises ConfigError, ModelError."""
     from sfms_robot.listeners.registry import at_hop, hops_of, load_listener
 
-    listener = load_listener(served.listener, engine=served.engine, threads=1)
+    listener = load_listener(served.listener, engine=served.engine, threads=1, device=served.device)
     hops = hops_of(listener)
     if served.hop is not None:
         if served.hop not in hops:
@@ -146,6 +148,10 @@ def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
     began_s = time.monotonic()
     try:
         answers = server.step(batch)
+    except MemoryError as error:
+        log.warning("%s; half as many from now on", error)
+        server.too_many(batch)
+        return []
     except Exception:
         log.exception("a batch of %d streams failed: they join again", len(batch))
         server.failed(batch)

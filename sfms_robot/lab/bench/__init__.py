@@ -81,7 +81,11 @@ BENCHES: Final[Mapping[str, Bench]] = {
     ),
     "serve": Bench(
         "serve_bench:measure", "heads that one server answers in time, beside one head at a time", in_all=False,
-        takes=("say",),
+        takes=("say", "device"),
+    ),
+    "train": Bench(
+        "train_bench:measure", "what is not the model in a step of training, beside the step; exit code 1 where "
+        "that is more than 15 % (arig)", in_all=False, takes=("say",),
     ),
     "campaign": Bench(
         "campaign:measure", "every fault on every family of servos; exit code 1 where one is not survived",

@@ -7,6 +7,9 @@ of it (`bench live` and a run's report have that). The processes are those of `s
 machine too.
 
 The peer is the same listener serving one head at a time on one core, as a server without batches would.
+
+`--device cuda`: p99 and frames a second at 64, 256 and 1,024 heads, and what one batch of all of them takes, without
+the messages: in its networks, and in Python beside them.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.lab.bench.listener_bench import NAMES, with_weights
 from sfms_robot.lab.bench.measure import BenchResult, machine
+from sfms_robot.listeners.engine import Device
+from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.listeners.remote_messages import (
     Join,
     Notice,
@@ -46,12 +51,16 @@ _SPEAKER: Final = "katie"
 _WARM_S: Final = 1.0
 _SECONDS: Final = 4.0
 _MOST: Final = 512
+GPU_HEADS: Final = (64, 256, 1024)
+GPU_NAMES: Final = ("arig-small", "sfms-small")
 _NOT_KEPT_UP_MS: Final = 10_000.0  # stands for a server that skipped frames
 _ANSWER_S: Final = 30.0
 
 
-def measure(say: Callable[[str], None]) -> BenchResult:
+def measure(say: Callable[[str], None], device: Device = "cpu") -> BenchResult:
     """Measure every listener. Blocks for some minutes."""
+    if device != "cpu":
+        return on_gpu(say, device)
     figures = {name: _served(name, say) for name in NAMES}
     table = [
         {
@@ -64,6 +73,60 @@ def measure(say: Callable[[str], None]) -> BenchResult:
     ]  # fmt: skip
     figures = {f"serve.{name}": each for name, each in figures.items()}
     return BenchResult(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms, p99, a process for each of {machine()}"])
+
+
+def on_gpu(
+    say: Callable[[str], None],
+    device: Device,
+    names: Sequence[str] = GPU_NAMES,
+    heads: Sequence[int] = GPU_HEADS,
+    processes: int | None = None,
+) -> BenchResult:
+    """Measure listeners at fixed numbers of heads. Raises ConfigError where there is no GPU."""
+    table, messages, where = list[dict[str, Any]](), _frames(), machine()
+    for name in names:
+        listener = load_listener(name, threads=1, device=device)
+        where = f"{engine_name(listener)}, {machine()}"
+        batches = {count: batch_ms(listener, count) for count in heads}
+        load = _Load()
+        served = Served(listener=name, name="bench", all_heads=True, device=device)
+        with closing(WorkerPool(served, load.sent, processes)) as pool:
+            for count in heads:
+                point = {"listener": name, "hop": pool.hop, "processes": len(pool.capacities)}
+                point |= _loaded(pool, load, messages, count) | batches[count]
+                table.append(point)
+                say(
+                    f"{name}: {count} heads, p99 {point['p99_ms']:.0f} ms, {point['frames_a_second']:.1f} frames/s each"
+                )
+    figures = {f"serve.{each['listener']}.{each['heads']}": each | {"machine": where} for each in table}
+    return BenchResult(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms is in time; on {where}"])
+
+
+def batch_ms(listener: Any, heads: int, frames: int = 8) -> dict[str, float]:
+    """Return what a batch of one frame of `heads` heads takes, on average over plans: in its networks, and in all."""
+    engine, spent_s = listener.engine, list[float]()
+    run = engine.run
+
+    def timed(network: str, *inputs: Any) -> Any:
+        began_s = time.perf_counter()
+        found = run(network, *inputs)
+        spent_s.append(time.perf_counter() - began_s)
+        return found
+
+    memories = [listener.start(seed) for seed in range(heads)]
+    voices = np.random.default_rng(0).normal(0, 0.1, (heads, FRAME_SAMPLES)).astype(np.float32)
+    engine.run = timed
+    try:
+        for index in range(2 * frames):  # half of them warm up
+            if index == frames:
+                spent_s.clear()
+                began_s = time.perf_counter()
+            speakers = [SpeakerFrame((index + 1) * FRAME_S, voice) for voice in voices]
+            memories = [memory for _, memory in listener.step_each(speakers, memories)]
+        whole_s = time.perf_counter() - began_s
+    finally:
+        engine.run = run
+    return {"batch_ms": round(whole_s / frames * 1e3, 2), "networks_ms": round(sum(spent_s) / frames * 1e3, 2)}
 
 
 def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
@@ -144,6 +207,7 @@ def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int
             if ahead_s > 0:
                 time.sleep(ahead_s)
             pool.receive(stream, _numbered(messages[(number + shifts[index]) % len(messages)], number))
+    sent_s = time.monotonic() - began_s
     now = pool.statistics()
     spent = {name: now[name] - before[name] for name in ("steps", "batches", "cpu_s")}
     for stream in streams:
@@ -156,6 +220,7 @@ def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int
         "heads": heads,
         "p50_ms": round(float(p50), 1),
         "p99_ms": round(float(p99), 1),
+        "frames_a_second": round(frames / sent_s, 2),
         "batch_size": round(spent["steps"] / max(spent["batches"], 1), 1),
         "cpu_ms_per_head_and_second": round(spent["cpu_s"] / heads / (_WARM_S + _SECONDS) * 1e3, 2),
     }

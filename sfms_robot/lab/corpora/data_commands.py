@@ -32,7 +32,9 @@ def _scanned(layout: Layout, place: Path, split: str, order: Order | None) -> Da
         return formats.scan_split(layout, place, split, order)
 
 
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False) -> dict[str, Any]:
+def compose_dyads(
+    data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False, jobs: int = 1
+) -> dict[str, Any]:
     """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
@@ -42,7 +44,7 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: b
             moved(done, wanted, f"{name}, {done:.0f} of {wanted:.0f} minutes")
 
         moved(0, 0, "reading")
-        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite))
+        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite, jobs=jobs))
 
 
 # --- `data check` ---------------------------------------------------------------------------------------------------

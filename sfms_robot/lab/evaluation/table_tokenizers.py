@@ -95,7 +95,7 @@ class Stack(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
+        x = x + sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.norm(x)

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from sfms_robot import config
@@ -91,7 +93,8 @@ class Corpus(Generic[Frames]):
 
     def cut(self, starts: Tensor, window: int) -> Frames:
         """Return the windows (B, window, ...) at (B,) starts, on the device of the starts."""
-        return _each(self.frames, lambda part: windows(part, starts.to(part.device), window).to(starts.device))
+        at, to_gpu = starts.device, starts.is_cuda
+        return _each(self.frames, lambda part: windows(part, starts, window).to(at, non_blocking=to_gpu))
 
     def to(self, device: torch.device) -> Corpus[Frames]:
         """Return the same frames on another device; staged ones stay on disk."""
@@ -168,6 +171,7 @@ def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
 
 def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
     """Cut values (N, ...) at (B,) starts into (B, length, ...)."""
+    starts = starts.to(values.device, non_blocking=values.is_cuda)
     return values[starts[:, None] + torch.arange(length, device=starts.device)]
 
 
@@ -308,11 +312,71 @@ def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
 
 
 @contextmanager
-def _writing(file: Path) -> Iterator[None]:
+def _writing(file: Path, option: str = "--scratch") -> Iterator[None]:
     try:
         yield
-    except OSError as error:
-        raise ConfigError(f"--scratch: {file} cannot be written: {error.strerror or error}") from error
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"{option}: {file} cannot be written: {getattr(error, 'strerror', None) or error}") from error
+
+
+# --- Packs: all that a trainer reads of its data, in one file --------------------------------------------------------
+#
+# A safetensors file of tensors SPLIT.FIELD; its metadata have the version, what it was made for, and of each split the
+# lengths and scenes of its dyads, as JSON.
+
+PACK_VERSION: Final = 1
+_MADE_FOR: Final = ("kind", "motion_space", "neutral", "metres_per_unit", "sound", "audio", "phase", "events", "sway")
+
+
+def _made_for(listener: config.Sfms | config.Arig, window: int) -> dict[str, Any]:
+    """Return the settings that frames depend on, as plain data."""
+    known = listener.model_dump(mode="json")
+    return {**{name: known.get(name) for name in _MADE_FOR}, "window": window}
+
+
+def write_pack(
+    file: Path, corpora: Mapping[str, Corpus[Any]], listener: config.Sfms | config.Arig, window: int
+) -> None:
+    """Write corpora by split to a file, in one move. Raises ConfigError."""
+    tensors = {
+        f"{split}.{name}": tensor.contiguous()
+        for split, corpus in corpora.items()
+        for name, tensor in vars(corpus.frames).items()
+    }
+    about = {"version": PACK_VERSION, "made for": _made_for(listener, window)}
+    about |= {split: [corpus.lengths, corpus.scenes] for split, corpus in corpora.items()}
+    part = file.with_suffix(".part")
+    with _writing(file, "--out"):
+        save_file(tensors, part, {"pack": json.dumps(about)})
+        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
+        part.replace(file)
+
+
+def packed(
+    data: Path,
+    split: str,
+    frames: type[Frames],
+    listener: config.Sfms | config.Arig,
+    window: int,
+    otherwise: Callable[[], Corpus[Frames]],
+) -> Corpus[Frames]:
+    """Return a split of the pack `data`; where that is a folder, what `otherwise` reads. Raises ConfigError."""
+    if not data.is_file():
+        return otherwise()
+    again = "pack again: sfms-robot train pack"
+    try:
+        with safe_open(data, framework="pt") as opened:
+            about = json.loads((opened.metadata() or {})["pack"])
+            if about["version"] != PACK_VERSION:
+                raise ConfigError(f"{data}: version: expected {PACK_VERSION}, got {about['version']}; {again}")
+            for key, ours in _made_for(listener, window).items():
+                if (theirs := about["made for"].get(key)) != ours:
+                    raise ConfigError(f"{data}: {key}: expected {ours!r}, got {theirs!r}; {again}")
+            lengths, scenes = about[split]
+            named = {field.name: opened.get_tensor(f"{split}.{field.name}") for field in fields(frames)}
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{data}: not a pack of training data ({error}); {again}") from error
+    return Corpus(frames(**named), tuple(lengths), tuple(scenes))
 
 
 # --- Slow motion of a head -------------------------------------------------------------------------------------------

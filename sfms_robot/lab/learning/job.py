@@ -17,9 +17,10 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
     )
     outcome = fit(job, out, run)                           # the model now holds its best weights: save them
 
-Five duties make a resumed run bit-identical on a CPU:
- - `loss_of` draws every random number from the generator it is given (a CPU one: draw there, then move to the device)
-   or from torch's global one (dropout); never from numpy, the clock or another generator;
+Six duties make a resumed run bit-identical on a CPU:
+ - `loss_of` draws every random number from the generator it is given (a CPU one), from `noise_of` it, which on a GPU
+   draws there, or from torch's global one (dropout); never from numpy, the clock or another generator;
+ - on a GPU it makes the host wait for nothing: what is chosen is chosen on the CPU and sent, losses are read later;
  - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (`learning.process_group`), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
@@ -179,6 +180,27 @@ class Job:
         return next(self.model.parameters()).device
 
 
+class OwnNoise(torch.Generator):
+    """The generator of a GPU's own noise. Nothing of weight 0 is drawn from it.
+
+    From the run's generator, on a CPU, everything is drawn in one order whatever its weight: a run repeats bit for bit.
+    """
+
+
+def noise_of(generator: torch.Generator, device: torch.device) -> torch.Generator:
+    """Return what draws the noise of a step on `device`: a CPU's is the run's generator, a GPU's is seeded by it."""
+    if device.type == "cpu":
+        return generator
+    own = OwnNoise(device)
+    own.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+    return own
+
+
+def is_drawn(generator: torch.Generator, *weights: float) -> bool:
+    """Return whether noise of these weights is drawn from a generator."""
+    return any(weights) or not isinstance(generator, OwnNoise)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Position:
     """Where a run stands after `step` steps. `loss` is smoothed; `worse` counts looks since the best held-out loss."""
@@ -225,6 +247,8 @@ class Run:
             The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
             resumed with any number of processes that can share its pieces.
         scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
+        read_every: steps whose losses are read and reported together; None: one, and `READ_EVERY` on a GPU, where
+            reading makes the host wait.
     """
 
     resume: bool = False
@@ -233,6 +257,7 @@ class Run:
     group: ProcessGroup = ProcessGroup()
     accumulate: int | None = None
     scratch: Path | None = None
+    read_every: int | None = None
 
     def staging(self, name: str) -> Scratch | None:
         """Return where frames of this name are staged, if they are."""

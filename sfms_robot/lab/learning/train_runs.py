@@ -25,8 +25,9 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.rollout import offline_rollout
+from sfms_robot.lab.learning.arig.trainer import corpora as arig_corpora
 from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.corpus import without_gaze
+from sfms_robot.lab.learning.corpus import Corpus, without_gaze, write_pack
 from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
@@ -82,6 +83,9 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
 def train_listener(options: TrainOptions) -> dict[str, Any]:
     """Train SFMS: phase 2, on the tokenizer in `options.out`; or all of ARIG. Returns its figures and minutes."""
     settings, began_s = train_settings(options, "predictor"), time.monotonic()
+    if isinstance(settings, config.Training) and options.data.is_file() and settings.predictor.calibration_rounds:
+        told = "a pack holds no dyads for the roll-outs of predictor.calibration_rounds"
+        raise ConfigError(f"{options.data}: {told}: expected 0 of them, or the folder as --data")
     arig = isinstance(settings, config.ArigTraining)
     if arig and options.order is not None:
         raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
@@ -93,9 +97,22 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
             figures = listener.train_listener(settings, options.data, options.out, run, options.order)
     if not run.group.first:
         return {}
-    if isinstance(settings, config.Training):
+    if isinstance(settings, config.Training) and not options.data.is_file():
         calibrate(settings, options.data, options.out, options.order)
     return {**figures, "minutes": _minutes(began_s)}
+
+
+def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> dict[str, Any]:
+    """Write all that the training of a file reads of its data to `out`. Returns dyads, frames and bytes."""
+    settings = load_training(file)
+    if isinstance(settings, config.ArigTraining):
+        window = settings.training.window_frames
+        found: Mapping[str, Corpus[Any]] = arig_corpora(settings, data, Run())
+    else:
+        window, found = settings.listener.window_frames, listener.corpora(settings, data, Run(), order)
+    write_pack(out, found, settings.listener, window)
+    counts = {split: {"dyads": len(one.lengths), "frames": sum(one.lengths)} for split, one in found.items()}
+    return {"out": str(out), **counts, "bytes": out.stat().st_size}
 
 
 def _minutes(began_s: float) -> float:

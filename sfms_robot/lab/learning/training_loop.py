@@ -32,13 +32,16 @@ from sfms_robot.errors import ConfigError, GroupError, ModelError
 from sfms_robot.lab.learning.job import Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
+READ_EVERY = 10  # steps of a GPU whose losses are read together: reading one makes the host wait for it
 
 log = logging.getLogger(__name__)
 
 
 def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
-    """Return AdamW with the paper's betas (V-A)."""
-    return torch.optim.AdamW(parameters, lr=rate, betas=(0.9, 0.98), weight_decay=decay)
+    """Return AdamW with the paper's betas (V-A), in one kernel on a GPU."""
+    learned = list(parameters)
+    fused = bool(learned) and learned[0].is_cuda or None
+    return torch.optim.AdamW(learned, lr=rate, betas=(0.9, 0.98), weight_decay=decay, fused=fused)
 
 
 def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> TrainingOutcome:  # noqa: B008
@@ -47,7 +50,9 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
     only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
     the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
-    checkpoint stays. `clock` (s) decides when to write checkpoints and how fast frames go, and no weights.
+    checkpoint stays; and, with a checkpoint of the steps made so far, where a GPU has too little memory. On a GPU
+    losses are read, and reports made, every `READ_EVERY` steps. `clock` (s) decides when to write
+    checkpoints and how fast frames go, and no weights.
 
     Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
     it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
@@ -67,33 +72,37 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     began_at = position.step
     saved_s = began_s = clock()
     job.model.train()
-    gradients = Gradients(job, group, pieces, file)
+    gradients = Gradients(job, group, pieces, file, run.read_every)
+    every = phase.evaluate_every if job.held_out else 0
+    made: list[tuple[Tensor, float]] = []  # of steps that are not read yet: loss and norm, learning rate
     with _interruptions(patient=group.size > 1) as pressed:
         while not position.finished:
-            rate = _set_rates(job, base, position.step)
-            loss, norm, interrupted = make_step(gradients, position.step, generator, pressed())
-            smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
-            position = replace(position, step=position.step + 1, loss=smooth)
-            every = phase.evaluate_every if job.held_out else 0
-            looked = every > 0 and (position.step % every == 0 or position.step == phase.steps)
-            if looked:
-                position = _compared(position, group.from_first(partial(_held_out, job)))
-                best = weights_of(job) if position.worse == 0 else best
-            impatient = phase.patience is not None and position.worse >= phase.patience
-            position = replace(position, finished=impatient or position.step >= phase.steps)
-            now_s = clock()
-            report = Report(
-                name=job.name,
-                steps=phase.steps,
-                position=position,
-                loss=loss,
-                gradient_norm=norm,
-                learning_rate=rate,
-                frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
-                looked=looked,
-            )
-            for watch in run.watches:
-                watch(report)
+            step = position.step + len(made)
+            rate = _set_rates(job, base, step)
+            with _enough_memory(gradients, partial(_saved_at, job, position, made, generator, best), step):
+                made.append((make_step(gradients, step, generator), rate))
+            looked = every > 0 and ((step + 1) % every == 0 or step + 1 == phase.steps)
+            stops = looked or step + 1 == phase.steps or (step + 1) % phase.checkpoint_every == 0
+            if not stops and len(made) < gradients.read_every and not (group.size == 1 and pressed()):
+                continue
+            found, interrupted = gradients.read([each for each, _ in made], position.step, pressed())
+            for (loss, norm), (_, rate) in zip(found, made, strict=True):
+                position = _moved(position, loss)
+                is_last = position.step == step + 1
+                if is_last and looked:
+                    position = _compared(position, group.from_first(partial(_held_out, job)))
+                    best = weights_of(job) if position.worse == 0 else best
+                impatient = phase.patience is not None and position.worse >= phase.patience
+                position = replace(position, finished=impatient or position.step >= phase.steps)
+                now_s = clock()
+                report = Report(
+                    name=job.name, steps=phase.steps, position=position, loss=loss, gradient_norm=norm,
+                    learning_rate=rate, looked=is_last and looked,
+                    frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
+                )  # fmt: skip
+                for watch in run.watches:
+                    watch(report)
+            made.clear()
             interrupted |= group.size == 1 and pressed()
             due = position.step % phase.checkpoint_every == 0 or now_s - saved_s >= 60 * phase.checkpoint_minutes
             if group.first and (interrupted or position.finished or due):
@@ -102,6 +111,11 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
             if interrupted:
                 at = f"{job.name}: interrupted after step {position.step} of {phase.steps}, saved in {file}"
                 raise KeyboardInterrupt(f"{at}; the same command with --resume continues")
+    return _ended(job, position, best, began_at if run.resume else None)
+
+
+def _ended(job: Job, position: Position, best: Weights | None, resumed_at: int | None) -> TrainingOutcome:
+    """Put the best weights into the model, and return the outcome."""
     if best is not None:
         job.model.load_state_dict(best)
     return TrainingOutcome(
@@ -109,8 +123,8 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
         held_out=position.best,
         steps=position.step,
         best_step=position.step if best is None else position.best_step,
-        stopped="steps" if position.step == phase.steps else "patience",
-        resumed_at=began_at if run.resume else None,
+        stopped="steps" if position.step == job.phase.steps else "patience",
+        resumed_at=resumed_at,
     )
 
 
@@ -138,27 +152,58 @@ def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
     return base[0][0] * share
 
 
-def make_step(
-    gradients: Gradients, step: int, generator: torch.Generator, pressed: bool = False
-) -> tuple[float, float, bool]:
-    """Update the weights once; return loss, largest gradient norm, and whether Ctrl-C was pressed in any process.
+def make_step(gradients: Gradients, step: int, generator: torch.Generator) -> Tensor:
+    """Update the weights once; return loss and largest gradient norm (2,) of this process, on the device.
 
-    Raises ModelError when loss or norm is not finite, and nothing is updated then; GroupError.
+    Raises ModelError when loss or norm of a CPU is not finite, and nothing is updated then; GroupError.
     """
-    job, file = gradients.job, gradients.file
+    job = gradients.job
     for one in job.optimizers:
         one.zero_grad(set_to_none=True)
-    try:
-        value, asked = gradients.group.mean([gradients.of(step, generator), float(pressed)])
-    except GroupError as error:
-        raise GroupError(f"{job.name}: {error}; at step {step} ({_kept(file)}; --resume continues)") from error
-    norm = max(_clip(one, job.phase.clip_norm) for one in job.optimizers)
-    if not math.isfinite(value) or not math.isfinite(norm):
-        broken = f"loss {value:g}, gradient norm {norm:g} at step {step}: not finite"
-        raise ModelError(f"{job.name}: {broken} ({_kept(file)})")
+    with gradients.talking(step):
+        loss = gradients.of(step, generator)
+    norms = [_clip(one, job.phase.clip_norm) for one in job.optimizers]
+    made = torch.stack([loss, torch.stack(norms).max().to(loss)])
+    if gradients.read_every == 1:
+        gradients.check(made.tolist(), step)
     for one in job.optimizers:
         one.step()
-    return value, norm, asked > 0
+    return made
+
+
+def _moved(position: Position, loss: float) -> Position:
+    """Return the position one step on, with the smoothed loss."""
+    smooth = loss if position.loss is None else SMOOTHING * position.loss + (1 - SMOOTHING) * loss
+    return replace(position, step=position.step + 1, loss=smooth)
+
+
+@contextmanager
+def _enough_memory(gradients: Gradients, save: Callable[[Path], None], step: int) -> Iterator[None]:
+    """Run a step; where the GPU has too little memory, keep the steps before it and raise ModelError."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        job, file = gradients.job, gradients.file
+        for one in job.optimizers:
+            one.zero_grad(set_to_none=True)
+        if step and gradients.group.first:
+            save(file)
+        few = f"too little memory on the GPU for a batch of {job.phase.batch} at step {step}"
+        raise ModelError(f"{job.name}: {few}: begin with --accumulate 2 or more ({_kept(file)})") from error
+
+
+def _saved_at(
+    job: Job,
+    position: Position,
+    made: Sequence[tuple[Tensor, float]],
+    generator: torch.Generator,
+    best: Weights | None,
+    file: Path,
+) -> None:
+    """Write a checkpoint of the steps made so far, read or not."""
+    for values, _ in made:
+        position = _moved(position, values.tolist()[0])
+    save_checkpoint(file, job, position, generator, best)
 
 
 def _kept(file: Path) -> str:
@@ -166,9 +211,9 @@ def _kept(file: Path) -> str:
     return f"{file} holds step {left[0].step}" if left else "there is no checkpoint yet"
 
 
-def _clip(one: torch.optim.Optimizer, norm: float) -> float:
+def _clip(one: torch.optim.Optimizer, norm: float) -> Tensor:
     parameters = [p for group in one.param_groups for p in group["params"] if p.grad is not None]
-    return float(nn.utils.clip_grad_norm_(parameters, norm)) if parameters else 0.0
+    return nn.utils.clip_grad_norm_(parameters, norm) if parameters else one.param_groups[0]["params"][0].new_zeros(())
 
 
 def _held_out(job: Job) -> float:
@@ -242,9 +287,10 @@ def pieces_of(job: Job, run: Run, file: Path) -> int:
 class Gradients:
     """Gradients of a job's parameters, filled step by step; the same in all processes of the group."""
 
-    def __init__(self, job: Job, group: ProcessGroup, pieces: int, file: Path) -> None:
+    def __init__(self, job: Job, group: ProcessGroup, pieces: int, file: Path, read_every: int | None = None) -> None:
         self.job, self.group, self.file = job, group, file
         self._pieces, self._samples = pieces, job.phase.batch // pieces
+        self.read_every = read_every or (1 if job.device.type == "cpu" else READ_EVERY)
         self._half = job.phase.precision == "bf16" and multiplies_bf16(job.device)
         loss: nn.Module = _Loss(job.model, job.loss_of)
         if group.size > 1:  # not every part of a model learns in every phase and step
@@ -252,12 +298,12 @@ class Gradients:
                 loss = DistributedDataParallel(loss, find_unused_parameters=True)
         self._loss = loss
 
-    def of(self, step: int, generator: torch.Generator) -> float:
+    def of(self, step: int, generator: torch.Generator) -> Tensor:
         """Return the loss of this process' pieces; set the gradients of all processes. Raises GroupError."""
         if self._pieces == 1:
             return self._piece(step, generator, 1)
         mine = range(self.group.rank, self._pieces, self.group.size)
-        total = 0.0
+        total = torch.zeros((), dtype=torch.float64, device=self.job.device)
         for piece in mine:
             seed = _seed(self.job.seed, step, piece)
             torch.manual_seed(seed)  # of dropout
@@ -266,12 +312,40 @@ class Gradients:
                 total += self._piece(step, torch.Generator().manual_seed(seed), len(mine))
         return total
 
-    def _piece(self, step: int, generator: torch.Generator, share: int) -> float:
+    @contextmanager
+    def talking(self, step: int) -> Iterator[None]:
+        """Run a part of a step that talks to the other processes. Raises GroupError, which names job and checkpoint."""
+        try:
+            yield
+        except GroupError as error:
+            where = f"at step {step} ({_kept(self.file)}; --resume continues)"
+            raise GroupError(f"{self.job.name}: {error}; {where}") from error
+
+    def read(self, made: Sequence[Tensor], first: int, pressed: bool) -> tuple[list[tuple[float, float]], bool]:
+        """Return losses and norms of steps from `first` on, and whether Ctrl-C was pressed in any process.
+
+        Waits for the device. Raises ModelError for one that is not finite, GroupError.
+        """
+        losses, norms = torch.stack(list(made), dim=1).tolist()
+        with self.talking(first + len(made) - 1):
+            *losses, asked = self.group.mean([*losses, float(pressed)])
+        found = list(zip(losses, norms, strict=True))
+        for step, each in enumerate(found, first):
+            self.check(each, step)
+        return found, asked > 0
+
+    def check(self, made: Sequence[float], step: int) -> None:
+        """Raise ModelError where loss or norm of a step is not finite."""
+        if not all(map(math.isfinite, made)):
+            broken = f"loss {made[0]:g}, gradient norm {made[1]:g} at step {step}: not finite"
+            raise ModelError(f"{self.job.name}: {broken} ({_kept(self.file)})")
+
+    def _piece(self, step: int, generator: torch.Generator, share: int) -> Tensor:
         with torch.autocast(self.job.device.type, torch.bfloat16, enabled=self._half):
             loss: Tensor = self._loss(step, generator, self._samples)
         with self.group.talking():
             (loss / share).backward()  # type: ignore[no-untyped-call]
-        return loss.item() / share
+        return loss.detach().double() / share
 
 
 class _Loss(nn.Module):

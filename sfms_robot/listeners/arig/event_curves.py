@@ -25,7 +25,7 @@ from sfms_robot.signals.control import COLUMNS, KINDS, SWINGING
 
 _OVER: Final = tuple(step / 8 for step in range(9))
 _SINCE: Final = (0.0, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0, 4.0)  # on the axis of the control row: 0 to 10 s
-_AT: Final = {name: at for at, name in enumerate(COLUMNS)}
+_EACH: Final = COLUMNS.index(f"{KINDS[1]}.active")  # numbers of a kind: active, since, over, size
 FEATURES: Final = 1 + len(KINDS) * (len(_OVER) + len(_SINCE)) + 8 * len(SWINGING)
 RIDGE: Final = 1.0  # frames of weight that pull towards no motion
 LEAST: Final = 1e-3  # share of an event that is left in any frame of it
@@ -42,20 +42,39 @@ MOVES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 
-def features(row: Tensor) -> Tensor:
-    """Return features (..., FEATURES) of control rows (..., K); the first of them is 1."""
+def knots() -> Tensor:
+    """Return the knots (S,) of all curves, as `features` takes them."""
+    return torch.tensor([*_OVER, *_SINCE])
+
+
+def features(row: Tensor, at: Tensor | None = None) -> Tensor:
+    """Return features (..., FEATURES) of control rows (..., K); the first of them is 1.
+
+    `at`: `knots` on the device of the rows, from a caller that must not make any: a step of a stream on a GPU.
+    """
+    at = knots().to(row) if at is None else at
+    active, since, over, size = _of_kinds(row)  # (..., KINDS, 1)
+    size = active * size  # 0 while no such event is under way: then the kind has no features
+    curves = torch.cat([size * _hats(over, at[: len(_OVER)]), size * _hats(since, at[len(_OVER) :])], dim=-1)
+    swings = [KINDS.index(kind) for kind in SWINGING]
+    sine, cosine = torch.unflatten(row[..., _EACH * len(KINDS) :], -1, (len(SWINGING), 2)).chunk(2, dim=-1)
+    # sin a, cos a, sin 2a = 2 sin a cos a, cos 2a = cos^2 a - sin^2 a
+    waves = torch.cat([sine, cosine, 2 * sine * cosine, cosine.square() - sine.square()], dim=-1)
     found = [torch.ones_like(row[..., :1])]
-    for kind in KINDS:
-        # 0 while no such event is under way: then the kind has no features.
-        size = (row[..., _AT[f"{kind}.active"]] * row[..., _AT[f"{kind}.size"]])[..., None]
-        over, since = (row[..., _AT[f"{kind}.{name}"], None] for name in ("over", "since"))
-        found += [size * _hats(over, _OVER), size * _hats(since, _SINCE)]
-        if kind in SWINGING:
-            sine, cosine = (row[..., _AT[f"{kind}.{name}"], None] for name in ("sine", "cosine"))
-            # sin a, cos a, sin 2a = 2 sin a cos a, cos 2a = cos^2 a - sin^2 a
-            waves = torch.cat([sine, cosine, 2 * sine * cosine, cosine.square() - sine.square()], dim=-1)
-            found += [size * waves, size * over * waves]
+    for kind in range(len(KINDS)):
+        found.append(curves[..., kind, :])
+        if kind in swings:
+            wave, of = waves[..., swings.index(kind), :], size[..., kind, :]
+            found += [of * wave, of * over[..., kind, :] * wave]
     return torch.cat(found, dim=-1)
+
+
+def _of_kinds(row: Tensor) -> tuple[Tensor, ...]:
+    """Return active, since, over and size (..., KINDS, 1) of control rows (..., K): views, no index is made."""
+    found: tuple[Tensor, ...] = torch.unflatten(row[..., : _EACH * len(KINDS)], -1, (len(KINDS), _EACH)).chunk(
+        4, dim=-1
+    )
+    return found
 
 
 def moves(channels: Sequence[str]) -> Tensor:
@@ -65,8 +84,7 @@ def moves(channels: Sequence[str]) -> Tensor:
 
 def moved_channels(row: Tensor, moves: Tensor) -> Tensor:
     """Return (..., C) bool: the channels that an event of the control row (..., K) moves; `moves` (KINDS, C)."""
-    active = row[..., [_AT[f"{kind}.active"] for kind in KINDS]] > 0
-    return (active[..., None] & moves).any(-2)
+    return ((_of_kinds(row)[0] > 0) & moves).any(-2)
 
 
 def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
@@ -75,19 +93,18 @@ def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
     1 where no event moves a channel. While one does, left(t) / left(t - 1), where left is the share of the event still
     to come: the drift of a Brownian bridge, which brings any deviation to 0 by the end, however long the event is.
     """
-    active, over = ([_AT[f"{kind}.{name}"] for kind in KINDS] for name in ("active", "over"))
+    active, _, over, _ = _of_kinds(now)  # (..., KINDS, 1)
+    was_active, _, was_over, _ = _of_kinds(before)
     # left: share of the event still to come, at this row; 0 in the first row behind it.
-    left = 1 - now[..., over] * now[..., active]
-    left = torch.where((before[..., active] > 0) & (now[..., active] == 0), 0.0, left)
-    was = (1 - before[..., over] * before[..., active]).clamp(min=LEAST)
+    left = torch.where((was_active > 0) & (active == 0), 0.0, 1 - over * active)
+    was = (1 - was_over * was_active).clamp(min=LEAST)
     # Events that overlap each take back what they move: their shares multiply.
-    share: Tensor = torch.where(moves, (left / was).clamp(0, 1)[..., None], 1.0).prod(dim=-2)
+    share: Tensor = torch.where(moves, (left / was).clamp(0, 1), 1.0).prod(dim=-2)
     return share
 
 
-def _hats(x: Tensor, knots: tuple[float, ...]) -> Tensor:
-    """Return (..., knots) of x (..., 1) within the knots: 1 at its own knot, 0 at the next ones, linear in between."""
-    at = torch.tensor(knots, dtype=x.dtype, device=x.device)
+def _hats(x: Tensor, at: Tensor) -> Tensor:
+    """Return (..., S) of x (..., 1) within the knots `at`: 1 at its own knot, 0 at the next ones, linear in between."""
     # A hat is the lower of two lines, rising to its knot and falling from it.
     gap = at.diff()
     below, above = (x - at[:-1]) / gap, (at[1:] - x) / gap

@@ -167,6 +167,7 @@ class ArigModel(nn.Module):
             if self.is_told:
                 self.told = nn.Buffer(torch.zeros(event_curves.FEATURES, c))
                 self.moves = nn.Buffer(event_curves.moves(settings.channels), persistent=False)
+                self.knots = nn.Buffer(event_curves.knots(), persistent=False)
                 self.rest_range = nn.Buffer(torch.full((c,), UNBOUNDED))
         drawn = [name in settings.drawn_channels for name in settings.channels]
         self.is_drawn = nn.Buffer(torch.tensor(drawn), persistent=False)
@@ -202,9 +203,13 @@ class ArigModel(nn.Module):
         if not self.is_told or rows is None:
             return self.rho * last  # ours, because errors are forgotten at the rate of the data
         before, now = rows.chunk(2, dim=-1)
-        off = last - event_curves.features(before) @ self.told  # x_(t-1) - b_(t-1)
+        off = last - self._course(before)  # x_(t-1) - b_(t-1)
         # b_t + rho f_t (x_(t-1) - b_(t-1))
-        return event_curves.features(now) @ self.told + self.rho * event_curves.remains(before, now, self.moves) * off
+        return self._course(now) + self.rho * event_curves.remains(before, now, self.moves) * off
+
+    def _course(self, row: Tensor) -> Tensor:
+        """Return b (..., C), the motion expected of the events of control rows (..., K)."""
+        return event_curves.features(row, self.knots) @ self.told
 
     def moved(self, motion: Tensor, last: Tensor, rows: Tensor | None = None) -> Tensor:
         """Return the draw (..., C) that leads to motion (..., C) after `last` (..., C), both standardised.
@@ -243,7 +248,7 @@ class ArigModel(nn.Module):
         There |x - b| <= max(rest_range, |begins - b|): a draw may not lead further from the expected motion b than
         faces at rest are, and what already is further away comes back at least as fast as without a draw.
         """
-        course = event_curves.features(row) @ self.told  # b_t
+        course = self._course(row)  # b_t
         free = speaks[..., None] | event_curves.moved_channels(row, self.moves)
         most = torch.where(free, UNBOUNDED, torch.maximum(self.rest_range, (begins - course).abs()))
         return course + torch.minimum(torch.maximum(made - course, -most), most)

@@ -12,7 +12,9 @@ N samples, c frames of a chunk, D width, h heads; B batch, T frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -201,6 +203,13 @@ class ContextLayer(nn.Module):
         return out
 
 
+@lru_cache(maxsize=16)
+@torch.inference_mode(False)  # the cached tensor serves training as well
+def _turned(frames: int, chunk: int, width: int, device: torch.device) -> Tensor:
+    """Return the rotary places (2, frames, width) of the chunk of every frame."""
+    return torch.from_numpy(rotary(np.arange(frames) // chunk, width)).transpose(0, 1).to(device)
+
+
 class LongRange(nn.Module):
     """Causal decoder over the context cache of capacity w -> cis-token."""
 
@@ -227,8 +236,7 @@ class LongRange(nn.Module):
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
         behind = of[:, None] - of[whole]  # chunks from a kept summary to that of each frame, (T, S)
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
-        x, turned = summaries, torch.from_numpy(rotary(of.numpy(force=True), self.head_width))
-        turned = turned.transpose(0, 1).to(x.device)
+        x, turned = summaries, _turned(t, self.chunk, self.head_width, summaries.device)
         for layer in self._layers():
             own = layer.project(x, turned)
             x = layer(x, own, (own[1][:, :, whole], own[2][:, :, whole]), seen)

@@ -95,12 +95,13 @@ class Denoiser(nn.Module):
         Args:
             z: (N, D) conditions.
             motion: (N, C) standardised.
-            generator: draws levels and noise, on the CPU.
+            generator: draws levels and noise, on its own device; None: torch's own, there.
             weights: (C,) of the channels, which add up to 1. Ours: by number most channels are of the mouth.
         """
         n = len(motion)
-        t = torch.randint(0, self.settings.train_steps, (n,), generator=generator).to(motion.device)
-        noise = torch.randn(motion.shape, generator=generator).to(motion.device)
+        place = motion.device if generator is None else generator.device
+        t = torch.randint(0, self.settings.train_steps, (n,), generator=generator, device=place).to(motion.device)
+        noise = torch.randn(motion.shape, generator=generator, device=place).to(motion.device)
         alpha_bar = self.alpha_bar[t][:, None]
         # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise

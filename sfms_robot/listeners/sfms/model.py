@@ -93,7 +93,7 @@ class Inpainter(nn.Module):
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
             seen = around.seen
-        places = sinusoidal(mask.shape[1], self.width).to(codes)  # (T, W)
+        places = sinusoidal(mask.shape[1], self.width, codes.device).to(codes)  # (T, W)
         # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
@@ -251,7 +251,8 @@ class Rest(Network):
     def forward(self, still: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
         quantizer = self.model.tokenizer.quantizer
-        indices = torch.arange(max(self.codes))[:, None] % torch.tensor(self.codes)
+        place = still.device
+        indices = torch.arange(max(self.codes), device=place)[:, None] % torch.tensor(self.codes, device=place)
         return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codebook.codes(indices)[None])
 
 

@@ -64,7 +64,7 @@ class ScoreNetwork(nn.Module):
     def forward(self, seen: Tensor) -> Tensor:
         """Return logits (B, T, outputs) of (B, T, inputs): in the paper standardised motion, one output per group."""
         x = self.linear(self.conv(seen.transpose(1, 2)).transpose(1, 2))
-        x = x + sinusoidal(x.shape[1], self.width).to(x)
+        x = x + sinusoidal(x.shape[1], self.width, x.device).to(x)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.out(self.norm(x))
@@ -223,7 +223,7 @@ def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> T
             index = ((torch.arange(count) + 0.5) * t / count).long()
         else:
             index = torch.arange(count) * (t // count)
-        mask[:, index, group] = 1.0
+        mask[:, index.to(mask.device, non_blocking=True), group] = 1.0
     return mask
 
 

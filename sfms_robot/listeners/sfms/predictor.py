@@ -22,7 +22,6 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
 from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, sinusoidal
-from sfms_robot.listeners.sfms import draw
 from sfms_robot.listeners.sfms.draw import Context, LastKeyframes
 from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.signals.control import COLUMNS
@@ -33,9 +32,13 @@ KERNEL_ROWS = 5  # of the convolution over rows of sound
 
 
 def last_keyframes(tokens: Tensor) -> LastKeyframes[Tensor]:
-    """Return `draw.last_keyframes` of tokens (B, T, G), as tensors on their device."""
-    found = draw.last_keyframes(tokens.numpy(force=True))
-    return LastKeyframes(*(torch.from_numpy(part).to(tokens.device) for part in found))
+    """Return `draw.last_keyframes` of tokens (B, T, G), computed on their device."""
+    known = F.pad(tokens.clamp(min=0), (0, 0, 1, 0))  # a frame before all others, for those that have none yet
+    frame = torch.arange(known.shape[1], device=tokens.device)[:, None]
+    last = torch.where(known > 0, frame, 0).cummax(1).values
+    before = torch.cat([last[:, :1], last[:, :-1]], dim=1).gather(1, last)  # as of the frame before
+    at = torch.stack([last, before], dim=-1)[:, 1:]
+    return LastKeyframes(torch.stack([known.gather(1, one) for one in at.unbind(-1)], dim=-1), at - 1)
 
 
 # --- Speaker (IV-C1) --------------------------------------------------------------------------------------------------
@@ -97,7 +100,7 @@ class SpeakerEncoder(nn.Module):
         x = torch.where(c.face_known[..., None], self.face_in(c.face), self.no_face)
         voice = c.voice if self.phase_in is None else c.voice + self.phase_in(c.phase)
         y = torch.where(c.heard[..., None], voice, self.no_voice)
-        places = sinusoidal(x.shape[1], x.shape[2]).to(x)  # (P, W)
+        places = sinusoidal(x.shape[1], x.shape[2], x.device).to(x)  # (P, W)
         x, y = x + places, y + places
         for face_layer, voice_layer in zip(self.face, self.voice, strict=True):
             x, y = face_layer(x, y), voice_layer(y, x)
@@ -177,7 +180,7 @@ class Predictor(nn.Module):
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         if self.control_in is not None:
             x = x + self.control_in(control)
-        x = x + sinusoidal(x.shape[1], x.shape[2]).to(x)
+        x = x + sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
         for block in self.own:
             x = block(x)
         return x

@@ -33,6 +33,19 @@ def test_every_bench_is_a_function_that_takes_what_its_line_says(name):
     assert needed <= {"say"}, "a bench without options has to run"
 
 
+@pytest.mark.slow
+def test_a_training_step_is_timed_with_and_without_its_model():
+    found = importlib.import_module("sfms_robot.lab.bench.train_bench").measure(quiet, steps=2)
+    assert set(found.figures) == {"train.arig", "train.tokenizer", "train.listener"}
+    assert all(0 < each["ratio"] < 1 for each in found.figures.values())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here is a GPU")
+def test_serve_on_a_gpu_is_refused_without_one():
+    with pytest.raises(ConfigError, match="--device cuda: torch sees no CUDA device here"):
+        run_bench("serve", {"device": "cuda"}, quiet)
+
+
 def test_a_bench_that_is_none_is_told_those_that_are():
     with pytest.raises(ConfigError, match=r'there is no "bos" \(all, startup, bus, .*campaign'):
         run_bench("bos", {}, quiet)

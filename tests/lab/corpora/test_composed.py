@@ -463,3 +463,18 @@ def test_a_broken_motion_file_is_named(tmp_path):
     (tmp_path / "motions.npz").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="motions.npz: not a file of motion primitives"):
         read_motions(tmp_path / "motions.npz")
+
+
+@pytest.mark.slow
+def test_several_jobs_write_the_files_of_one(tables, tmp_path):
+    told = []
+    for jobs in (1, 2):
+        found = composed.compose_folder(
+            tables, tmp_path / str(jobs), 1, 2.0, lambda name, *minutes: told.append(name), jobs=jobs
+        )
+    assert found["train"] > 0 and "listening" in told
+    one, two = (
+        {file.relative_to(tmp_path / jobs): file.read_bytes() for file in (tmp_path / jobs).rglob("*.npz")}
+        for jobs in ("1", "2")
+    )
+    assert one == two and len(one) > 3

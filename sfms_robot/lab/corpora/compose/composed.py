@@ -22,8 +22,9 @@ the filmed recordings themselves (`speaking.py`). Each is a data set of its own 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final, Literal
 
@@ -51,6 +52,7 @@ from sfms_robot.lab.corpora.compose.voices import (
     split_voices,
 )
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
@@ -139,6 +141,7 @@ def compose_folder(
     minutes: float,
     told: Callable[[str, float, float], None] | None = None,
     overwrite: bool = False,
+    jobs: int = 1,
 ) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
@@ -147,28 +150,75 @@ def compose_folder(
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
     ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
     or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
-    dyad: the set, the minutes wanted of it, the minutes written. Returns the minutes written per split. Raises
+    dyad: the set, the minutes wanted of it, the minutes written. `jobs`: processes; each part, a split of a set, has
+    random numbers of its own, so the files are the same with any number. Returns the minutes written per split. Raises
     ConfigError.
     """
-    sets: dict[str, tuple[Path, float, Callable[..., Iterator[tuple[Split, Dyad]]]]] = {
-        "listening": (out, minutes, dyads),
-        "interaction": (out / "interaction", SHARES["interaction"] * minutes, partial(dyads, scene="interaction")),
-        "speaking": (out / "speaking", SHARES["speaking"] * minutes, monologues),
-    }
-    if not overwrite and (earlier := sorted(file for folder, _, _ in sets.values() for file in _composed(folder))):
+    folders = {"listening": out, **{name: out / name for name in SHARES}}
+    wanted = {name: SHARES.get(name, 1.0) * minutes for name in folders}
+    if not overwrite and (earlier := sorted(file for folder in folders.values() for file in _composed(folder))):
         raise ConfigError(
             f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
         )
+    parts = [(name, split) for name in folders for split in SPLITS]
+    found: dict[tuple[str, Split], list[tuple[Path, float]]] = {}
+    done = dict.fromkeys(folders, 0.0)
+    for part, file, minute in _written(data, folders, wanted, seed, parts, jobs):
+        found.setdefault(part, []).append((file, minute))
+        done[part[0]] += minute
+        if told:
+            told(part[0], wanted[part[0]] * (1 + 2 * HELD_OUT_SHARE), done[part[0]])
+    fresh = {file for files in found.values() for file, _ in files}
+    for stale in {file for folder in folders.values() for file in _composed(folder)} - fresh:
+        stale.unlink()
+    names = {(name, split): split if name == "listening" else f"{name}_{split}" for name, split in parts}
+    return {names[part]: sum(minute for _, minute in found.get(part, ())) for part in parts}
+
+
+Part = tuple[str, Split]  # a set and one of its splits
+
+
+def _written(
+    data: Path, folders: Mapping[str, Path], wanted: Mapping[str, float], seed: int, parts: Sequence[Part], jobs: int
+) -> Iterator[tuple[Part, Path, float]]:
+    """Yield each dyad once it is written: its part, file and minutes; with several jobs, part by part."""
+    if jobs == 1:
+        material = material_of(data)
+        for part in parts:
+            for file, minute in write_part(material, part, folders[part[0]], seed, wanted[part[0]]):
+                yield part, file, minute
+        return
+    with process_pool(min(jobs, len(parts))) as pool:
+        largest = sorted(parts, key=lambda part: (part[1] != "train", -wanted[part[0]]))
+        of = {pool.submit(_whole_part, data, part, folders[part[0]], seed, wanted[part[0]]): part for part in largest}
+        for ended in as_completed(of):
+            yield from ((of[ended], file, minute) for file, minute in ended.result())
+
+
+def _whole_part(data: Path, part: Part, folder: Path, seed: int, minutes: float) -> list[tuple[Path, float]]:
+    """Write a part, in a process of a pool."""
+    return [*write_part(material_of(data), part, folder, seed, minutes)]
+
+
+def write_part(
+    material: Mapping[Split, Material], part: Part, folder: Path, seed: int, minutes: float
+) -> Iterator[tuple[Path, float]]:
+    """Write the dyads of a part; yield the file and minutes of each."""
+    name, only = part
+    scene: Scene = "interaction" if name == "interaction" else "listening"
+    make = monologues if name == "speaking" else partial(dyads, scene=scene)
+    for split, dyad in make(material, seed, minutes, only=only):
+        save(folder / split, [dyad])
+        yield folder / split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
+
+
+@lru_cache(maxsize=1)
+def material_of(data: Path) -> dict[Split, Material]:
+    """Return the material in a folder, and the bundled, read once. Raises ConfigError."""
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
-    material = read_material(ami, [*bundled, *brought], data_dir("sim") / "listeners" / "motions.npz")
-    written: dict[str, float] = {}
-    for name, (folder, wanted, make) in sets.items():
-        each = partial(told, name, wanted * (1 + 2 * HELD_OUT_SHARE)) if told else None
-        found = _write(make(material, seed, wanted), folder, each)
-        written |= found if name == "listening" else {f"{name}_{split}": value for split, value in found.items()}
-    return written
+    return read_material(ami, [*bundled, *brought], data_dir("sim") / "listeners" / "motions.npz")
 
 
 def _composed(out: Path) -> set[Path]:
@@ -176,36 +226,35 @@ def _composed(out: Path) -> set[Path]:
     return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
 
 
-def _write(made: Iterator[tuple[Split, Dyad]], out: Path, each: Callable[[float], None] | None) -> dict[str, float]:
-    """Write a set and remove what an earlier one left; minutes per split."""
-    written, fresh = dict.fromkeys(SPLITS, 0.0), set()
-    for split, dyad in made:
-        save(out / split, [dyad])
-        fresh.add(out / split / f"{dyad.name}.npz")
-        written[split] += len(dyad.listener) * FRAME_S / 60
-        if each:
-            each(sum(written.values()))
-    for stale in _composed(out) - fresh:
-        stale.unlink()
-    return {str(split): value for split, value in written.items()}
-
-
 def dyads(
-    material: Mapping[Split, Material], seed: int, minutes: float, scene: Scene = "listening"
+    material: Mapping[Split, Material],
+    seed: int,
+    minutes: float,
+    scene: Scene = "listening",
+    only: Split | None = None,
 ) -> Iterator[tuple[Split, Dyad]]:
-    """Yield dyads one by one, as (split, dyad): for sets that need not fit in memory. Raises ConfigError."""
+    """Yield dyads one by one, as (split, dyad): for sets that need not fit in memory; `only` of one split.
+
+    Raises ConfigError.
+    """
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
     for number, split in enumerate(SPLITS):
+        if only not in (None, split):
+            continue
         rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
         wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
         for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
             yield split, compose_one(stretch, material[split], rng)
 
 
-def monologues(material: Mapping[Split, Material], seed: int, minutes: float) -> Iterator[tuple[Split, Dyad]]:
-    """Return dyads in which only the agent speaks; none for a split without filmed voices."""
+def monologues(
+    material: Mapping[Split, Material], seed: int, minutes: float, only: Split | None = None
+) -> Iterator[tuple[Split, Dyad]]:
+    """Yield dyads in which only the agent speaks; none for a split without filmed voices; `only` of one split."""
     for number, split in enumerate(SPLITS):
+        if only not in (None, split):
+            continue
         wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
         part = material[split]
         for dyad in speaking.dyads(part.voices, part.motions, part.dwell, [seed, number, 2], wanted):

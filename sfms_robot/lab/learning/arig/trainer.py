@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -18,8 +19,17 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, POSE_CHANNELS
-from sfms_robot.lab.learning.arig.features import SCENES, ArigCorpus, cut, fit_scales, gather, open_scenes
-from sfms_robot.lab.learning.job import Job, Run
+from sfms_robot.lab.learning.arig.features import (
+    SCENES,
+    ArigCorpus,
+    LabelledDyad,
+    cut,
+    fit_scales,
+    gather,
+    open_scenes,
+)
+from sfms_robot.lab.learning.corpus import packed
+from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
@@ -48,11 +58,7 @@ def train_arig(
     listener, phase = settings.listener, settings.training
     torch.manual_seed(settings.seed)
     student = Student(ArigModel(listener))
-    space = MotionSpace.of(listener)
-    corpus, held_out = (
-        gather(open_scenes(data, split), phase.window_frames, space, listener, run.staging(split))
-        for split in ("train", "validation")
-    )
+    corpus, held_out = corpora(settings, data, run).values()
     fit_scales(student.model, corpus, listener.channels)
     job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
@@ -65,6 +71,19 @@ def train_arig(
         "held_out_noise": float(parts.motion),
         "held_out_state": float(parts.state),
         "held_out_coarse": float(parts.coarse),
+    }
+
+
+def corpora(settings: config.ArigTraining, data: Path, run: Run) -> dict[str, ArigCorpus]:
+    """Return the frames of training and validation, from a folder or a pack."""
+    listener, window = settings.listener, settings.training.window_frames
+
+    def read(split: str) -> ArigCorpus:
+        return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run.staging(split))
+
+    return {
+        split: packed(data, split, LabelledDyad, listener, window, partial(read, split))
+        for split in ("train", "validation")
     }
 
 
@@ -83,9 +102,10 @@ def arig_job(
 
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
         chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
-        dyad = cut(corpus, chosen.to(device), phase.window_frames)
-        told, truth = augment(dyad, student.model, phase, generator)
-        return loss_parts(student, told, dyad.states, truth, phase, generator).total(phase)
+        dyad = cut(corpus, chosen.to(device, non_blocking=True), phase.window_frames)
+        noise = noise_of(generator, device)
+        told, truth = augment(dyad, student.model, phase, noise)
+        return loss_parts(student, told, dyad.states, truth, phase, noise).total(phase)
 
     return Job(
         name="arig",
@@ -223,17 +243,29 @@ def loss_parts(
         generator: Of noise levels and of the previous states.
     """
     model = student.model
-    weights = channel_weights(model.settings, phase.group_weights).to(truth.device) if phase.group_weights else None
+    weights = None
+    if phase.group_weights is not None:
+        weights = sent(channel_weights(model.settings, phase.group_weights), truth.device)
     found = model.condition(told, previous_states(states, phase.state_noise, generator, len(model.settings.states)))
     target = model.standardise(truth[:, 1:])
     to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
     motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), phase.draws, generator, weights).mean()
     coarse = weighted_mean((student.readout(found.outline) - target).square(), weights).mean()
-    known = states[:, 1:] >= 0
-    state = motion.new_zeros(())
-    if found.states is not None and bool(known.any()):
-        state = F.cross_entropy(found.states[known], states[:, 1:][known])
+    state = motion.new_zeros(()) if found.states is None else state_loss(found.states, states[:, 1:])
     return LossParts(motion, state, coarse)
+
+
+def state_loss(logits: Tensor, states: Tensor, selected: bool | None = None) -> Tensor:
+    """Return the cross-entropy of labelled frames, 0 without any; logits (B, T, S), states (B, T), -1 not labelled.
+
+    `selected`: rows of those frames are taken out, which makes the host wait for a GPU; None: on a CPU alone. The sums
+    are added in another order.
+    """
+    known = states >= 0
+    if not (logits.device.type == "cpu" if selected is None else selected):
+        total = F.cross_entropy(logits.flatten(0, 1), states.flatten(), ignore_index=-1, reduction="sum")
+        return total / known.sum().clamp(min=1)
+    return F.cross_entropy(logits[known], states[known]) if bool(known.any()) else logits.new_zeros(())
 
 
 def group_of(channel: str) -> str:
@@ -243,10 +275,14 @@ def group_of(channel: str) -> str:
 
 def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
     """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
-    drawn = set(settings.drawn_channels)
+    return _weights(settings.channels, settings.drawn_channels, groups)
+
+
+@lru_cache(maxsize=8)
+def _weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: config.GroupWeights) -> Tensor:
     members = Counter(group_of(name) for name in drawn)
-    weights = torch.zeros(len(settings.channels))
-    for index, name in enumerate(settings.channels):
+    weights = torch.zeros(len(channels))
+    for index, name in enumerate(channels):
         if name in drawn:
             weights[index] = getattr(groups, group_of(name)) / members[group_of(name)]
     return weights / weights.sum()
@@ -264,10 +300,12 @@ def augment(
     in every window, and all of it is taken back at once.
     """
     b, n = dyad.user_heard.shape
-    device = dyad.agent_motion.device
+    device, place = dyad.agent_motion.device, generator.device
 
     def dropped(share: float) -> Tensor:
-        return (torch.rand(b, 1, generator=generator) < share).to(device)
+        if not is_drawn(generator, share):
+            return torch.zeros(b, 1, dtype=torch.bool, device=device)
+        return (torch.rand(b, 1, generator=generator, device=place) < share).to(device)
 
     deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
     silent = dropped(phase.silent_user)
@@ -276,10 +314,12 @@ def augment(
     user_off, agent_off = (_microphone(b, n, model, phase, generator).to(device) for _ in range(2))
     off = model.motion_std * model.is_recalled
     slow, fast = (each.to(device) * off for each in _wander(b, n, model.channels, phase, generator))
-    lips = torch.tensor([name.startswith(SPOKEN) for name in model.settings.channels], device=device)
-    spoken = dyad.voiced[..., :1] & lips
-    missed = torch.rand(b, 1, 1, generator=generator) * phase.speaking_noise
-    missed = (missed * torch.randn(b, n, model.channels, generator=generator)).to(device) * model.motion_std
+    spoken = dyad.voiced[..., :1] & sent(_lips(model.settings.channels), device)
+    missed = torch.zeros((), device=device)
+    if is_drawn(generator, phase.speaking_noise):
+        missed = torch.rand(b, 1, 1, generator=generator, device=place) * phase.speaking_noise
+        missed = missed * torch.randn(b, n, model.channels, generator=generator, device=place)
+        missed = missed.to(device) * model.motion_std
     told = replace(
         dyad,
         user_sound=_in_a_room(dyad.user_sound + user_off, voiced[..., 1:], silent, model, phase, generator),
@@ -294,17 +334,47 @@ def augment(
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
+@lru_cache(maxsize=32)
+def _sent(tensor: Tensor, device: torch.device) -> Tensor:
+    return tensor.to(device)
+
+
+def sent(constant: Tensor, device: torch.device) -> Tensor:
+    """Return a constant that is kept for good on a device; it goes there once."""
+    return constant if constant.device == device else _sent(constant, device)
+
+
+@lru_cache(maxsize=8)
+def _lips(channels: tuple[str, ...]) -> Tensor:
+    return torch.tensor([name.startswith(SPOKEN) for name in channels])
+
+
+@lru_cache(maxsize=1)
+def _colours() -> Tensor:
+    """Return the waves over the bands (COLOURS, bands) that make up a microphone's colour."""
+    place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
+    return torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
+
+
+@lru_cache(maxsize=8)
+def _silence(frames: int) -> Tensor:
+    """Return the features (frames, A) of silence since the start of a stream."""
+    return torch.from_numpy(track(np.zeros(frames * FRAME_SAMPLES, np.float32))[0])
+
+
 def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
     """Draw what another microphone would add (B, N, A) to logarithms of power; nothing to other features."""
-    off = torch.zeros(b, n, model.sound_width)
-    if model.settings.sound != "mel":
+    place = generator.device
+    off = torch.zeros(b, n, model.sound_width, device=place)
+    if model.settings.sound != "mel" or not is_drawn(generator, phase.gain_db, phase.colour_db, phase.grain_db):
         return off
-    size = torch.rand(b, 1, 2, generator=generator) * mel.LN_PER_DB
-    waves = torch.randn(b, 1, COLOURS, generator=generator) / COLOURS**0.5
-    place = torch.arange(mel.MEL_BINS) / mel.MEL_BINS
-    colour = waves @ torch.cos(torch.pi * torch.arange(1, COLOURS + 1)[:, None] * place)
-    grain = torch.randn(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS, generator=generator)
-    gain = torch.rand(b, 1, 1, generator=generator) * 2 - 1
+    size = torch.rand(b, 1, 2, generator=generator, device=place) * mel.LN_PER_DB
+    waves = torch.randn(b, 1, COLOURS, generator=generator, device=place) / COLOURS**0.5
+    colour = waves @ sent(_colours(), place)
+    grain = torch.zeros((), device=place).expand(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS)
+    if is_drawn(generator, phase.grain_db):
+        grain = torch.randn(grain.shape, generator=generator, device=place)
+    gain = torch.rand(b, 1, 1, generator=generator, device=place) * 2 - 1
     bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
     off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
     return off
@@ -320,12 +390,13 @@ def _in_a_room(
     if model.settings.sound != "mel":
         return sound
     b, n = sound.shape[:2]
-    share = torch.rand(b, 1, 1, generator=generator) * (torch.rand(b, 1, 1, generator=generator) < phase.quiet_room)
-    bands = sound[..., :MEL_WIDTH]
-    less = share.to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
-    quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
-    silence = torch.from_numpy(track(np.zeros(n * FRAME_SAMPLES, np.float32))[0]).to(sound.device)
-    return torch.where(silent[..., None], silence, quieter)
+    quieter = sound
+    if is_drawn(generator, phase.quiet_room):
+        share, lot = (torch.rand(b, 1, 1, generator=generator, device=generator.device) for _ in range(2))
+        bands = sound[..., :MEL_WIDTH]
+        less = (share * (lot < phase.quiet_room)).to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
+        quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
+    return torch.where(silent[..., None], sent(_silence(n), sound.device), quieter)
 
 
 def _wander(
@@ -337,23 +408,44 @@ def _wander(
     The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
     the drift of a stream: its speed does not continue in the frames after it.
     """
-    size = torch.rand(b, 1, 1, generator=generator) * phase.history_noise
-    size = size * (torch.rand(b, 1, 1, generator=generator) >= COLD)
-    jumps = torch.randn(b, n, channels, generator=generator)
-    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator) < JUMPS), generator)
-    fast = torch.randn(b, n, channels, generator=generator)
+    place = generator.device
+    if not is_drawn(generator, phase.history_noise):
+        return torch.zeros(b, n, 1, device=place), torch.zeros(b, n, 1, device=place)
+    size = torch.rand(b, 1, 1, generator=generator, device=place) * phase.history_noise
+    size = size * (torch.rand(b, 1, 1, generator=generator, device=place) >= COLD)
+    jumps = torch.randn(b, n, channels, generator=generator, device=place)
+    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator, device=place) < JUMPS), generator)
+    fast = torch.randn(b, n, channels, generator=generator, device=place)
+    return size * decayed(jumps), size * fast
+
+
+def decayed(jumps: Tensor, at_once: bool | None = None) -> Tensor:
+    """Return jumps (B, N, C), each with what `RETURN` a frame has left of those before it.
+
+    `at_once`: as one product, for a GPU; None: on a GPU alone. The sums are added in another order.
+    """
+    n = jumps.shape[1]
+    if jumps.device.type != "cpu" if at_once is None else at_once:
+        return sent(_left(n), jumps.device) @ jumps
     slow = jumps.clone()
     for frame in range(1, n):
         slow[:, frame] += (1 - RETURN) * slow[:, frame - 1]
-    return size * slow, size * fast
+    return slow
+
+
+@lru_cache(maxsize=8)
+def _left(frames: int) -> Tensor:
+    """Return (frames, frames): the share of a jump of one frame (column) that is left in another (row)."""
+    frame = torch.arange(frames)
+    return ((1 - RETURN) ** (frame[:, None] - frame).double()).tril().float()
 
 
 def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
     """Spread jumps (B, N, C) evenly over the frames from each on: 1 to `GLIDE`, drawn for each window."""
     b, n = jumps.shape[:2]
-    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator)
+    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator, device=jumps.device)
     total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
-    before = (torch.arange(1, n + 1) - frames).clamp(min=0)
+    before = (torch.arange(1, n + 1, device=jumps.device) - frames).clamp(min=0)
     ended = total.gather(1, before[..., None].expand(-1, -1, jumps.shape[2]))
     return (total[:, 1:] - ended) / frames[..., None]
 
@@ -363,6 +455,8 @@ def previous_states(states: Tensor, share: float, generator: torch.Generator, co
     `count`.
     """
     known = torch.where(states < 0, FIRST, states)
-    drawn = torch.randint(count, states.shape, generator=generator).to(states.device)
-    replaced = (torch.rand(states.shape, generator=generator) < share).to(states.device)
+    if not is_drawn(generator, share):
+        return known
+    drawn = torch.randint(count, states.shape, generator=generator, device=generator.device).to(states.device)
+    replaced = (torch.rand(states.shape, generator=generator, device=generator.device) < share).to(states.device)
     return torch.where(replaced, drawn, known)

@@ -154,7 +154,9 @@ def context(
     `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
     frames, device = corpus.frames, model.motion_mean.device
-    index = (starts[:, None] + torch.arange(-1, past)).clamp(min=0)  # one frame more: convolution looks back on it
+    starts = starts.to(frames.heard.device)
+    looked_at = torch.arange(-1, past, device=starts.device)  # one frame more: convolution looks back on it
+    index = (starts[:, None] + looked_at).clamp(min=0)
     heard = frames.heard[index]
     heard[:, 0] &= ~corpus.begins[starts]
     heard, sound = heard.to(device), frames.sound[index].to(device).float()
@@ -163,7 +165,7 @@ def context(
     sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
     own = windows(tokens, starts, past)
     if held is not None:
-        own[:, 0] = held[starts]
+        own[:, 0] = held[starts.to(held.device)]
     undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
     return Context(
         face=model.standardise(windows(frames.face, starts, past).to(device)),
@@ -178,6 +180,7 @@ def context(
 
 # --- Motion of a whole corpus as tokens: what phase 2 is trained on -----------------------------------------------
 
+TOGETHER = 64  # stretches of one length that are placed at once
 STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
 
 
@@ -189,14 +192,21 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
     borrow from quiet ones of the same stretch.
     """
     size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
-    masks = []
-    for dyad in torch.split(motion, list(lengths)):
-        if tokenizer.strategy == "penalised":
-            masks.append(tokenizer.place(dyad[None])[0])
-            continue
-        for stretch in torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)):
-            masks.append(tokenizer.place(stretch[None])[0])
-    return torch.cat(masks)
+    penalised = tokenizer.strategy == "penalised"
+    pieces = [
+        piece
+        for dyad in torch.split(motion, list(lengths))
+        for piece in ([dyad] if penalised else torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)))
+    ]
+    alike: dict[int, list[int]] = {}  # pieces of one length are placed together
+    for index, piece in enumerate(pieces):
+        alike.setdefault(len(piece), []).append(index)
+    masks: dict[int, Tensor] = {}
+    for indices in alike.values():
+        for some in range(0, len(indices), TOGETHER):
+            chosen = indices[some : some + TOGETHER]
+            masks |= zip(chosen, tokenizer.place(torch.stack([pieces[index] for index in chosen])), strict=True)
+    return torch.cat([masks[index] for index in range(len(pieces))])
 
 
 def _stretches(frames: int, size: int, least: int) -> list[int]:
@@ -260,7 +270,7 @@ def without_last_keyframes(
     b, t, groups = tokens.shape
     row, frame = torch.arange(b, device=tokens.device)[:, None], torch.arange(t, device=tokens.device)
     recent = (frame >= first[:, None] - MISSED_FRAMES) & (frame < first[:, None])
-    chosen = torch.rand(b, 1, groups, generator=generator).to(tokens.device) < share
+    chosen = torch.rand(b, 1, groups, generator=generator, device=generator.device).to(tokens.device) < share
     left = torch.where(recent[..., None] & chosen, 0, tokens)
     last = last_keyframes(left).at[row[:, 0], first - 1][..., 0]  # (B, G)
     off = motion[row, last.clamp(min=0)] - motion[row[:, 0], first][:, None]  # (B, G, C)

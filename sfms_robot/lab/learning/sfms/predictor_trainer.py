@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import fit_sound, windows
-from sfms_robot.lab.learning.job import Job, Run
+from sfms_robot.lab.learning.corpus import fit_sound, packed, windows
+from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
+    SfmsFrames,
     context,
     gather,
     held_tokens,
@@ -56,13 +58,8 @@ def train_listener(
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
     """
-    listener, space = settings.listener, MotionSpace.of(settings.listener)
-    dyads, unseen = (open_for(space.name, data, split, order, [listener.audio]) for split in ("train", "validation"))
-    frontend = AudioFrontend.of(listener)
-    corpus, held_out = (
-        gather(some, listener.window_frames, space, frontend, listener, run.staging(split))
-        for some, split in ((dyads, "train"), (unseen, "validation"))
-    )
+    listener = settings.listener
+    corpus, held_out = corpora(settings, data, run, order).values()
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
     checkpoint.load_weights(out / TOKENIZER_WEIGHTS, model)
@@ -75,6 +72,20 @@ def train_listener(
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
     scores = keyframe_scores(model.cpu(), held_out, listener)
     return {**asdict(outcome), "held_out_loss": last, **scores}
+
+
+def corpora(settings: config.Training, data: Path, run: Run, order: Order | None) -> dict[str, SfmsCorpus]:
+    """Return the frames of training and validation, from a folder or a pack."""
+    listener, space = settings.listener, MotionSpace.of(settings.listener)
+
+    def read(split: str) -> SfmsCorpus:
+        dyads, frontend = open_for(space.name, data, split, order, [listener.audio]), AudioFrontend.of(listener)
+        return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
+
+    return {
+        split: packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
+        for split in ("train", "validation")
+    }
 
 
 def listener_job(
@@ -93,21 +104,21 @@ def listener_job(
     held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
-
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
+    costs = torch.tensor(model.tokenizer.costs, device=device)
 
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
         chosen = starts[torch.randint(len(starts), (batch,), generator=generator)]
         if phase.event_windows and len(eventful):
             busy = torch.rand(batch, generator=generator) < phase.event_windows
             chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
-        gain = None
-        if listener.audio == "mel":  # microphones differ
-            gain = ((torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB).to(device)
+        gain = _louder(phase, batch, generator, device) if listener.audio == "mel" else None
+        chosen = chosen.to(device, non_blocking=True)
+        noise = noise_of(generator, device)
         seen = context(
             model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held
         )
-        seen = augment(seen, levels, neutral, phase, generator)
+        seen = augment(seen, levels, neutral, phase, noise)
         target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
         count = _drawn(listener, target, generator)
@@ -116,11 +127,11 @@ def listener_job(
                 meant,
                 windows(dense, chosen, listener.window_frames),
                 windows(motion, chosen, listener.window_frames),
-                listener.past_frames + count[:, 0],
+                listener.past_frames + count[:, 0].to(device, non_blocking=True),
                 member=model.tokenizer.member,
-                costs=torch.tensor(model.tokenizer.costs, device=device),
+                costs=costs,
                 share=phase.missed_keyframes,
-                generator=generator,
+                generator=noise,
             )
         return _loss(model, seen, meant, count, settings)
 
@@ -143,6 +154,12 @@ def listener_job(
     )
 
 
+def _louder(phase: config.PredictorTraining, batch: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Draw how much louder (B,) each window is, in logarithms of power: microphones differ."""
+    gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
+    return gain.to(device, non_blocking=True)
+
+
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
     """Return those of the `starts` in whose future an event other than a blink is under way."""
     active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
@@ -163,27 +180,28 @@ def corrected(settings: config.Training) -> config.Sfms:
 
 
 def _drawn(listener: config.Sfms, target: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw how many frames (B, 1) of each future (B, H, G) are drawn already when the rest is planned.
+    """Draw how many frames (B, 1), on the CPU, of each future (B, H, G) are drawn already when the rest is planned.
 
     None of them is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left of the
     one before. A stream of hop 4 plans with 4 of them drawn.
     """
     b, h, _ = target.shape
-    return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator).to(target.device)
+    return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator)
 
 
 def _loss(model: SfmsModel, seen: Context[Tensor], meant: Tensor, count: Tensor, settings: config.Training) -> Tensor:
-    """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames that are drawn already.
+    """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames, of the CPU, drawn already.
 
     `meant` (B, P + H, G): tokens of the past, in place of those in `seen`, and of the future.
     """
     training, h = settings.predictor, settings.listener.future_frames
     target = meant[:, -h:]
-    drawn = torch.arange(h, device=target.device) < count  # (B, H)
+    counted = torch.arange(h) >= count  # (B, H)
+    drawn = ~counted.to(target.device, non_blocking=True)
     future = torch.where(drawn[..., None], target, UNDECIDED)
     logits = model.predictor.teacher_forced(seen._replace(tokens=torch.cat([meant[:, :-h], future], dim=1)), target)
     weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
-    loss = next_tokens(logits.unbind(-2), target, ~drawn, training.transition_weight, weights)
+    loss = next_tokens(logits.unbind(-2), target, counted, training.transition_weight, weights)
     if training.dtw_weight:
         key = (target > 0).float()
         expected = 1 - torch.softmax(logits, dim=-1)[..., 0]
@@ -204,14 +222,14 @@ def augment(
     device = seen.tokens.device
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator).to(device)
+        return torch.rand(shape, generator=generator, device=generator.device).to(device)
 
     heard = seen.heard & (uniform(b, 1) >= training.drop_audio)
     known = seen.face_known & (uniform(b, 1) >= training.drop_face)
     past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
     cold = uniform(b, 1) < training.neutral_prefix
-    cut = torch.randint(1, p + 1, (b, 1), generator=generator).to(device)
+    cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=generator.device).to(device)
     frame = torch.arange(p, device=device)
     before = cold & (frame < cut)
     shifted = neutral[(frame - cut) % p]  # (B, P, G): its end at the cut
@@ -227,13 +245,16 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 
     Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
     """
-    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator).to(tokens.device) < share)
+    if not is_drawn(generator, share):
+        return tokens
+    place = generator.device
+    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator, device=place).to(tokens.device) < share)
     if levels is None:
         return torch.where(changed, 0, tokens)
     codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
     dims = levels.shape[1]
-    dimension = torch.randint(dims, tokens.shape, generator=generator)
-    sign = torch.randint(2, tokens.shape, generator=generator)[..., None] * 2 - 1
+    dimension = torch.randint(dims, tokens.shape, generator=generator, device=place)
+    sign = torch.randint(2, tokens.shape, generator=generator, device=place)[..., None] * 2 - 1
     moved = (torch.nn.functional.one_hot(dimension, dims) * sign).to(tokens.device)
     noisy = (codes + moved * 2 / (levels - 1)).clamp(-1.0, 1.0)
     return torch.where(changed, codes_to_indices(noisy, levels) + 1, tokens)
@@ -294,13 +315,14 @@ def next_tokens(
     Args:
         logits: per group (B, H, V_g + 1).
         target: (B, H, G) classes.
-        counted: (B, H) bool: frames that were to be predicted.
+        counted: (B, H) bool: frames that were to be predicted; of the CPU, or else the host waits for their number.
     """
-    total = torch.zeros(())
+    total = target.new_zeros((), dtype=torch.float32)
+    rows = counted.flatten().nonzero()[:, 0].to(target.device, non_blocking=True)
     for group, values in enumerate(logits):
-        truth = target[..., group][counted]
+        truth = target[..., group].flatten()[rows]
         weight = torch.where(truth == 0, transition_weight, 1.0)
-        loss = F.cross_entropy(values[counted], truth, reduction="none")
+        loss = F.cross_entropy(values.flatten(0, 1)[rows], truth, reduction="none")
         total = total + group_weights[group] * (loss * weight).sum() / weight.sum()
     return total / sum(group_weights)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import first_frames, windows
-from sfms_robot.lab.learning.job import Job, LossOf, Run
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, fit_scales, gather, place_all
+from sfms_robot.lab.learning.corpus import first_frames, packed, windows
+from sfms_robot.lab.learning.job import Job, LossOf, Run, noise_of
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, SfmsFrames, fit_scales, gather, place_all
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -60,16 +61,19 @@ def train_tokenizer(
     listener, space = settings.listener, MotionSpace.of(settings.listener)
     if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
         raise ConfigError("listener.quantizer = 'vq' moves its codes beside gradients: one process, one piece a step")
-    dyads = open_for(space.name, data, "train", order)
-    if dyads.fps != FRAME_HZ:
-        log.warning(
-            "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
-            data, dyads.fps, FRAME_HZ,
-        )  # fmt: skip
-    unseen = open_for(space.name, data, "validation", order)
+
+    def read(split: str) -> SfmsCorpus:
+        dyads = open_for(space.name, data, split, order)
+        if dyads.fps != FRAME_HZ and split == "train":
+            log.warning(
+                "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
+                data, dyads.fps, FRAME_HZ,
+            )  # fmt: skip
+        return gather(dyads, listener.window_frames, space, None, listener, run.staging(split))
+
     corpus, held_out = (
-        gather(some, listener.window_frames, space, None, listener, run.staging(split))
-        for some, split in ((dyads, "train"), (unseen, "validation"))
+        packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
+        for split in ("train", "validation")
     )
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
@@ -125,7 +129,8 @@ def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
     """
     if not gain:
         return batch
-    return batch * torch.exp(gain * torch.randn(len(batch), 1, 1, generator=generator)).to(batch.device)
+    factor = torch.exp(gain * torch.randn(len(batch), 1, 1, generator=generator))
+    return batch * factor.to(batch.device, non_blocking=True)
 
 
 def loss_of_steps(
@@ -218,7 +223,8 @@ def learned_loss(
     """Return loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
     assert isinstance(tokenizer.score, ScoreNetwork)
     scores = tokenizer.score(batch)
-    draws = [place_learned(scores, tokenizer.keyframes, temperature, generator) for _ in range(DRAWS)]
+    noise = noise_of(generator, batch.device)
+    draws = [place_learned(scores, tokenizer.keyframes, temperature, noise) for _ in range(DRAWS)]
     scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
     best = torch.stack([error for _, error in scored]).argmin(0)  # (B,)
     masks = torch.stack([mask for mask, _ in draws])
@@ -290,9 +296,9 @@ EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
 def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torch.Generator) -> Tensor:
     """Return the cross-entropy of scores and teacher over all states of one choice of 1..`most` keyframes a track."""
     n = len(track.curves)
-    k = torch.randint(1, most + 1, (n,), generator=generator).to(track.curves.device)
-    rows, chosen, remaining = states(score, track, k, generator)
-    regret = regrets(track[rows], chosen, k[rows], most)
+    k = torch.randint(1, most + 1, (n,), generator=generator)  # on the CPU: as many states follow
+    rows, chosen, remaining = states(score, track, k, noise_of(generator, track.curves.device))
+    regret = regrets(track[rows], chosen, k.to(rows.device, non_blocking=True)[rows], most)
     wanted = torch.softmax(-regret / SHARPNESS, dim=1)
     logits = score(track[rows], chosen, remaining)
     heard = torch.log_softmax(logits, dim=1).masked_fill(chosen > 0.5, 0.0)
@@ -303,11 +309,12 @@ def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torc
 def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: torch.Generator) -> Tracks:
     """Draw at most `count` tracks of motion (B, T, C), lively ones more often: a still one has no best keyframes."""
     few = -(-CANDIDATES * count // len(member))  # windows that give enough candidates
-    some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device)]
+    some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device, non_blocking=True)]
     found = tracks(some, member, curves)
     around = (some - some.mean(1, keepdim=True)).square().mean(1) @ member.T  # (B, G)
-    weight = around.float().flatten().clamp(max=1.0).sqrt().cpu() + 0.05
-    rows = torch.multinomial(weight, min(count, len(weight)), generator=generator)
+    noise = noise_of(generator, motion.device)
+    weight = around.float().flatten().clamp(max=1.0).sqrt().to(noise.device) + 0.05
+    rows = torch.multinomial(weight, min(count, len(weight)), generator=noise)
     return found[rows.to(motion.device)]
 
 
@@ -315,16 +322,20 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: t
 def states(
     score: ConditionalScore, track: Tracks, k: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach."""
+    """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach.
+
+    `k` (n,) keyframes of each track, of the CPU.
+    """
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
     rows, chosen, remaining = [], [], []
     for step in range(int(k.max())):
-        here = (step < k).nonzero()[:, 0]
+        here = (step < k).nonzero()[:, 0].to(mask.device, non_blocking=True)
+        to_come = (k - step).to(mask.device, non_blocking=True)
         rows.append(here)
         chosen.append(mask[here])
-        remaining.append((k - step)[here])
-        logits = score(track, mask, (k - step).clamp(min=1))
+        remaining.append(to_come[here])
+        logits = score(track, mask, to_come.clamp(min=1))
         noise = -torch.log(-torch.log(_uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
         drawn = _uniform(n, generator, mask.device) < EXPLORED
         picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
@@ -344,7 +355,7 @@ def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
 
 
 def _uniform(shape: int | tuple[int, int], generator: torch.Generator, device: torch.device) -> Tensor:
-    return torch.rand(shape, generator=generator).to(device)
+    return torch.rand(shape, generator=generator, device=generator.device).to(device)
 
 
 # --- Keyframe masks for training: fresh for every batch, or, where that is slow, from a bank placed beforehand ----
@@ -389,7 +400,7 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
         chosen = torch.randint(len(starts), (size,), generator=generator)
         batch = windows(motion, starts[chosen], window)
         if kept is not None:
-            return batch, kept[chosen].float()
+            return batch, kept[chosen.to(kept.device, non_blocking=kept.is_cuda)].float()
         if whole is None:
             return batch, _masks(tokenizer, batch)
         mask = windows(whole, starts[chosen], window)

@@ -1,0 +1,88 @@
+"""`bench train`: the share of a training step, on one core, that is not the model.
+
+The model is what lies between the first call of one of its modules and the end of the backward pass. The rest draws
+windows and noise, cuts and changes them, clips and updates. Steps are those of the shipped files, on made-up frames
+(`learning.dry_run`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.module import register_module_forward_pre_hook
+
+from sfms_robot.config import load_training
+from sfms_robot.data import data_dir
+from sfms_robot.lab.bench.measure import BenchResult, Row, row
+from sfms_robot.lab.learning.dry_run import jobs_of
+from sfms_robot.lab.learning.job import Job, ProcessGroup
+from sfms_robot.lab.learning.training_loop import Gradients, make_step
+
+FILES: Final = ("arig", "sfms-small")
+STEPS: Final = 12  # measured, after one that is not
+MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
+
+
+def measure(say: Callable[[str], None], steps: int = STEPS) -> BenchResult:
+    """Measure every job of the shipped files. Blocks for half a minute."""
+    threads, rows = torch.get_num_threads(), dict[str, Row]()
+    torch.set_num_threads(1)
+    try:
+        for file in FILES:
+            for name, job, _ in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):
+                rows[f"train.{name}"] = _measured(job, steps)
+                say(f"{name}: {rows[f'train.{name}']['ratio']:.1%} of a step is not the model")
+    finally:
+        torch.set_num_threads(threads)
+    missed = [name for name, most in MOST_BESIDE.items() if rows[f"train.{name}"]["ratio"] > most]
+    lines = [f"{name}: more than {MOST_BESIDE[name]:.0%} of a step is not the model" for name in missed]
+    found = BenchResult.of_rows(rows)
+    return BenchResult(found.figures, found.table, lines, not missed)
+
+
+def _measured(job: Job, steps: int) -> Row:
+    """Return the row of a job: what is not the model beside the whole step."""
+    job.model.train()
+    timed, generator = _TimedGradients(job), torch.Generator().manual_seed(job.seed)
+    whole_ms, beside_ms = [], []
+    hook = register_module_forward_pre_hook(timed.called)
+    try:
+        for step in range(steps + 1):
+            began_s = timed.begin()
+            make_step(timed, step, generator)
+            whole_ms.append((time.perf_counter() - began_s) * 1e3)
+            beside_ms.append(whole_ms[-1] - timed.model_s * 1e3)
+    finally:
+        hook.remove()
+    return row(beside_ms[1:], whole_ms[1:], "ms beside the model", "a step")
+
+
+class _TimedGradients(Gradients):
+    """Gradients that keep when the model was first called in a step, and for how long it was at work."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job, ProcessGroup(), 1, Path())
+        self._modules = {*job.model.modules()}
+        self.first_s: float | None = None
+        self.model_s = 0.0
+
+    def begin(self) -> float:
+        """Begin a step; return the time."""
+        self.first_s = None
+        return time.perf_counter()
+
+    def called(self, module: nn.Module, inputs: Any) -> None:
+        """Note the first call of a module of the model."""
+        if self.first_s is None and module in self._modules:
+            self.first_s = time.perf_counter()
+
+    def of(self, step: int, generator: torch.Generator) -> Tensor:
+        """Return what `Gradients.of` returns."""
+        found = super().of(step, generator)
+        self.model_s = 0.0 if self.first_s is None else time.perf_counter() - self.first_s
+        return found
