@@ -22,14 +22,21 @@ SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 _INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
 _ANSWERS = "{participants} people, {answers} answers"
-_TABLES = {3: "Table 3: where keyframes go", 4: "Table 4: kinds of codes"}  # of the SFMS paper
+_TABLES = {  # of the SFMS paper, and where their figures come from
+    3: "Table 3: where keyframes go",
+    4: "Table 4: kinds of codes",
+    "3-placements": "Every placement with both inpainters",
+    "4-codes": "Kinds of codes, alike",
+}
 HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
+    table: str | None = Option(
+        None, metavar="3|4|all|3-placements|4-codes", help="A table of the SFMS paper, or both, or what is behind one."
+    ),
     data: Path | None = Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
@@ -37,6 +44,8 @@ def tokenizer(
     train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
     size: Literal["small", "paper"] = Option("small", help="Of what is trained; paper: for a GPU."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
+    seeds: int = Option(1, min=1, help="Trainings of each tokenizer of the table, into --models."),
+    only: str = Option("*", metavar="PATTERN", help="Tokenizers of the table to compare, as in 'sparse-all-k7*'."),
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,
@@ -52,7 +61,8 @@ def tokenizer(
         return
     from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "jobs": jobs, "plots": plots}
+    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "seeds": seeds, "only": only, "jobs": jobs}
+    options["plots"] = plots
     show(interruptible(lambda: evaluate_table(table, data, models, **options)), json, _print_tokenizers)
 
 
@@ -308,7 +318,7 @@ def _print_paper(name: str, found: Mapping[str, Any]) -> None:
 def _print_tokenizers(found: Mapping[str, Any]) -> None:
     """Print table 3 or 4 of the SFMS paper, or both."""
     for table in found.get("tables", [found]):
-        print_report(table, _TABLES[table["table"]], ("rows", "ratios", "truth_silhouette", "not_trained"))
+        print_report(table, _TABLES[table["table"]], ("rows", "ratios", "claims", "truth_silhouette", "not_trained"))
     say(f"{found['windows']} windows of {found['data']}; mse is the {found['unit']}", "dim")
     say("The paper's figures are of other motion: compare ratios.", "dim")
 

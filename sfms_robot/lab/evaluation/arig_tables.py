@@ -29,7 +29,7 @@ from sfms_robot.lab.evaluation.intervals import Chosen, jackknife, people_of
 from sfms_robot.lab.evaluation.listener_tables import collect, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts, tracked
-from sfms_robot.lab.evaluation.tokenizer_tables import TABLES as TOKENIZER_TABLES
+from sfms_robot.lab.evaluation.tokenizer_tables import PAPER_TABLES as TOKENIZER_TABLES
 from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table, needed
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS

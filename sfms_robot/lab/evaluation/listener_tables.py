@@ -28,7 +28,7 @@ from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.detection import behaviour
-from sfms_robot.lab.evaluation.intervals import Chosen, finite, jackknife, people_of
+from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, finite, intervals, people_of
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import (
     frames_of_dyad,
@@ -106,7 +106,7 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
     rows = []
     for name, motion in {**guesses, **answers}.items():
         score = score_of(motion)
-        over = jackknife(score, clips.people) if name in answers else {}
+        over = intervals(bootstrap(score, clips.people)) if name in answers else {}
         rows.append({"name": name, "source": "here", **score(np.arange(len(clips.truth))), "interval": over})
     if number == 1:
         keys = [f"{part} {column}" for part in metrics.CLUSTERS for column in _COLUMNS_1]
