@@ -67,6 +67,7 @@ SFMS = {
     "V-C: 40 past frames, 8 future ones": lambda one: (one.listener.past_frames, one.listener.future_frames) == (40, 8),
     "V-C: 8 frames in parallel": lambda one: not one.listener.sequential,
     "V-C: the window rolls on by what was predicted": lambda one: one.listener.hop_frames == 8,
+    "V-B, V-C: keyframes of each window by itself": lambda one: one.predictor.tokens == "windows",
     "V-B: windows of 48 frames": lambda one: one.listener.window_frames == 48,
     "nothing is done to the motion afterwards": lambda one: (
         one.listener.sampling.smoothing == 0 and one.listener.sampling.seam_frames == 1

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from sfms_robot.lab.learning.sfms.features import (
     held_tokens,
     keyframe_tokens,
     tokenise,
+    window_tokens,
     without_last_keyframes,
 )
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
@@ -37,6 +38,7 @@ from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
 
+TokensOf = Literal["dyads", "windows"]
 HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
 
 
@@ -73,7 +75,7 @@ def train_listener(
     if run.group.first:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    scores = keyframe_scores(model.cpu(), held_out, listener)
+    scores = keyframe_scores(model.cpu(), held_out, listener, settings.predictor.tokens)
     return {**asdict(outcome), "held_out_loss": last, **scores}
 
 
@@ -90,9 +92,10 @@ def listener_job(
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    by_window = phase.tokens == "windows"
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" and not by_window else None
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
-    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
+    dense = keyframe_tokens(model, motion) if phase.missed_keyframes or by_window else tokens
 
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
 
@@ -104,11 +107,14 @@ def listener_job(
         gain = None
         if listener.audio == "mel":  # microphones differ
             gain = ((torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB).to(device)
-        seen = context(
-            model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held
+        own = (
+            window_tokens(model, motion, dense, chosen)
+            if by_window
+            else windows(tokens, chosen, listener.window_frames)
         )
+        seen = context(model, corpus, own, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held)
         seen = augment(seen, levels, neutral, phase, generator)
-        target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
+        target = own[:, listener.past_frames :]
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
         count = _drawn(listener, target, generator)
         if phase.missed_keyframes:
@@ -248,34 +254,45 @@ def held_out_loss(
     tokens = tokenise(model, corpus) if tokens is None else tokens
     generator = torch.Generator().manual_seed(0)
     losses = []
-    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator):
+    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator, settings.predictor.tokens):
         meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
         losses.append(float(_loss(model, seen, meant, _drawn(settings.listener, target, generator), settings)))
     return sum(losses) / len(losses)
 
 
 def some_windows(
-    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
+    model: SfmsModel,
+    corpus: SfmsCorpus,
+    tokens: Tensor,
+    listener: config.Sfms,
+    generator: torch.Generator,
+    placed: TokensOf = "dyads",
 ) -> Iterator[tuple[Context[Tensor], Tensor]]:
-    """Yield batches of contexts and the tokens (B, H, G) that came next."""
+    """Yield batches of contexts and the tokens (B, H, G) that came next; `placed`: `PredictorTraining.tokens`."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    by_window = placed == "windows"
+    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" and not by_window else None
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    dense = keyframe_tokens(model, motion) if by_window else tokens
     for _ in range(HELD_OUT_BATCHES):
         chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
-        yield context(model, corpus, tokens, chosen, past, future, held=held), windows(tokens, chosen + past, future)
+        own = window_tokens(model, motion, dense, chosen) if by_window else windows(tokens, chosen, past + future)
+        yield context(model, corpus, own, chosen, past, future, held=held), own[:, past:]
 
 
 @torch.no_grad()
-def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
+def keyframe_scores(
+    model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms, placed: TokensOf = "dyads"
+) -> dict[str, float]:
     """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
-    All groups and future frames pooled, on windows drawn with a fixed seed.
+    All groups and future frames pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
     """
     model.eval()
     tokens = tokenise(model, corpus)
     hit = said = true = 0
-    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0)):
+    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0), placed):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
