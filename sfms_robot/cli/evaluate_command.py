@@ -17,6 +17,7 @@ app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded fa
 
 
 Part = Literal["train", "validation", "test"]  # of meetings and voices (`corpora.clips`)
+Unseen = Literal["validation", "test"]
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SPLIT = Option("test", help="Dyads: test to report, validation to choose.")
 SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
@@ -50,7 +51,7 @@ def tokenizer(
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,
-    split: Part = SPLIT,
+    split: Unseen = SPLIT,
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
@@ -85,7 +86,7 @@ def listener_(
     config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
     seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4; three and more say what holds."),
-    split: Part = SPLIT,
+    split: Unseen = SPLIT,
     seed: int = SEED,
     hop: int | None = HOP,
     order: Order | None = ORDER,
@@ -132,7 +133,7 @@ def papers(
     samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
     steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
     seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4."),
-    split: Part = SPLIT,
+    split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
@@ -257,7 +258,7 @@ def interaction(
     listener: str = Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
     data: Path = Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
     clips: int | None = Option(None, min=1, help="At most this many dyads of each set; all of them."),
-    split: Part = SPLIT,
+    split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -92,11 +92,9 @@ def listener_job(
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
-    by_window = phase.tokens == "windows"
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" and not by_window else None
+    tokens_at, held = placed_tokens(model, corpus, tokens, listener, phase.tokens)
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
-    dense = keyframe_tokens(model, motion) if phase.missed_keyframes or by_window else tokens
-
+    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
 
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
@@ -107,11 +105,7 @@ def listener_job(
         gain = None
         if listener.audio == "mel":  # microphones differ
             gain = ((torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB).to(device)
-        own = (
-            window_tokens(model, motion, dense, chosen)
-            if by_window
-            else windows(tokens, chosen, listener.window_frames)
-        )
+        own = tokens_at(chosen)
         seen = context(model, corpus, own, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held)
         seen = augment(seen, levels, neutral, phase, generator)
         target = own[:, listener.past_frames :]
@@ -147,6 +141,21 @@ def listener_job(
             "tokenizer weights": tokenizer_digest,
         },
     )
+
+
+def placed_tokens(
+    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, placed: TokensOf
+) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
+    """Return the tokens (B, T, G) of windows by their first frames, and those held (N, G) at a window's first frame.
+
+    `tokens` (N, G) are those of whole dyads; `placed`: `PredictorTraining.tokens`.
+    """
+    if placed == "dyads":
+        held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+        return lambda starts: windows(tokens, starts, listener.window_frames), held
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    dense = keyframe_tokens(model, motion)
+    return lambda starts: window_tokens(model, motion, dense, starts), None
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
@@ -271,13 +280,10 @@ def some_windows(
     """Yield batches of contexts and the tokens (B, H, G) that came next; `placed`: `PredictorTraining.tokens`."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
-    by_window = placed == "windows"
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" and not by_window else None
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
-    dense = keyframe_tokens(model, motion) if by_window else tokens
+    tokens_at, held = placed_tokens(model, corpus, tokens, listener, placed)
     for _ in range(HELD_OUT_BATCHES):
         chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
-        own = window_tokens(model, motion, dense, chosen) if by_window else windows(tokens, chosen, past + future)
+        own = tokens_at(chosen)
         yield context(model, corpus, own, chosen, past, future, held=held), own[:, past:]
 
 
