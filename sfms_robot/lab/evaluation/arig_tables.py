@@ -165,13 +165,8 @@ def claims(
     for name in (each for each in ABLATIONS[number] if draws.get("ARIG") and draws.get(each)):
         enough = min(rows[each]["trainings"] for each in ("ARIG", name)) >= LEAST_SEEDS
         for part in PARTS:
-            people = draws["GT"][f"Var {part}"]
-            for metric, better in (
-                ("SID", lambda values: values),
-                ("RPCC", lambda values: -values),
-                ("Var", lambda values, people=people: -np.abs(values - people)),
-            ):
-                whole, less = (better(draws[each][f"{metric} {part}"]) for each in ("ARIG", name))
+            for metric in ("SID", "RPCC", "Var"):
+                whole, less = (_merit(metric, draws[each], draws["GT"], part) for each in ("ARIG", name))
                 interval = intervals({"": whole - less}).get("") if enough else None
                 comparable = metric != "SID" or (alike("ARIG", part) and alike(name, part))
                 found.append({
@@ -181,6 +176,12 @@ def claims(
                     "verdict": verdict(interval, comparable=comparable),
                 })  # fmt: skip
     return found
+
+
+def _merit(metric: str, row: Mapping[str, Doubles], people: Mapping[str, Doubles], part: str) -> Doubles:
+    """Return a figure of each draw as a number of which more is better."""
+    values = row[f"{metric} {part}"]
+    return values if metric == "SID" else -values if metric == "RPCC" else -np.abs(values - people[f"Var {part}"])
 
 
 # --- listeners that are played --------------------------------------------------------------------------------------
@@ -232,16 +233,18 @@ def arig_table(
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
         unchanged = "arig-as-written" if training is None else "arig"
-        ablations = {label: {"changes": changes} for label, changes in ABLATIONS[number].items()}
+        rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **(READINGS if number == 1 else {})}
+        rows |= {label: {"changes": changes} for label, changes in ABLATIONS[number].items()}
         folders = {
             label: [
                 trained(
                     "arig", models / (_folder(label) if differing else unchanged), data,
-                    file=training, steps=steps, seed=trial, **differing,
+                    file=training, steps=steps, seed=trial, changes=differing.get("changes", {}),
+                    phase_changes=differing.get("phase_changes", {}),
                 )
                 for trial in range(1, seeds + 1)
             ]
-            for label, differing in {"ARIG": {}, **(READINGS if number == 1 else {}), **ablations}.items()
+            for label, differing in rows.items()
         } | folders  # fmt: skip
     elif models is not None:
         folders[LABELS["arig"]] = [trained("arig", models / "arig-as-written", data, steps=steps)]
@@ -255,8 +258,8 @@ def arig_table(
         answers[label] = cut(rolled, CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], CLIP_FRAMES)
-    rows, said = rows_of(number, truth, speaker, answers, people)
-    found = {"table": name, "split": split, "clips": len(truth), "frames": CLIP_FRAMES, "rows": rows}
+    scored, said = rows_of(number, truth, speaker, answers, people)
+    found = {"table": name, "split": split, "clips": len(truth), "frames": CLIP_FRAMES, "rows": scored}
     return found if number == 2 else {**found, "claims": said}
 
 
