@@ -102,23 +102,24 @@ def train(
     model = TableModel(recipe)
     motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
     model.fit_scales(motion)
-    history: list[Snapshot] = []
+    history = load_history(folder) if run.resume else []
     job = _job(name, model.to(run.device), motion, [len(take.motion) for take in takes])
-    if watched is not None and not run.resume:
+    if watched is not None:
         due = {min(recipe.training.steps - 1, round(share * recipe.training.steps)) for share in _SNAPSHOTS_AT}
         windows, loss_of = model.standardise(watched.to(run.device)), job.loss_of
 
         def recorded(step: int, generator: torch.Generator, samples: int) -> Tensor:
-            if step in due:
-                history.extend(snapshots(model.tokenizer, windows, step))
+            new = step in due and all(step != one.step for one in history)
+            if new and (found := snapshots(model.tokenizer, windows, step)):
+                history.extend(found)
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
             return loss_of(step, generator, samples)
 
         job = replace(job, loss_of=recorded)
     fit(job, folder, run)
     save_tokenizer(folder, model.cpu().eval())
     checkpoint_file(folder, name).unlink(missing_ok=True)
-    if history:
-        (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
 
 
 def _job(name: str, model: TableModel, motion: Tensor, lengths: Sequence[int]) -> Job:

@@ -140,7 +140,13 @@ def _placements() -> Iterable[Spec]:
     )  # fmt: skip
     for k in (7, 3, 10):
         for name, inpainter, ending in rows:
-            yield Spec(name=name, tokenizer=f"sparse-all-k{k}{ending}", k=k, note=_INPAINTERS[inpainter], shipped=False)
+            yield Spec(
+                name=name,
+                tokenizer=f"sparse-all-k{k}{ending}",
+                k=k,
+                note=_INPAINTERS[inpainter],
+                shipped=inpainter == "ours" and name != _ALGORITHM_1,
+            )
         for name, ending in (
             ("Algorithm 1, 8,000 steps", f"{written}-8000"), ("Algorithm 1, 30,000 steps", f"{written}-30000"),
             ("Adaptive k, equation (8)", "-adaptive"),

@@ -203,6 +203,18 @@ def test_three_seeds_on_one_side_decide_what_the_paper_says() -> None:
     assert (claim["seeds"], claim["verdict"]) == (1, "open")
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"only": "none*"}, r"--only none\*: expected a pattern of tokenizers of this table \(valid: sparse-all-k7-"),
+        ({"seeds": 3}, "--seeds 3: needs --models DIR, where tokenizers of other seeds"),
+    ],
+)
+def test_rows_that_cannot_be_had_are_named(options, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        tokenizer_tables.evaluate_table("3-placements", **options)
+
+
 def test_a_broken_history_is_named(tmp_path: Path) -> None:
     assert load_history(tmp_path) == []
     (tmp_path / "history.json").write_text('[{"stride": 1}]')
@@ -214,6 +226,8 @@ def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> 
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
     snapshots = load_history(tmp_path / "one")
+    train("one", sparse("learned"), faces(), tmp_path, Run(resume=False), seen.motion[:2])
+    assert load_history(tmp_path / "one") == snapshots, "trained again, it begins again"
     assert {snapshot.window for snapshot in snapshots} == {0, 1}
     assert snapshots[0].step == 0 and snapshots[-1].step == 2
     for snapshot in snapshots:
