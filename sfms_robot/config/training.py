@@ -80,7 +80,7 @@ class PredictorTraining(Phase):
     """Phase 2: the next-token predictor.
 
     Attributes:
-        tokens: keyframes are placed in whole dyads or long stretches (dyads), or in each training window by itself
+        tokens: keyframes are placed in whole dyads or long stretches (dyads), or in each training window separately
             (windows), as in the paper, whose tokenizer has the predictor's window.
         transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: it is taken out of the probabilities
             again afterwards, which the paper leaves open.

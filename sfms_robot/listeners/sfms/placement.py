@@ -286,7 +286,7 @@ def place_learned(
 def place_adaptive(
     scores: Tensor, temperature: float = 0.0, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return (mask, relaxed mask) of scores (B, T, G), each frame by itself (IV-B3): log-odds of being a keyframe.
+    """Return (mask, relaxed mask) of scores (B, T, G), each frame separately (IV-B3): log-odds of being a keyframe.
 
     Temperature 0 is evaluation. A track of which no frame is likely has its likeliest one.
     """

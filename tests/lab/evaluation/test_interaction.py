@@ -171,7 +171,7 @@ def test_ablations_stand_beside_the_papers(number):
 
 
 def verdicts(size: float, trainings: int = 3) -> dict[str, str]:
-    """What `claims` says of ARIG with `size` times people's variance, beside a row with three quarters of it."""
+    """Return the verdicts of `claims` on ARIG with `size` times people's variance, beside a row with 0.75."""
     name, noise = "w/o continuous AR modeling", np.random.default_rng(0).normal(1, 0.01, 200)
     rows, draws = {}, {}
     for row, times in (("GT", 1.0), ("ARIG", size), (name, 0.75)):

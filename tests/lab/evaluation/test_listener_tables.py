@@ -128,7 +128,7 @@ def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
 
 
 def test_the_last_true_frame_held_scores_high_without_any_listener():
-    """FRCorr of what only repeats the past: a plan of 8 frames that begins from the truth is scored beside it."""
+    """FRCorr of a repeated past: a plan of 8 frames that begins from the truth is scored beside it."""
     truth = np.cumsum(np.random.default_rng(4).normal(0, 1, (3, 400, 58)), axis=1)
     still = held(truth)
     assert np.array_equal(still[:, 8:16], np.repeat(truth[:, 7:8], 8, axis=1)) and np.array_equal(

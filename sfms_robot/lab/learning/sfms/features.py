@@ -150,7 +150,7 @@ def context(
 ) -> Context[Tensor]:
     """Return the predictor's inputs at the seam of each window, the tokens of the future undecided.
 
-    `tokens`: (N, G) of the corpus, or (B, T, G) of each window by itself.
+    `tokens`: (N, G) of the corpus, or (B, T, G) of separate windows.
     `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
     `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
@@ -228,7 +228,7 @@ def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
 
 @torch.no_grad()
 def window_tokens(model: SfmsModel, motion: Tensor, dense: Tensor, starts: Tensor) -> Tensor:
-    """Return the tokens (B, T, G) of windows, each placed by itself, as the paper's are (V-B, V-C).
+    """Return the tokens (B, T, G) of windows, each placed separately, as the paper's are (V-B, V-C).
 
     `motion` (N, C) standardised; `dense` (N, G): `keyframe_tokens` of it.
     """
