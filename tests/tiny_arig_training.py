@@ -60,8 +60,9 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
 
 
 def write(folder: Path) -> Path:
-    """Train and validation of all three scenes."""
+    """Train, validation and test of all three scenes."""
     for scene, place in (("listening", "."), ("speaking", "speaking"), ("interaction", "interaction")):
         clips.save(folder / place / "train", [dyad(f"a{seed}", scene, seed) for seed in (0, 1)])
-        clips.save(folder / place / "validation", [dyad("v", scene, 2)])
+        for split in ("validation", "test"):
+            clips.save(folder / place / split, [dyad("v", scene, 2)])
     return folder

@@ -17,19 +17,28 @@ app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded fa
 
 
 Part = Literal["train", "validation", "test"]  # of meetings and voices (`corpora.clips`)
+Unseen = Literal["validation", "test"]
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
+SPLIT = Option("test", help="Dyads: test to report, validation to choose.")
 SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 _INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
 _ANSWERS = "{participants} people, {answers} answers"
-_TABLES = {3: "Table 3: where keyframes go", 4: "Table 4: kinds of codes"}  # of the SFMS paper
+_TABLES = {  # of the SFMS paper, and where their figures come from
+    3: "Table 3: where keyframes go",
+    4: "Table 4: kinds of codes",
+    "3-placements": "Every placement with both inpainters",
+    "4-codes": "Kinds of codes, alike",
+}
 HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
 
 
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
-    table: str | None = Option(None, metavar="3|4|all", help="A table of the SFMS paper, or both."),
+    table: str | None = Option(
+        None, metavar="3|4|all|3-placements|4-codes", help="A table of the SFMS paper, or both, or what is behind one."
+    ),
     data: Path | None = Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
@@ -37,9 +46,12 @@ def tokenizer(
     train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
     size: Literal["small", "paper"] = Option("small", help="Of what is trained; paper: for a GPU."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
+    seeds: int = Option(1, min=1, help="Trainings of each tokenizer of the table, into --models."),
+    only: str = Option("*", metavar="PATTERN", help="Tokenizers of the table to compare, as in 'sparse-all-k7*'."),
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,
+    split: Unseen = SPLIT,
     json: bool = JSON,
 ) -> None:
     """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
@@ -48,11 +60,12 @@ def tokenizer(
 
         if data is None:
             raise BadParameter("--data is needed without --table")
-        show(evaluate_tokenizer(listener, data, order), json)
+        show(evaluate_tokenizer(listener, data, order, split), json)
         return
     from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "jobs": jobs, "plots": plots}
+    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "seeds": seeds, "only": only, "jobs": jobs}
+    options["plots"] = plots
     show(interruptible(lambda: evaluate_table(table, data, models, **options)), json, _print_tokenizers)
 
 
@@ -72,6 +85,8 @@ def listener_(
     ),
     config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
+    seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4; three and more say what holds."),
+    split: Unseen = SPLIT,
     seed: int = SEED,
     hop: int | None = HOP,
     order: Order | None = ORDER,
@@ -83,14 +98,16 @@ def listener_(
     of_arig = table is not None and table.startswith("arig")
     listener = listener or ["arig-small" if of_arig else "sfms-small"]
     if table is None:
-        show(evaluate_listener(listener, data, seed, order, hop), json)
+        show(evaluate_listener(listener, data, seed, order, hop, split), json)
         return
     if of_arig:
         if order is not None or hop is not None:
             raise BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.lab.evaluation.arig_tables import arig_table
 
-        trained: dict[str, Any] = {"models": models, "training": config, "steps": steps}
+        trained: dict[str, Any] = {
+            "models": models, "training": config, "steps": steps, "seeds": seeds, "split": split,
+        }  # fmt: skip
         found = interruptible(lambda: arig_table(table, listener, data, clips=clips, seed=seed, **trained))
         show(found, json, note=_INTERVALS)
         return
@@ -98,7 +115,7 @@ def listener_(
 
     options: dict[str, Any] = {
         "samples": samples, "limit": clips, "seed": seed, "order": order, "hop": hop,
-        "models": models, "steps": steps,
+        "models": models, "steps": steps, "split": split,
     }  # fmt: skip
     show(interruptible(lambda: sfms_table(int(table), listener, data, **options)), json, note=_INTERVALS)
 
@@ -115,13 +132,17 @@ def papers(
     clips: int | None = Option(None, min=1, help="At most this many dyads a table; all of them."),
     samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
     steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
+    seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4."),
+    split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
     from sfms_robot.lab.evaluation.arig_tables import EVERY, evaluate_papers
 
-    options: dict[str, Any] = {"clips": clips, "samples": samples, "steps": steps, "seed": seed}
+    options: dict[str, Any] = {
+        "clips": clips, "samples": samples, "steps": steps, "seed": seed, "seeds": seeds, "split": split,
+    }  # fmt: skip
     each = _quiet if json else _print_paper
     show(interruptible(lambda: evaluate_papers(data, models, table or EVERY, each, **options)), json, _quiet)
 
@@ -237,13 +258,14 @@ def interaction(
     listener: str = Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
     data: Path = Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
     clips: int | None = Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
     """Score a listener that speaks: its states against labels, its lips, and the borders of its chunks."""
     from sfms_robot.lab.evaluation.interaction import evaluate_interaction
 
-    show(evaluate_interaction(listener, data, clips, seed), json, _print_interaction)
+    show(evaluate_interaction(listener, data, clips, seed, split), json, _print_interaction)
 
 
 @app.command()
@@ -308,7 +330,7 @@ def _print_paper(name: str, found: Mapping[str, Any]) -> None:
 def _print_tokenizers(found: Mapping[str, Any]) -> None:
     """Print table 3 or 4 of the SFMS paper, or both."""
     for table in found.get("tables", [found]):
-        print_report(table, _TABLES[table["table"]], ("rows", "ratios", "truth_silhouette", "not_trained"))
+        print_report(table, _TABLES[table["table"]], ("rows", "ratios", "claims", "truth_silhouette", "not_trained"))
     say(f"{found['windows']} windows of {found['data']}; mse is the {found['unit']}", "dim")
     say("The paper's figures are of other motion: compare ratios.", "dim")
 

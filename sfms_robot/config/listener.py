@@ -18,7 +18,7 @@ Count = Annotated[int, Field(ge=1)]
 PerMinute = Annotated[float, Field(ge=0, le=60)]
 Levels = Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)]
 MotionSpace = Literal["arkit58", "faceverse58", "deca56"]
-Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
+Placement = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "adaptive", "learned"]
 GAZE_CHANNELS: Final = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
 # Conversational states of ARIG (3.3), in the order of the model's classes.
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
@@ -213,7 +213,7 @@ class Sfms(ListenerSettings):
         ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
             None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
         quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
-            codes, the product of its levels.
+            codes, the product of its levels. squashed: learned vectors lie in -1..1, as the grid's codes do.
         inpainter: added to straight lines (residual), or in place of them (paper).
         tokenizer_layers: transformer blocks in each of the inpainter's three parts.
     """
@@ -233,6 +233,7 @@ class Sfms(ListenerSettings):
     scores: Scores = Scores()
     quantizer: Literal["fsq", "vq"] = "fsq"
     code_dims: Count = 4
+    squashed: bool = False
     inpainter: Literal["residual", "paper"] = "residual"
     tokenizer_width: Count = 96
     tokenizer_layers: Count = 1
@@ -349,7 +350,8 @@ class Diffusion(Model):
 
     Attributes:
         width: of its condition and blocks; the paper takes that of its motion, 262.
-        train_steps: noise levels in training.
+        train_steps: noise levels in training. schedule: `cosine`; `logarithmic` has as many of them for each factor of
+            noise over motion, so that small motion is taught too.
         steps: of them used to sample one frame, spread evenly.
         sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
         temperature: factor on the noise that is added between steps; two: after the first step and before the last,
@@ -361,6 +363,7 @@ class Diffusion(Model):
     width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
     blocks: Count = 3
     train_steps: Annotated[int, Field(ge=2)] = 1000
+    schedule: Literal["cosine", "logarithmic"] = "cosine"
     steps: Count = 15
     sampler: Literal["ddpm", "ddim"] = "ddpm"
     temperature: Temperature = (1.0, 1.0)

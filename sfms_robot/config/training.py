@@ -60,6 +60,8 @@ class TokenizerTraining(Phase):
     Attributes:
         score_tracks: tracks (a window of one group) that the scores of `learned` learn from in a step.
         mask_loss: alpha of equation (13); temperature: first and last of Algorithm 1. Both of `learned_paper`.
+        tempered_draws: the temperature acts on what is drawn, as equation (6) reads; Algorithm 1 leaves the draw alone.
+        sparsity: weight of equation (8), of `adaptive`.
         commitment: weight of ||sg[z_q] - E(z)|| in equation (13), of quantizer vq.
         velocity_loss: weight of the error from one frame to the next.
     """
@@ -68,6 +70,8 @@ class TokenizerTraining(Phase):
     score_tracks: Count = 32
     mask_loss: NonNegative = 0.1
     temperature: tuple[Positive, Positive] = (2.0, 0.1)
+    tempered_draws: bool = False
+    sparsity: NonNegative = 0.1
     commitment: NonNegative = 1.0
     velocity_loss: NonNegative = 0.0
 
@@ -76,6 +80,8 @@ class PredictorTraining(Phase):
     """Phase 2: the next-token predictor.
 
     Attributes:
+        tokens: keyframes are placed in whole dyads or long stretches (dyads), or in each training window separately
+            (windows), as in the paper, whose tokenizer has the predictor's window.
         transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: it is taken out of the probabilities
             again afterwards, which the paper leaves open.
         dtw_weight, dtw_gamma: of the soft-DTW on the keyframe indicator (IV-D3), and how soft its minima are.
@@ -90,6 +96,7 @@ class PredictorTraining(Phase):
             of nods that a listener with events produces for a given size.
     """
 
+    tokens: Literal["dyads", "windows"] = "dyads"
     transition_weight: Positive = 0.5
     undo_weight: bool = True
     dtw_weight: NonNegative = 0.1
@@ -168,6 +175,7 @@ class ArigPhase(Phase):
             equation (3) weighs 1. The paper gives no weights.
         history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
         speaking_noise: the same of jaw and mouth while the agent speaks: its words decide them, not their past.
+        own_states: previous states are the model's own answers, as a stream feeds them; else true ones.
         state_noise: share of previous states that are drawn at random. A stream that continues from its own best guess
             needs it: true ones would be copied. One that draws its states (events) is trained with true ones.
         group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
@@ -188,6 +196,7 @@ class ArigPhase(Phase):
     coarse_weight: NonNegative = 0.5
     history_noise: NonNegative = 0.3
     speaking_noise: NonNegative = 1.0
+    own_states: bool = False
     state_noise: Share = 0.8
     group_weights: GroupWeights | None = None
     event_windows: Share = 0.0

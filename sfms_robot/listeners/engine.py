@@ -153,6 +153,8 @@ OUTSIDE: Final = frozenset(
     "max_gap_frames".split()
 )
 OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias")
+# Keys that came after graphs had been exported: their defaults are what those graphs do.
+LATER: Final[Mapping[str, object]] = {"squashed": False, "schedule": "cosine"}
 
 
 @dataclass(frozen=True)
@@ -189,6 +191,10 @@ def digest(settings: config.ListenerSettings) -> str:
     for group in known.get("groups", {}).values():
         for key in OUTSIDE_GROUPS:
             group.pop(key)
+    for part in (known, known.get("diffusion", {})):
+        for key, default in LATER.items():
+            if part.get(key) == default:
+                del part[key]
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:16]
 
 

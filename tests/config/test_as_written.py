@@ -67,6 +67,7 @@ SFMS = {
     "V-C: 40 past frames, 8 future ones": lambda one: (one.listener.past_frames, one.listener.future_frames) == (40, 8),
     "V-C: 8 frames in parallel": lambda one: not one.listener.sequential,
     "V-C: the window rolls on by what was predicted": lambda one: one.listener.hop_frames == 8,
+    "V-B, V-C: keyframes of each window by itself": lambda one: one.predictor.tokens == "windows",
     "V-B: windows of 48 frames": lambda one: one.listener.window_frames == 48,
     "nothing is done to the motion afterwards": lambda one: (
         one.listener.sampling.smoothing == 0 and one.listener.sampling.seam_frames == 1
@@ -75,9 +76,10 @@ SFMS = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("name", ["sfms-as-written", "sfms-paper"])
 @pytest.mark.parametrize("said", SFMS)
-def test_the_configuration_does_what_the_sfms_paper_says(said):
-    assert SFMS[said](trained("sfms-as-written"))
+def test_the_configuration_does_what_the_sfms_paper_says(said, name):
+    assert SFMS[said](trained(name))
 
 
 # --- ARIG -----------------------------------------------------------------------------------------------------------
@@ -121,9 +123,35 @@ ARIG = {
 }
 
 
+@pytest.mark.parametrize("name", ["arig-as-written", "arig-paper"])
 @pytest.mark.parametrize("said", ARIG)
-def test_the_configuration_does_what_the_arig_paper_says(said):
-    assert ARIG[said](trained("arig-as-written"))
+def test_the_configuration_does_what_the_arig_paper_says(said, name):
+    assert ARIG[said](trained(name))
+
+
+# --- the papers' sizes ----------------------------------------------------------------------------------------------
+
+WIDTHS = {
+    "sfms": {"tokenizer_width": 256, "predictor_width": 256},  # V-B
+    "arig": {"width": 512, "feedforward": 2048, "context_chunks": 512},  # A.2, 4.1
+}
+DEPTHS = {"layers", "tokenizer_layers", "predictor_layers", "speaker_layers"}  # V-A gives parameters and hours alone
+RUN_LENGTH = {"warm_up_steps", "checkpoint_every", "score_learning_rate"}
+
+
+@pytest.mark.parametrize("kind", WIDTHS)
+def test_the_paper_at_its_size_is_the_one_as_written_but_for_sizes(kind):
+    written, paper = (leaves(trained(f"{kind}-{ending}").model_dump(mode="json")) for ending in ("as-written", "paper"))
+    differing = {key for key in written.keys() | paper.keys() if written.get(key) != paper.get(key)}
+    assert differing - SIZES - DEPTHS - RUN_LENGTH - {"width"} <= WIDTHS[kind].keys()
+    assert {key: getattr(trained(f"{kind}-paper").listener, key) for key in WIDTHS[kind]} == WIDTHS[kind]
+    assert kind == "sfms" or trained("arig-paper").listener.diffusion.width == 262  # A.2
+
+
+def test_every_training_of_scores_states_their_learning_rate():
+    files = [file for file in TRAINING.glob("*.yaml") if isinstance(load_training(file), config.Training)]
+    assert len(files) == 4
+    assert [file.name for file in files if "score_learning_rate:" not in file.read_text()] == []
 
 
 def test_both_papers_optimizer_is_theirs():

@@ -132,3 +132,14 @@ def messages():
 def test_every_warning_and_error_is_explained():
     page = (ROOT / "docs" / "start" / "troubleshooting.md").read_text(encoding="utf-8")
     assert {text: place for text, place in messages().items() if text not in page} == {}
+
+
+# --- one source for speeds --------------------------------------------------------------------------------------------
+
+SPEED = r"\d[\d.,]* (?:ms|us|ticks/s|ticks a second|plans a second|of a core|MB resident)\b"
+
+
+def test_the_first_page_states_no_speed_that_the_measured_page_does_not():
+    measured = (ROOT / "docs" / "science" / "performance.md").read_text(encoding="utf-8")
+    said = re.findall(SPEED, (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert [each for each in said if each not in measured] == []

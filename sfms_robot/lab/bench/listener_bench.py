@@ -37,7 +37,7 @@ from sfms_robot.ports import Listener
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
-PAPER: Final = "sfms-paper"  # ships as a training only
+PAPER: Final = "sfms-large"  # ships as a training only
 TRAINED, SEEDED = "trained", "seeded, not trained"
 EAGER: Final = "eager"
 TURN_HOPS: Final = 4

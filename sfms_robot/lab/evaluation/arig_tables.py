@@ -26,11 +26,11 @@ from sfms_robot.frames import POSE, SHAPES, Doubles
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.intervals import Chosen, jackknife, people_of
+from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, Chosen, bootstrap, intervals, people_of, verdict
 from sfms_robot.lab.evaluation.listener_tables import collect, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts
-from sfms_robot.lab.evaluation.tokenizer_tables import TABLES as TOKENIZER_TABLES
+from sfms_robot.lab.evaluation.tokenizer_tables import PAPER_TABLES as TOKENIZER_TABLES
 from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table, needed
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
@@ -70,6 +70,13 @@ _PAPER: Final[Mapping[int, Mapping[str, tuple[float, ...]]]] = {  # tables 1 (on
         "ARIG": (0.125, 2.428, 2.397),
     },
 }
+# Other readings of what the paper leaves open, trained beside table 1: changes of the training, of the listener.
+READINGS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
+    "ARIG, states fed back": {"phase_changes": {"own_states": True}},
+    "ARIG, fine noise levels": {"changes": {"diffusion": {"schedule": "logarithmic"}}},
+    "ARIG, both": {"phase_changes": {"own_states": True}, "changes": {"diffusion": {"schedule": "logarithmic"}}},
+}
+_LEAST_ALIKE: Final = 0.5  # variance of faces that can be compared, over people's; at most its inverse
 # Changes to the listener's configuration behind the ablations' rows.
 ABLATIONS: Final[Mapping[int, Mapping[str, Mapping[str, Any]]]] = {
     1: {
@@ -106,32 +113,76 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
 
 def rows_of(
     number: int, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
-) -> list[dict[str, Any]]:
-    """Return the rows of table 1, 2 or 4: truth, ours by name, the paper's.
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the rows of table 1, 2 or 4 (truth, ours by name, the paper's), and what holds of the paper's statements.
 
-    Rows of tables 1 and 4 have the paper's RPCC, SID and Var beside ours. `people`: the listener of each clip, for
-    intervals over them.
+    Rows of tables 1 and 4 have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training after
+    another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
     """
 
     def row(name: str, source: str, values: Mapping[str, float | None]) -> dict[str, Any]:
-        return {"name": name, "source": source} | {
+        return {"name": name, "source": source, "trainings": None} | {
             key: None if value is None or not np.isfinite(value) else round(float(value), 5)
             for key, value in values.items()
         }
 
     centres, rows = metrics.centres_of(truth, PARTS, _CLUSTERS), []
+    draws, count = dict[str, dict[str, Doubles]](), len(truth)
     for name, made in {"Ground truth" if number == 2 else "GT": truth, **answers}.items():
 
         def score(clips: Chosen, made: Doubles = made) -> dict[str, float]:
-            return scores(truth[clips], made[clips], speaker[clips], centres)
+            return scores(truth[clips % count], made[clips], speaker[clips % count], centres)
 
-        found = {key: [round(end, 5) for end in ends] for key, ends in jackknife(score, people).items()}
-        rows.append({**row(name, "here", score(np.arange(len(truth)))), "interval": found})
+        trainings = len(made) // count
+        draws[name] = bootstrap(score, [*people] * trainings, np.repeat(range(trainings), count).tolist())
+        found = {key: [round(end, 5) for end in ends] for key, ends in intervals(draws[name]).items()}
+        all_clips = row(name, "here", score(np.arange(len(made))))
+        rows.append({**all_clips, "trainings": trainings, "interval": found})
     if number == 2:
-        return rows + [row(name, "paper", dict(zip(_NAMES, each, strict=True))) for name, each in _PAPER_2.items()]
+        paper_rows = [row(name, "paper", dict(zip(_NAMES, each, strict=True))) for name, each in _PAPER_2.items()]
+        return rows + paper_rows, []
+    said = claims(number, {each["name"]: each for each in rows}, draws, truth)
     paper, columns = _PAPER[number], ("paper RPCC", "paper SID", "paper Var")
     rows += [row(name, "paper", dict.fromkeys(_NAMES)) for name in paper.keys() - {each["name"] for each in rows}]
-    return [each | dict(zip(columns, paper.get(each["name"], (None,) * 3), strict=True)) for each in rows]
+    return [each | dict(zip(columns, paper.get(each["name"], (None,) * 3), strict=True)) for each in rows], said
+
+
+def claims(
+    number: int, rows: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
+) -> list[dict[str, Any]]:
+    """Return what holds of: with all parts more kinds of motion, an RPCC and a variance nearer to people's.
+
+    Differences are of the same people, over people and trainings (`intervals.verdict`). Fewer than three trainings
+    leave it open; so does, of kinds of motion, a face that does not vary as people's do or lies far from them: noise
+    has every kind.
+    """
+
+    def alike(name: str, part: str) -> bool:
+        own, people = (rows[one][f"Var {part}"] for one in (name, "GT"))
+        near = rows[name][f"FD {part}"] <= metrics.variance(truth[..., PARTS[part]], "sum")
+        return bool(near and _LEAST_ALIKE * people <= own <= people / _LEAST_ALIKE)
+
+    found = []
+    for name in (each for each in ABLATIONS[number] if draws.get("ARIG") and draws.get(each)):
+        enough = min(rows[each]["trainings"] for each in ("ARIG", name)) >= LEAST_SEEDS
+        for part in PARTS:
+            for metric in ("SID", "RPCC", "Var"):
+                whole, less = (_merit(metric, draws[each], draws["GT"], part) for each in ("ARIG", name))
+                interval = intervals({"": whole - less}).get("") if enough else None
+                comparable = metric != "SID" or (alike("ARIG", part) and alike(name, part))
+                found.append({
+                    "name": name, "figure": f"{metric} {part}",
+                    "with all parts better by": round(float(np.mean(whole - less)), 5),
+                    "interval": interval and [round(end, 5) for end in interval],
+                    "verdict": verdict(interval, comparable=comparable),
+                })  # fmt: skip
+    return found
+
+
+def _merit(metric: str, row: Mapping[str, Doubles], people: Mapping[str, Doubles], part: str) -> Doubles:
+    """Return a figure of each draw as a number of which more is better."""
+    values = row[f"{metric} {part}"]
+    return values if metric == "SID" else -values if metric == "RPCC" else -np.abs(values - people[f"Var {part}"])
 
 
 # --- listeners that are played --------------------------------------------------------------------------------------
@@ -147,6 +198,8 @@ def arig_table(
     models: Path | None,
     training: Path | None = None,
     steps: int | None = None,
+    seeds: int = 1,
+    split: str = "test",
     train: bool = True,
 ) -> dict[str, Any]:
     """Return `arig-2`: `names` side by side on the listening set; or `arig-1`, `arig-4`: ablations, on interaction.
@@ -160,42 +213,59 @@ def arig_table(
         models: Folder of listeners that only tables need; with it each table includes the paper as written.
         training: Training file of the ablations; None: the paper as written.
         steps: Of a training, in place of the file's.
+        seeds: Trainings of each row of `arig-1` and `arig-4`.
+        split: Part of the dyads.
         train: Train missing ablations; else their rows are left out.
 
     Raises ConfigError.
     """
     if name not in ARIG_TABLES:
         raise ConfigError(f"--table {name}: is not one of {', '.join(ARIG_TABLES)}")
-    scenes = open_scenes(data, "validation")
+    scenes = open_scenes(data, split)
     number = int(name.removeprefix("arig-"))
     scene = "listening" if number == 2 else "interaction"
     if scene not in scenes:
-        raise ConfigError(f"{data / scene}: no validation dyads, which --table {name} needs")
+        raise ConfigError(f"{data / scene}: no {split} dyads, which --table {name} needs")
     held_out = [dyad for dyad in spread_clips(scenes[scene], clips) if len(dyad.listener) >= CLIP_FRAMES]
     if not held_out:
-        raise ConfigError(f"{data}: no validation dyad is as long as a clip of {CLIP_FRAMES} frames")
-    folders = {one: find("listeners", one, "config.yaml") for one in names}
+        raise ConfigError(f"{data}: no {split} dyad is as long as a clip of {CLIP_FRAMES} frames")
+    folders = {one: [find("listeners", one, "config.yaml")] for one in names}
     if number != 2 and train:
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
         unchanged = "arig-as-written" if training is None else "arig"
+        rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **(READINGS if number == 1 else {})}
+        rows |= {label: {"changes": changes} for label, changes in ABLATIONS[number].items()}
         folders = {
-            label: trained(
-                "arig", models / (label.replace("/", "").replace(" ", "-").lower() if changes else unchanged), data,
-                file=training, steps=steps, changes=changes,
-            )
-            for label, changes in {"ARIG": {}, **ABLATIONS[number]}.items()
+            label: [
+                trained(
+                    "arig", models / (_folder(label) if differing else unchanged), data,
+                    file=training, steps=steps, seed=trial, changes=differing.get("changes", {}),
+                    phase_changes=differing.get("phase_changes", {}),
+                )
+                for trial in range(1, seeds + 1)
+            ]
+            for label, differing in rows.items()
         } | folders  # fmt: skip
     elif models is not None:
-        folders[LABELS["arig"]] = trained("arig", models / "arig-as-written", data, steps=steps)
+        folders[LABELS["arig"]] = [trained("arig", models / "arig-as-written", data, steps=steps)]
     answers = {}
-    for label, folder in folders.items():
-        rolled = rollouts(load_listener(folder), tracked(held_out, label), seed, CLIP_FRAMES)
-        answers[label] = cut([one.motion[0] for one in rolled], CLIP_FRAMES)
+    for label, each in folders.items():
+        rolled = [
+            one.motion[0]
+            for folder in each
+            for one in rollouts(load_listener(folder), tracked(held_out, label), seed, CLIP_FRAMES)
+        ]
+        answers[label] = cut(rolled, CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], CLIP_FRAMES)
-    rows = rows_of(number, truth, speaker, answers, people)
-    return {"table": name, "clips": len(truth), "frames": CLIP_FRAMES, "rows": rows}
+    scored, said = rows_of(number, truth, speaker, answers, people)
+    found = {"table": name, "split": split, "clips": len(truth), "frames": CLIP_FRAMES, "rows": scored}
+    return found if number == 2 else {**found, "claims": said}
+
+
+def _folder(label: str) -> str:
+    return label.replace("/", "").replace(",", "").replace(" ", "-").lower()
 
 
 def training_file(kind: Kind) -> Path:
@@ -210,23 +280,28 @@ def trained(
     *,
     file: Path | None = None,
     steps: int | None = None,
+    seed: int = 1,
     order: Order | None = None,
     changes: Mapping[str, Any] = MappingProxyType({}),
+    phase_changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> Path:
-    """Return `out`, a folder with a listener of a paper, which is trained on `data` if it is missing.
+    """Return a folder with a listener of a paper, which is trained on `data` if it is missing: `out`, or OUT-seedN.
 
     Training takes half an hour or more of one core; an interrupted one is resumed. `file`: of the training; None: as
-    written. `steps`: of every phase, in place of the file's. `changes`: of the listener. Raises ConfigError.
+    written. `steps`: of every phase, in place of the file's. `changes`: of the listener; `phase_changes`: of ARIG's
+    training. Raises ConfigError.
     """
-    file = file or training_file(kind)
+    file, out = file or training_file(kind), out if seed == 1 else out.with_name(f"{out.name}-seed{seed}")
     if load_training(file).listener.kind != kind:
         raise ConfigError(f"{file}: listener.kind is not {kind}")
 
     def options(job: str) -> TrainOptions:
         begun = checkpoint_file(out, job).is_file()
         return TrainOptions(
-            file=file, data=data, out=out, resume=begun, steps=steps, tensorboard=False, order=order, changes=changes
-        )
+            file=file, data=data, out=out, resume=begun, steps=steps, seed=None if seed == 1 else seed,
+            tensorboard=False, order=order,
+            changes=changes, phase_changes=phase_changes,
+        )  # fmt: skip
 
     if not (out / checkpoint.WEIGHTS).is_file():
         if kind == "sfms" and not (out / TOKENIZER_WEIGHTS).is_file():
@@ -253,6 +328,8 @@ def evaluate_papers(
     samples: int,
     steps: int | None,
     seed: int,
+    seeds: int = 1,
+    split: str = "test",
 ) -> dict[str, Any]:
     """Return every table; call `each(name, table)` as soon as one is done.
 
@@ -268,6 +345,8 @@ def evaluate_papers(
         samples: Answers to every clip of tables 1 and 2.
         steps: Of every training, in place of its file's.
         seed: Of the listeners.
+        seeds: Trainings of each row of ARIG's tables 1 and 4.
+        split: Part of the dyads; of tables 3 and 4 the held-out recordings.
 
     Raises ConfigError.
     """
@@ -280,11 +359,15 @@ def evaluate_papers(
             found[name] = evaluate_table(name, models=None if models is None else models / "tokenizers", steps=steps)
         elif name in _SFMS_TABLES:
             found[name] = sfms_table(
-                int(name), [_SFMS], data, samples=samples, limit=clips, seed=seed, models=models, steps=steps
-            )
+                int(name), [_SFMS], data, samples=samples, limit=clips, seed=seed, models=models, steps=steps,
+                split=split,
+            )  # fmt: skip
         else:
             names, train = [_ARIG, _SFMS] if name == "arig-2" else [_ARIG], models is not None
-            found[name] = arig_table(name, names, data, clips=clips, seed=seed, models=models, steps=steps, train=train)
+            found[name] = arig_table(
+                name, names, data, clips=clips, seed=seed, models=models, steps=steps, seeds=seeds, split=split,
+                train=train,
+            )  # fmt: skip
         if models is None:
             found[name]["not_trained"] = _not_trained(name)
         each(name, found[name])
@@ -303,6 +386,7 @@ def sfms_table(
     hop: int | None = None,
     models: Path | None = None,
     steps: int | None = None,
+    split: str = "test",
 ) -> dict[str, Any]:
     """Return table 1 or 2 of SFMS for listeners by name; with a folder `models` also for the paper as written."""
     listeners = {name: load_at_hop(name, hop, "auto") for name in names}
@@ -312,11 +396,11 @@ def sfms_table(
     space = shared_space(listeners)
     features = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
     train, held_out = (
-        spread_clips(open_for(space.name, data, split, order, features), most)
-        for split, most in (("train", _TRAIN_DYADS), ("validation", limit))
+        spread_clips(open_for(space.name, data, part, order, features), most)
+        for part, most in (("train", _TRAIN_DYADS), (split, limit))
     )
     found, given = collect(number, listeners, space, train, held_out, range(seed, seed + samples))
-    return table(number, found, given, samples, seed)
+    return {**table(number, found, given, samples, seed), "split": split}
 
 
 def _not_trained(name: str) -> dict[str, str]:

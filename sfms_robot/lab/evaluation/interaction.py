@@ -32,8 +32,8 @@ States = NDArray[np.int8]
 Bools = NDArray[np.bool_]
 
 
-def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) -> dict[str, Any]:
-    """Return figures of states, lips, chunk borders and the end of speech on the validation sets of `data`.
+def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, split: str = "test") -> dict[str, Any]:
+    """Return figures of states, lips, chunk borders and the end of speech on the sets of `data` of a split.
 
     At most `clips` dyads of each set. Raises ConfigError for a listener without states, or data without such sets.
     """
@@ -41,7 +41,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
     settings = getattr(getattr(listener, "how", listener), "settings", None)
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this command evaluates listeners of kind arig")
-    held_out = {scene: spread_clips(dyads, clips) for scene, dyads in open_scenes(data, "validation").items()}
+    held_out = {scene: spread_clips(dyads, clips) for scene, dyads in open_scenes(data, split).items()}
     rolled = {scene: rollouts(listener, tracked(dyads, f"{name}, {scene}"), seed) for scene, dyads in held_out.items()}
     every = [one for scene in held_out for one in rolled[scene]]
     dyads = [dyad for each in held_out.values() for dyad in each]
@@ -53,6 +53,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int) ->
             lips |= {f"lips_{scene}_{key}": value for key, value in jaw_tracking(made, recorded).items()}
     return {
         "listener": name,
+        "split": split,
         "dyads": {scene: len(each) for scene, each in held_out.items()},
         "chunk_border_acceleration_ratio": border_ratio(motions, settings.chunk_frames),
         "dyads_border_acceleration_ratio": border_ratio(people, settings.chunk_frames),

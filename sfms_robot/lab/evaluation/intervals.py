@@ -2,19 +2,18 @@
 
 Whole people are drawn with replacement, not their minutes or their nods, which depend on one another. For the bootstrap
 (`estimates`) a figure is a function of sums over people, so a person is one row of sums, computed once for all draws.
-Most sums are pairs: a count and its base. Metrics of the papers that pool all clips are not such functions; for these
-`jackknife` leaves out one person at a time, which takes as many evaluations as there are people instead of thousands.
+Most sums are pairs: a count and its base. Metrics of the papers that pool all clips are not such functions; `bootstrap`
+evaluates these again for each of fewer draws.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
 
 from sfms_robot.frames import Doubles
 from sfms_robot.lab.corpora.clips import Dyad, series
@@ -22,7 +21,9 @@ from sfms_robot.lab.corpora.clips import Dyad, series
 LEVEL: Final = 0.95
 DRAWS: Final = 2000
 _DEFINED: Final = 0.9  # share of the draws in which a figure has to be defined to have an interval
-_LEAST_PEOPLE: Final = 3  # for a jackknife
+POOLED_DRAWS: Final = 200  # of metrics that pool all clips
+LEAST_SEEDS: Final = 3  # trainings, for what a paper states
+_LEAST_PEOPLE: Final = 3
 
 Sums = dict[str, Doubles]  # of one person: name -> numbers (K,)
 Totals = Mapping[str, Doubles]  # of R sets of people: name -> (R, K)
@@ -119,7 +120,7 @@ def median(name: str, middles: Doubles) -> Figure:
     return figure
 
 
-# --- leaving out one person at a time -------------------------------------------------------------------------------
+# --- metrics that pool all clips ------------------------------------------------------------------------------------
 
 
 def people_of(dyads: Sequence[Dyad], lengths: Sequence[int], frames: int) -> list[str]:
@@ -136,22 +137,60 @@ def people_of(dyads: Sequence[Dyad], lengths: Sequence[int], frames: int) -> lis
     return [person(dyad) for dyad, length in zip(dyads, lengths, strict=True) for _ in range(length // frames)]
 
 
-def jackknife(score: Callable[[Chosen], Mapping[str, Any]], people: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return the interval of every finite figure of `score(clips)`; none for fewer than three people.
+def bootstrap(
+    score: Callable[[Chosen], Mapping[str, Any]],
+    people: Sequence[str],
+    runs: Sequence[int] = (),
+    seed: int = 0,
+    draws: int = POOLED_DRAWS,
+) -> dict[str, Doubles]:
+    """Return each figure of `score(clips)` in `draws` sets of people (R,), NaN where it is not finite.
 
-    `people` names the listener of each clip. With n people and s the standard deviation of the n figures without one of
-    them, the interval is the figure of all +- t(n - 1) sqrt(n - 1) s.
+    One seed gives the same people for any score, so two of these subtract pair by pair. Empty for fewer than three
+    people.
+
+    Args:
+        score: Figures of the clips at these places, which may repeat.
+        people: The listener of each clip.
+        runs: The training of each clip's motion, drawn with replacement too; empty: one training.
+        seed: Of the draws.
+        draws: Number of sets.
     """
-    who = np.asarray(people)
-    names = np.unique(who)
+    names, who = np.unique(np.asarray(people), return_inverse=True)
+    kinds, run = np.unique(np.asarray(runs if len(runs) else [0] * len(people)), return_inverse=True)
     if len(names) < _LEAST_PEOPLE:
         return {}
-    parts = [score(np.flatnonzero(who != name)) for name in names]
-    wide = float(student_t.ppf((1 + LEVEL) / 2, len(parts) - 1))
+    clips = [[np.flatnonzero((who == one) & (run == kind)) for kind in range(len(kinds))] for one in range(len(names))]
+    of_people, of_runs = (np.random.default_rng((seed, number)) for number in range(2))
+    found = []
+    for _ in range(draws):
+        drawn, trained = (rng.integers(n, size=n) for rng, n in ((of_people, len(names)), (of_runs, len(kinds))))
+        found.append(score(np.concatenate([clips[one][kind] for one in drawn for kind in trained])))
+    return {name: np.array([row[name] for row in found], np.float64) for name in found[0]}
+
+
+def intervals(draws: Mapping[str, Doubles]) -> dict[str, tuple[float, float]]:
+    """Return the interval of each figure of `bootstrap` that nearly all draws define."""
     found = {}
-    for name, value in score(np.arange(len(who))).items():
-        without = np.array([part[name] for part in parts], np.float64)
-        if value is not None and np.isfinite(without).all() and np.isfinite(value):
-            reach = wide * float(np.sqrt((len(parts) - 1) * np.var(without)))
-            found[name] = (float(value) - reach, float(value) + reach)
+    for name, values in draws.items():
+        defined = values[np.isfinite(values)]
+        if len(defined) >= _DEFINED * len(values):
+            low, high = ends(defined).tolist()
+            found[name] = (low, high)
     return found
+
+
+# --- what a paper states --------------------------------------------------------------------------------------------
+
+Verdict = Literal["holds", "does not hold", "open"]
+
+
+def verdict(interval: tuple[float, float] | None, bound: float = 0.0, *, comparable: bool = True) -> Verdict:
+    """Return whether "above `bound`", as a paper states it, holds of a figure with this interval.
+
+    It holds where the whole interval is above the bound and does not hold where the whole interval is at or below it.
+    Else, without an interval, and where what is compared is not `comparable`, it is open.
+    """
+    if interval is None or not comparable:
+        return "open"
+    return "holds" if interval[0] > bound else "does not hold" if interval[1] <= bound else "open"

@@ -29,7 +29,7 @@ from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.detection import behaviour
-from sfms_robot.lab.evaluation.intervals import Chosen, finite, jackknife, people_of
+from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, finite, intervals, people_of
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import (
     frames_of_dyad,
@@ -103,10 +103,12 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
     """
     score_of = _table_1(clips) if number == 1 else partial(_table_2, clips)
     guesses = {"Ground truth": clips.truth[:, None], **heuristics(clips, samples, seed)}
+    if number == 2:
+        guesses["Last frame held"] = held(clips.truth)[:, None]
     rows = []
     for name, motion in {**guesses, **answers}.items():
         score = score_of(motion)
-        over = jackknife(score, clips.people) if name in answers else {}
+        over = intervals(bootstrap(score, clips.people)) if name in answers else {}
         rows.append({"name": name, "source": "here", **score(np.arange(len(clips.truth))), "interval": over})
     if number == 1:
         keys = [f"{part} {column}" for part in metrics.CLUSTERS for column in _COLUMNS_1]
@@ -153,6 +155,15 @@ def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
     for name, motion in still.items():
         answers[name] = np.repeat(np.broadcast_to(motion, (n, t, d))[:, None], samples, axis=1)
     return answers
+
+
+def held(truth: Doubles, frames: int = 8) -> Doubles:
+    """Return clips (N, T, D) in which the last true frame before each plan of `frames` frames is repeated.
+
+    An answer of this kind knows nothing but the true past: what a figure says of it, no listener has to be asked.
+    """
+    at = np.arange(truth.shape[1])
+    return truth[:, np.maximum(at // frames * frames - 1, 0)]
 
 
 def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
@@ -226,12 +237,12 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
 _PLACEMENTS: tuple[Strategy, ...] = ("exact", "penalised", "static", "static_paper", "learned")
 
 
-def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dict[str, Any]:
+def evaluate_tokenizer(name: str, data: Path, order: Order | None = None, split: str = "test") -> dict[str, Any]:
     """Return the held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
     folder = find("listeners", name, "config.yaml")
     settings, listener = config.load(config.Sfms, folder / CONFIG), load_folder(folder, "torch")
     model = listener.model
-    dyads = open_for(listener.space.name, data, "validation", order)
+    dyads = open_for(listener.space.name, data, split, order)
     corpus = gather(dyads, model.tokenizer.window, listener.space, None, settings)
     placements = [
         each for each in _PLACEMENTS if (each == "penalised") == (settings.placement == "penalised")
@@ -239,6 +250,7 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
     ]  # fmt: skip
     return {
         "listener": name,
+        "split": split,
         "window": model.tokenizer.window,
         "rows": [
             {"name": each, "mse": reconstruction_error(model, corpus, each)}
@@ -248,15 +260,20 @@ def evaluate_tokenizer(name: str, data: Path, order: Order | None = None) -> dic
 
 
 def evaluate_listener(
-    names: Sequence[str], data: Path, seed: int, order: Order | None = None, hop: int | None = None
+    names: Sequence[str],
+    data: Path,
+    seed: int,
+    order: Order | None = None,
+    hop: int | None = None,
+    split: str = "test",
 ) -> dict[str, Any]:
     """Stream the held-out speakers of `data` through listeners; return their behaviour beside that of the dyads.
 
     For an SFMS listener the rows also have its keyframe scores. `hop`: see `load_at_hop`.
     """
-    dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, "validation", order))]
+    dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split, order))]
     if not dyads:
-        raise ConfigError(f"{data}: no dyad of validation can be read")
+        raise ConfigError(f"{data}: no dyad of {split} can be read")
     rows: list[dict[str, Any]] = []
     for name in names:
         listener = load_at_hop(name, hop)
@@ -270,6 +287,7 @@ def evaluate_listener(
     rows.append({"name": "dyads", **behaviour([dyad.listener for dyad in dyads], dyads)})
     return {
         "listeners": list(names),
+        "split": split,
         "dyads": len(dyads),
         "rows": [finite(row) for row in rows],
     }
@@ -333,10 +351,15 @@ def collect(
         train=cut(learned, frames),
         people=people_of(held_out, [len(one.motion) for one in heard], frames),
     )
-    return clips, {
+    answers = {
         name: cut([_answered(listener, space, dyad, seeds, frames) for dyad in tracked(held_out, name)], frames)
         for name, listener in listeners.items()
     }
+    for name, listener in listeners.items() if number == 2 else ():
+        if isinstance(listener, SfmsListener) and hasattr(listener.engine, "model"):
+            rolled = (offline_rollout(listener, dyad, seeds, true_past=True) for dyad in held_out)
+            answers[f"{name}, true past"] = cut([np.asarray(one.motion) for one in rolled], frames)
+    return clips, answers
 
 
 def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:

@@ -29,14 +29,14 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
-from sfms_robot.lab.learning.sfms.features import frames_of
+from sfms_robot.lab.learning.sfms.features import frames_of, keyframe_tokens, place_all
 from sfms_robot.listeners.arig.stream import ArigMemory
 from sfms_robot.listeners.capacity import step_each
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
 from sfms_robot.listeners.registry import at_hop, hops_of, load_listener, one_thread
-from sfms_robot.listeners.sfms.draw import Context, later, passed, revoked
+from sfms_robot.listeners.sfms.draw import UNDECIDED, Context, later, passed, revoked
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.ports import Listener
 from sfms_robot.processes import process_pool
@@ -200,8 +200,13 @@ class OfflineRollout:
     tokens: Tensor
 
 
-def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) -> OfflineRollout:
+def offline_rollout(
+    listener: SfmsListener, dyad: Dyad, seeds: Sequence[int], *, true_past: bool = False
+) -> OfflineRollout:
     """Compute `rollout` from arrays, with the dyad's events for a listener that follows events.
+
+    `true_past`: each plan continues from what the dyad's listener did, not from what this one planned before; it needs
+    engine torch.
 
     Raises ConfigError when the dyad's space cannot become the listener's, or the dyad has no events.
     """
@@ -221,6 +226,7 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
     drawn = np.repeat(np.maximum(tokens[:, -1:], 0), frames + ahead + 1, axis=1)
     shown = np.repeat(path[:, :1], frames + ahead + 1, axis=1)
     settled = np.array([past - 1])
+    truth = _true_past(listener, heard.motion) if true_past else None
     for now in range(0, frames, listener.hop):  # the newest frame heard
         frames_passed = listener.hop if now else 1
         tokens, path = passed(tokens, path, frames_passed, listener.holds)
@@ -229,6 +235,9 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
             control, before = listener.told([asked]), later(control, frames_passed)
             tokens, settled = revoked(tokens, before, control, ahead)
         window = slice(now + 1, now + 1 + past)
+        if truth is not None:
+            tokens[:, :past], tokens[:, past:] = truth[0][window], UNDECIDED
+            path[:, :2] = truth[1][now : now + 2]
         seen = Context(
             face=face[None, window],
             face_known=known[None, window],
@@ -244,6 +253,16 @@ def offline_rollout(listener: SfmsListener, dyad: Dyad, seeds: Sequence[int]) ->
     sway = np.stack([listener.sway.start(seed) for seed in seeds])
     motion = listener.with_sway(shown[:, :frames], sway, 0)
     return OfflineRollout(torch.from_numpy(motion), torch.from_numpy(drawn[:, :frames]))
+
+
+@torch.no_grad()
+def _true_past(listener: SfmsListener, motion: Tensor) -> tuple[NDArray[Any], Floats]:
+    """Return tokens (P + N, G) and standardised motion (1 + N, C) of a motion (N, C), led by a face at rest."""
+    model, rest = listener.model, listener.at_rest()
+    standard = model.standardise(motion)
+    mask = place_all(model.tokenizer, standard, [len(standard)])
+    tokens = torch.where(mask > 0.5, keyframe_tokens(model, standard), 0).numpy()
+    return np.concatenate([rest[0][: -listener.horizon], tokens]), np.concatenate([rest[1][:1], standard.numpy()])
 
 
 def _led(rows: NDArray[Any], frames: int) -> NDArray[Any]:

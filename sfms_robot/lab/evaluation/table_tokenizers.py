@@ -3,12 +3,14 @@
 Sizes: "small" has width 64, about a fifth of a million parameters, and takes one to two minutes each on one core;
 "paper" has about the parameters of table IV, for a GPU. Names state the content: sparse-all-k10 has a keyframe set for
 each channel and 10 keyframes a window; as-written ones have the paper's scores, learned by Algorithm 1, and its
-inpainter, which is not added to straight lines. The baselines have one code a frame, or one every eight frames.
+inpainter, which is not added to straight lines. NAME-seed2 is NAME trained with seed 2. The baselines have one code a
+frame, or one every eight frames.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -30,57 +32,107 @@ from sfms_robot.listeners.sfms.quantizer import Codebook, Grid
 SizeName = Literal["small", "paper"]
 KEYFRAMES: Final = (3, 7, 10)  # of table III
 AS_WRITTEN: Final = "as-written"
+_SEED: Final = "-seed"
 
 # Of each size: width, layers of each part of the sparse inpainter, layers on either side of a baseline's codes, width
 # of the scores, training.
 SIZES: Final[dict[str, tuple[int, int, int, int, dict[str, Any]]]] = {
-    "small": (64, 1, 2, 32, {"steps": 1000, "batch": 16, "learning_rate": 2e-3, "score_tracks": 16}),
+    "small": (
+        64, 1, 2, 32,
+        {"steps": 1000, "batch": 16, "learning_rate": 2e-3, "score_learning_rate": 3e-3, "score_tracks": 16},
+    ),
     "paper": (
         256, 4, 12, 128,
-        {"steps": 20_000, "batch": 128, "learning_rate": 3e-4, "precision": "bf16", "score_tracks": 64},
+        {
+            "steps": 20_000, "batch": 128, "learning_rate": 3e-4, "score_learning_rate": 3e-4, "precision": "bf16",
+            "score_tracks": 64,
+        },
     ),
 }  # fmt: skip
 _SCALAR: Final = (256,)  # of one channel: four coarse digits of one number are harder to learn, twice the error
 _PAPER: Final = {"placement": "learned_paper", "inpainter": "paper"}
+_ALIKE: Final = {"quantizer": "vq", "squashed": True}
 _ALL: Final = {"preset": "all", "levels": _SCALAR}
 _ONE: Final = {"preset": "one", "levels": (4, 4, 4, 4), "keyframes": 10}
+_LONGER: Final = (8_000, 30_000)  # steps: is Algorithm 1 given too few, or does it collapse?
+_PLACED: Final[dict[str, dict[str, Any]]] = {  # table III: what differs, by the ending of the name
+    "": {},
+    "-static": {"placement": "static"},
+    "-static_paper": {"placement": "static_paper"},
+    "-algorithm-1": {"placement": "learned_paper"},
+    "-paper-inpainter": {"inpainter": "paper"},
+    "-static-paper-inpainter": {"placement": "static", "inpainter": "paper"},
+    "-static_paper-paper-inpainter": {"placement": "static_paper", "inpainter": "paper"},
+    f"-{AS_WRITTEN}": _PAPER,
+    f"-{AS_WRITTEN}-tempered": _PAPER,
+    f"-{AS_WRITTEN}-slower-scores": _PAPER,
+}
+_TRAINED: Final[dict[str, dict[str, Any]]] = {  # how training differs, by the ending of the name
+    "-tempered": {"tempered_draws": True},
+    "-slower-scores": {"score_learning_rate": 3e-4},
+    **{f"-{steps}": {"steps": steps} for steps in _LONGER},
+}
 _SPARSE: Final[dict[str, dict[str, Any]]] = {  # the groups and what else differs, by name
     **{
         f"sparse-all-k{k}{ending}": {"groups": _ALL | {"keyframes": k}, **changes}
-        for k in KEYFRAMES  # table III
-        for ending, changes in (
-            ("", {}),
-            ("-static", {"placement": "static"}),
-            ("-static_paper", {"placement": "static_paper"}),
-            (f"-{AS_WRITTEN}", _PAPER),
-        )
+        for k in KEYFRAMES
+        for ending, changes in _PLACED.items()
     },
+    **{f"sparse-all-k7-{AS_WRITTEN}-{steps}": {"groups": _ALL | {"keyframes": 7}, **_PAPER} for steps in _LONGER},
+    "sparse-all-k7-adaptive": {"groups": _ALL | {"keyframes": 7}, **_PAPER, "placement": "adaptive"},
     "sparse-one-k10": {"groups": _ONE},
     "sparse-one-k10-static_paper": {"groups": _ONE, "placement": "static_paper"},
     "sparse-all-k10-vq-256": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq"},  # table IV
     f"sparse-all-k10-vq-256-{AS_WRITTEN}": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq", **_PAPER},
+    # As many dimensions, squashed alike, and so as many weights as the grid's.
+    "sparse-all-k10-vq-256-1d": {"groups": _ALL | {"keyframes": 10}, **_ALIKE, "code_dims": 1},
+    "sparse-all-k10-fsq-4444": {"groups": _ALL | {"keyframes": 10, "levels": (4, 4, 4, 4)}},
+    "sparse-all-k10-vq-256-4d": {"groups": _ALL | {"keyframes": 10}, **_ALIKE, "code_dims": 4},
 }
 _BASELINES: Final = {  # kind, quantizer, levels
     "dense-vq-1024": ("dense", "vq", (1024,)),
     "l2l-vq-256": ("grouped", "vq", (256,)),
     "dense-fsq-1024": ("dense", "fsq", (8, 5, 5, 5)),
+    "dense-fsq-32": ("dense", "fsq", (8, 4)),  # figure 6
+    "dense-fsq-200": ("dense", "fsq", (8, 5, 5)),
 }
 
 
 def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, config.Recipe]:
     """Return every tokenizer of both tables."""
     width, layers, baseline_layers, score_width, training = SIZES[size]
-    training = {**training, "evaluate_every": 0, **({} if steps is None else {"steps": steps})}
+    training, asked = {**training, "evaluate_every": 0}, {} if steps is None else {"steps": steps}
     shared = {
         "kind": "sfms", "placement": "learned", "tokenizer_width": width, "tokenizer_layers": layers,
         "scores": {"width": score_width}, "quantizer": "fsq", "inpainter": "residual",
     }  # fmt: skip
-    raw = {name: {"model": shared | changes, "training": training} for name, changes in _SPARSE.items()}
+    raw = {
+        name: {"model": shared | changes, "training": _differing(name, training)} for name, changes in _SPARSE.items()
+    }
     for name, (kind, quantizer, levels) in _BASELINES.items():
         model = {"kind": kind, "quantizer": quantizer, "levels": levels, "width": width, "layers": baseline_layers}
         # The encoder term of Learning2Listen's published configuration weighs a quarter.
         raw[name] = {"model": model, "training": training | {"commitment": 0.25}}
-    return {name: parse(config.Recipe, each, name) for name, each in raw.items()}
+    return {
+        name: parse(config.Recipe, each | {"training": each["training"] | asked}, name) for name, each in raw.items()
+    }
+
+
+def _differing(name: str, training: dict[str, Any]) -> dict[str, Any]:
+    for ending, changes in _TRAINED.items():
+        training = training | changes if name.endswith(ending) else training
+    return training
+
+
+def seeded(name: str, seeds: int) -> list[str]:
+    """Return the names of one tokenizer trained with seeds 1 to `seeds`."""
+    return [name, *(f"{name}{_SEED}{seed}" for seed in range(2, seeds + 1))]
+
+
+def recipe_of(name: str, size: SizeName = "small", steps: int | None = None) -> config.Recipe:
+    """Return the recipe of a tokenizer, perhaps with the seed of its name."""
+    base, _, seed = name.partition(_SEED)
+    return recipes(size, steps)[base].model_copy(update={"seed": int(seed or 1)})
 
 
 # --- baselines ------------------------------------------------------------------------------------------------------
@@ -265,22 +317,35 @@ class TableModel(nn.Module):
         return torch.cat(parts)
 
     @torch.no_grad()
-    def restore(self, motion: Tensor, strategy: Strategy | None = None) -> Tensor:
-        """Encode and decode standardised windows (W, T, C)."""
+    def restore(self, motion: Tensor, mask: Tensor | None = None, *, rounded: bool = True) -> Tensor:
+        """Encode and decode standardised windows (W, T, C), with keyframes at a mask (W, T, G) if given.
+
+        Not `rounded`: from what the encoder says, before a code is chosen; of sparse tokenizers.
+        """
         tokenizer = self.tokenizer
         if isinstance(tokenizer, DenseTokenizer):
             return torch.cat([tokenizer.decode(tokenizer.encode(some)) for some in torch.split(motion, _CHUNK)])
-        both = zip(*(torch.split(each, _CHUNK) for each in (motion, self.mask(motion, strategy))), strict=True)
-        return torch.cat([tokenizer.decode(tokenizer.encode(some, at)) for some, at in both])
+        mask = self.mask(motion) if mask is None else mask
+        both = zip(*(torch.split(each, _CHUNK) for each in (motion, mask)), strict=True)
+        if rounded:
+            return torch.cat([tokenizer.decode(tokenizer.encode(some, at)) for some, at in both])
+        quantizer = tokenizer.quantizer
+        bound = torch.tanh if isinstance(quantizer.codebook, Grid) else torch.nn.Identity()
+        return torch.cat([tokenizer.inpaint(bound(quantizer.latent(some)), at) for some, at in both])
 
-    def bits(self, strategy: Strategy | None = None) -> float:
-        """Return the bits of a window: codes at fixed length, and the places of keyframes unless they are known."""
+    def bits(self, strategy: Strategy | None = None, keyframes: Sequence[int] = ()) -> float:
+        """Return the bits of a window: codes at fixed length, and the places of keyframes unless they are known.
+
+        `keyframes` of each group, where they are not those of the recipe.
+        """
         settings = self.recipe.model
         if isinstance(self.tokenizer, DenseTokenizer):
             return self.tokenizer.bits_per_window
         assert isinstance(settings, config.Sfms)
         free = (strategy or settings.placement) in _FREE_PLACES  # then there is one way to choose them
-        counts = zip(self.tokenizer.keyframes, (group.codes for group in settings.groups.values()), strict=True)
+        counts = zip(
+            keyframes or self.tokenizer.keyframes, (group.codes for group in settings.groups.values()), strict=True
+        )
         return sum(keyframe_bits(n if free else self.window, n, size) for n, size in counts)
 
     def sparse(self) -> Tokenizer:

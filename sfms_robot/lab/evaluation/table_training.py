@@ -24,7 +24,7 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     SizeName,
     TableModel,
     baseline_loss,
-    recipes,
+    recipe_of,
     save_tokenizer,
 )
 from sfms_robot.lab.learning.corpus import first_frames, windows
@@ -62,12 +62,11 @@ def train_all(
 
     `examples` (W, T, 58) are windows of which some get a history.
     """
-    known = recipes(size, steps)
     order = examples[..., SHAPES].var(1).mean(1).argsort(descending=True)
     watched = examples[order[[round(share * (len(order) - 1)) for share in _WATCHED]]]
     tasks = [
         (
-            known[name],
+            recipe_of(name, size, steps),
             Run(resume=not again and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
             name,
         )
@@ -103,23 +102,24 @@ def train(
     model = TableModel(recipe)
     motion = torch.cat([torch.from_numpy(take.motion) for take in takes])
     model.fit_scales(motion)
-    history: list[Snapshot] = []
+    history = load_history(folder) if run.resume else []
     job = _job(name, model.to(run.device), motion, [len(take.motion) for take in takes])
-    if watched is not None and not run.resume:
+    if watched is not None:
         due = {min(recipe.training.steps - 1, round(share * recipe.training.steps)) for share in _SNAPSHOTS_AT}
         windows, loss_of = model.standardise(watched.to(run.device)), job.loss_of
 
         def recorded(step: int, generator: torch.Generator, samples: int) -> Tensor:
-            if step in due:
-                history.extend(snapshots(model.tokenizer, windows, step))
+            new = step in due and all(step != one.step for one in history)
+            if new and (found := snapshots(model.tokenizer, windows, step)):
+                history.extend(found)
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
             return loss_of(step, generator, samples)
 
         job = replace(job, loss_of=recorded)
     fit(job, folder, run)
     save_tokenizer(folder, model.cpu().eval())
     checkpoint_file(folder, name).unlink(missing_ok=True)
-    if history:
-        (folder / _HISTORY).write_bytes(_SNAPSHOTS.dump_json(history))
 
 
 def _job(name: str, model: TableModel, motion: Tensor, lengths: Sequence[int]) -> Job:
@@ -232,7 +232,7 @@ def _rounded(curve: Tensor) -> list[float]:
 # --- Pictures --------------------------------------------------------------------------------------------------------
 
 _TRAJECTORIES_OF: Final = {"keyframes.png": "sparse-all-k10", "keyframes-one-set.png": "sparse-one-k10"}
-_HISTORY_OF: Final = "sparse-all-k7"  # figure 7 has k = 7
+_HISTORIES_OF: Final = {"scores.png": "sparse-all-k7", "scores-as-written.png": "sparse-all-k7-as-written"}  # figure 7
 _CURVES: Final = 4  # trajectories drawn of a window
 _BARS: Final = 12  # channels in the bar chart
 
@@ -258,8 +258,9 @@ def draw(
     for file, name in _TRAJECTORIES_OF.items():
         if name in models:
             save(cases(models[name], motion, takes), folder / file)
-    if _HISTORY_OF in models and (history := load_history(trained / _HISTORY_OF)):
-        save(scores_over_steps(history), folder / "scores.png")
+    for file, name in _HISTORIES_OF.items():
+        if name in models and (history := load_history(trained / name)):
+            save(scores_over_steps(history), folder / file)
     if errors:
         save(_quantiles(errors), folder / "quantiles.png")
 

@@ -1,5 +1,8 @@
 """`evaluate tokenizer --table`: tables III and IV of the SFMS paper on any folder of faces, and figures 9 and 10.
 
+Two more tables say what the figures of those two come from: `3-placements` has every placement with the paper's
+inpainter and with ours, `4-codes` both kinds of code with the same dimensions, and without rounding.
+
 A row is a tokenizer, perhaps with another placement of keyframes, beside the paper's figure. The paper's figures are of
 other motion (Learning2Listen, 56 FLAME coefficients), other training and unknown units: only how many times one row is
 better than another can be compared.
@@ -14,6 +17,7 @@ W windows of T frames and C channels, K clusters.
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +34,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
 from sfms_robot.lab.corpora.clips import read_takes
+from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, verdict
 from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
     AS_WRITTEN,
@@ -37,16 +42,19 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     SizeName,
     TableModel,
     load_tokenizer,
+    seeded,
 )
 from sfms_robot.lab.evaluation.table_training import draw, train_all
 from sfms_robot.lab.learning.corpus import first_frames, windows
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.sfms.placement import Strategy
+from sfms_robot.listeners.sfms.model import Tokenizer
+from sfms_robot.listeners.sfms.placement import ScoreNetwork, Strategy, place_learned
 from sfms_robot.signals.tracks import Take, folder_takes
 
 ALL: Final = "all"
 DYNAMIC: Final = "Dynamic (learned, ours)"
 DYNAMIC_AS_WRITTEN: Final = "Dynamic (Algorithm 1, as written)"
+_ALGORITHM_1: Final = "Algorithm 1"
 _STATIC, _CENTRED, _EXACT = "Static (every N/k-th)", "Static, centred", "Exact"
 _UNEQUAL: Final = "unequal bits"
 _WINDOW_FRAMES: Final = 48  # of every recipe, as in the paper
@@ -67,6 +75,7 @@ class Spec:
     Attributes:
         k: Keyframes of a window, where the row shows them.
         placement: Where it differs from the tokenizer's.
+        rounded: Restored from codes; else from what they were chosen by.
         paper_e2: The paper's MSE, times 100.
         shipped: The tokenizer is in the checkout; others are trained if there is a folder for them.
     """
@@ -75,6 +84,7 @@ class Spec:
     tokenizer: str
     k: int | None = None
     placement: Strategy | None = None
+    rounded: bool = True
     paper_e2: float | None = None
     note: str = ""
     shipped: bool = True
@@ -101,6 +111,8 @@ def _table_3() -> Iterable[Spec]:
 def _table_4() -> Iterable[Spec]:
     yield Spec(name="L2L (VQ-256)", tokenizer="l2l-vq-256", paper_e2=1.44)
     yield Spec(name="Dense-FSQ-1024", tokenizer="dense-fsq-1024", paper_e2=0.73)
+    for codes in (32, 200):  # figure 6
+        yield Spec(name=f"Dense-FSQ-{codes}", tokenizer=f"dense-fsq-{codes}", shipped=False)
     for name, own, paper_e2 in (
         ("Sparse-VQ-256", "sparse-all-k10-vq-256", 0.05),
         ("Sparse-FSQ-256", "sparse-all-k10", 0.03),
@@ -111,7 +123,54 @@ def _table_4() -> Iterable[Spec]:
             )
 
 
-TABLES: Final = {"3": tuple(_table_3()), "4": tuple(_table_4())}
+_INPAINTERS: Final = {"paper": "the paper's inpainter", "ours": "our inpainter"}
+_BESIDE: Final = {"static": _STATIC, "static_centred": _CENTRED}
+
+
+def _placements() -> Iterable[Spec]:
+    """Yield every placement with each inpainter, the paper's k = 7 first, and the readings of Algorithm 1."""
+    written, lines = f"-{AS_WRITTEN}", "-paper-inpainter"
+    rows = (
+        (_STATIC, "paper", f"-static_paper{lines}"), (_CENTRED, "paper", f"-static{lines}"),
+        (_ALGORITHM_1, "paper", written), (DYNAMIC, "paper", lines),
+        (_STATIC, "ours", "-static_paper"), (_CENTRED, "ours", "-static"),
+        (_ALGORITHM_1, "ours", "-algorithm-1"), (DYNAMIC, "ours", ""),
+        ("Algorithm 1, drawn as (6) reads", "paper", f"{written}-tempered"),
+        ("Algorithm 1, scores learn at 3e-4", "paper", f"{written}-slower-scores"),
+    )  # fmt: skip
+    for k in (7, 3, 10):
+        for name, inpainter, ending in rows:
+            yield Spec(
+                name=name,
+                tokenizer=f"sparse-all-k{k}{ending}",
+                k=k,
+                note=_INPAINTERS[inpainter],
+                shipped=inpainter == "ours" and name != _ALGORITHM_1,
+            )
+        for name, ending in (
+            ("Algorithm 1, 8,000 steps", f"{written}-8000"), ("Algorithm 1, 30,000 steps", f"{written}-30000"),
+            ("Adaptive k, equation (8)", "-adaptive"),
+        ) if k == 7 else ():  # fmt: skip
+            yield Spec(name=name, tokenizer=f"sparse-all-k7{ending}", k=7, note=_INPAINTERS["paper"], shipped=False)
+
+
+def _codes() -> Iterable[Spec]:
+    """Yield grids and learned vectors of as many dimensions, with and without choosing a code."""
+    for name, own, shipped in (
+        ("FSQ-256, 1 dimension", "sparse-all-k10", True),
+        ("VQ-256, 1 dimension, squashed", "sparse-all-k10-vq-256-1d", False),
+        ("FSQ-4x4x4x4", "sparse-all-k10-fsq-4444", False),
+        ("VQ-256, 4 dimensions, squashed", "sparse-all-k10-vq-256-4d", False),
+        ("VQ-256, 4 dimensions", "sparse-all-k10-vq-256", True),
+    ):
+        for ending, rounded in (("", True), (", not rounded", False)):
+            yield Spec(name=name + ending, tokenizer=own, k=10, rounded=rounded, shipped=shipped)
+
+
+TABLES: Final = {
+    "3": tuple(_table_3()), "4": tuple(_table_4()), "3-placements": tuple(_placements()), "4-codes": tuple(_codes()),
+}  # fmt: skip
+PAPER_TABLES: Final = ("3", "4")
 
 
 def needed(name: str, shipped: bool = False) -> list[str]:
@@ -119,19 +178,30 @@ def needed(name: str, shipped: bool = False) -> list[str]:
     return list(dict.fromkeys(spec.tokenizer for spec in TABLES[name] if spec.shipped or not shipped))
 
 
-def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> tuple[dict[str, Any], dict[str, Doubles]]:
-    """Score those tokenizers of a table that are present; return its JSON, and the errors (W,) of its rows by label."""
+def build(
+    name: str, models: Mapping[str, TableModel], seen: Windows, seeds: int = 1
+) -> tuple[dict[str, Any], dict[str, Doubles]]:
+    """Score those tokenizers of a table that are present; return its JSON, and the errors (W,) of its rows by label.
+
+    With several seeds a row is that of the first, but its `mse` is the mean over all, and `mse_by_seed` has each.
+    """
     truth = _doubles(next(iter(models.values())).standardise(seen.motion))
     clusters = cluster(truth) if len(truth) >= 4 else None
     rows, errors = list[dict[str, Any]](), {}
-    for spec in tracked([each for each in TABLES[name] if each.tokenizer in models], f"scoring table {name}"):
-        row, wrong = _scored(spec, models[spec.tokenizer], seen, clusters)
-        rows.append(row)
-        errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
+    for spec in tracked([*TABLES[name]], f"scoring table {name}"):
+        each = [_scored(spec, models[one], seen, clusters) for one in seeded(spec.tokenizer, seeds) if one in models]
+        if each:
+            row, wrong = each[0]
+            if seeds > 1:
+                mse = [one["mse"] for one, _ in each]
+                row |= {"mse": float(np.mean(mse)), "mse_by_seed": mse}
+            rows.append(row)
+            errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
     table = {
-        "table": int(name),
+        "table": int(name) if name in PAPER_TABLES else name,
         "rows": rows,
-        "ratios": ratios_3(rows) if name == "3" else ratios_4(rows),
+        **({"ratios": ratios} if (ratios := _ratios(name, rows)) else {}),
+        **({"claims": claims(rows)} if name == "3-placements" else {}),
         "truth_silhouette": clusters and round(integrity(truth, truth, clusters)[0], 3),
     }
     return table, errors
@@ -140,7 +210,9 @@ def build(name: str, models: Mapping[str, TableModel], seen: Windows) -> tuple[d
 def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | None) -> tuple[dict[str, Any], Doubles]:
     """Return a row as in JSON, and the squared errors (W,) of the windows."""
     motion = model.standardise(seen.motion)
-    restored = model.restore(motion, spec.placement)
+    sparse = isinstance(model.tokenizer, Tokenizer)
+    mask = model.mask(motion, spec.placement) if sparse else None
+    restored = model.restore(motion, mask, rounded=spec.rounded)
     errors, angle_rmse_rad, shape_rmse = restoration_errors(model, motion, restored)
     shape = (None, None) if clusters is None else integrity(_doubles(restored), _doubles(motion), clusters)
     silhouette, separation = (value and round(value, 3) for value in shape)
@@ -150,7 +222,8 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
         "tokenizer": spec.tokenizer,
         "k": spec.k,
         "params": sum(p.numel() for p in model.tokenizer.parameters()),
-        "bits_per_window": round(model.bits(spec.placement), 1),
+        "steps": model.recipe.training.steps,
+        "bits_per_window": round(model.bits(spec.placement, _counts(mask)), 1),
         "mse": float(errors.mean()),
         "median": float(np.median(errors)),
         "per_take": {take: float(errors[names == take].mean()) for take in dict.fromkeys(seen.takes)},
@@ -160,7 +233,61 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
         "separation": separation,
         "paper_mse_e2": spec.paper_e2,
         "note": spec.note,
+        **({} if mask is None else placed(model, motion, mask)),
     }, errors
+
+
+def _counts(mask: Tensor | None) -> list[int]:
+    """Return the mean number of keyframes of each group, rounded; empty without keyframes."""
+    return [] if mask is None else mask.sum(1).mean(0).round().int().tolist()
+
+
+def placed(model: TableModel, motion: Tensor, mask: Tensor) -> dict[str, float]:
+    """Return how keyframes lie at a mask (W, T, G), and how far the scores of Algorithm 1 decide that.
+
+    keyframes: of a track of a window; neighbours: share of them with another one in the frame before or after;
+    score_deviation: of the scores of a window, beside Gumbel noise's 1.28; draw_overlap: share of the keyframes that
+    two masks drawn at the end of training have in common.
+    """
+    key = mask > 0.5
+    beside = torch.zeros_like(key)
+    beside[:, 1:] |= key[:, :-1]
+    beside[:, :-1] |= key[:, 1:]
+    found = {"keyframes": float(mask.sum(1).mean()), "neighbours": float((key & beside).sum() / key.sum())}
+    tokenizer, phase = model.sparse(), model.recipe.training
+    if tokenizer.strategy == "learned_paper" and isinstance(tokenizer.score, ScoreNetwork):
+        scores, generator = tokenizer.score(motion), torch.Generator().manual_seed(0)
+        first, second = (
+            place_learned(scores, tokenizer.keyframes, phase.temperature[1], generator, tempered=phase.tempered_draws)[
+                0
+            ]
+            > 0.5
+            for _ in range(2)
+        )
+        found["score_deviation"] = float(scores.std(1).mean())
+        found["draw_overlap"] = float((first & second).sum() / first.sum())
+    return {name: round(value, 3) for name, value in found.items()}
+
+
+def claims(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return, by inpainter and k, the error of learned keyframes over that of even ones, and if the paper's word holds.
+
+    The paper states that learned ones have less. The interval of `verdict` is the range over three seeds or more.
+    """
+    found = []
+    mse = {(row["name"], row["note"], row["k"]): row.get("mse_by_seed", [row["mse"]]) for row in rows}
+    for (name, note, k), ours in mse.items():
+        for beside, other in _BESIDE.items():
+            theirs = mse.get((other, note, k), [])
+            if name not in _BESIDE.values() and theirs:
+                ratios = [one / two for one, two in zip(ours, theirs, strict=False)]
+                less = [1 - ratio for ratio in ratios]
+                interval = (min(less), max(less)) if len(ratios) >= LEAST_SEEDS else None
+                found.append({
+                    "name": name, "note": note, "k": k, "over": beside, "ratio": round(float(np.mean(ratios)), 3),
+                    "seeds": len(ratios), "verdict": verdict(interval),
+                })  # fmt: skip
+    return found
 
 
 def restoration_errors(model: TableModel, motion: Tensor, restored: Tensor) -> tuple[Doubles, float, float]:
@@ -176,6 +303,15 @@ def restoration_errors(model: TableModel, motion: Tensor, restored: Tensor) -> t
 
 def _doubles(motion: Tensor) -> Doubles:
     return np.asarray(motion.double().numpy(), np.float64)
+
+
+def _ratios(name: str, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the ratios of a paper's table; empty of another one, and where rows are left out."""
+    if name not in PAPER_TABLES or not {spec.name for spec in TABLES[name] if spec.shipped} <= {
+        r["name"] for r in rows
+    }:
+        return {}
+    return ratios_3(rows) if name == "3" else ratios_4(rows)
 
 
 def ratios_3(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
@@ -287,6 +423,8 @@ def evaluate_table(
     train: bool = False,
     size: SizeName = "small",
     steps: int | None = None,
+    seeds: int = 1,
+    only: str = "*",
     jobs: int = 1,
     plots: Path | None = None,
 ) -> dict[str, Any]:
@@ -299,6 +437,8 @@ def evaluate_table(
         train: Train all of them again, not only the missing ones.
         size: Of what is trained.
         steps: Of training, in place of the size's.
+        seeds: Trainings of each tokenizer, with seeds from 1 on.
+        only: Pattern of the names of tokenizers that are compared.
         jobs: Processes that train.
         plots: Folder for pictures.
     """
@@ -306,11 +446,16 @@ def evaluate_table(
         raise ConfigError(f"--table {table!r} is not one of {', '.join((*TABLES, ALL))}")
     if train and models is None:
         raise ConfigError("--train needs --models DIR, a folder to keep the tokenizers in")
-    chosen = TABLES if table == ALL else (table,)
+    if seeds > 1 and models is None:
+        raise ConfigError(f"--seeds {seeds}: needs --models DIR, where tokenizers of other seeds are trained and kept")
+    chosen = PAPER_TABLES if table == ALL else (table,)
     folder = models or data_dir("configs") / "tokenizers"
     recorded = read_takes(data_dir("sim") / "listeners" / "takes.npz")
     held_out = recorded["held_out"] if data is None else folder_takes(data)
-    wanted = list(dict.fromkeys(name for each in chosen for name in needed(each, models is None)))
+    names = dict.fromkeys(name for each in chosen for name in needed(each, models is None))
+    wanted = [one for name in fnmatch.filter(names, only) for one in seeded(name, seeds)]
+    if not wanted:
+        raise ConfigError(f"--only {only}: expected a pattern of tokenizers of this table (valid: {', '.join(names)})")
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
         examples = Windows.of(recorded["held_out"], _WINDOW_FRAMES).motion
         train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)
@@ -327,7 +472,7 @@ def evaluate_table(
             len(short), len(held_out), first.window, ", ".join(dict.fromkeys(short)),
         )  # fmt: skip
     with torch.inference_mode():
-        tables = {name: build(name, loaded, seen) for name in chosen}
+        tables = {name: build(name, loaded, seen, seeds) for name in chosen}
     if plots is not None:
         draw(plots, loaded, folder, seen.motion, seen.takes, tables["4"][1] if "4" in tables else {})
     shared = {

@@ -47,9 +47,9 @@ DEVICES = ("auto", "cpu", "cuda")
 class TrainOptions:
     """Options of the command line.
 
-    `steps`, and `changes` of the listener, replace the file's; `tensorboard` None: if installed. `order` is that of the
-    channels in the data, if not its layout's own. `overwrite`: what an earlier training left in `out` may be lost.
-    `accumulate` and `scratch`: of `learning.job.Run`.
+    `seed`, `steps`, `changes` of the listener and `phase_changes` of ARIG's training replace the file's; `tensorboard`
+    None: if installed. `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an
+    earlier training left in `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
 
     Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
     starts again after one of them died resumes from the checkpoint.
@@ -61,7 +61,9 @@ class TrainOptions:
     resume: bool = False
     device: str = "auto"
     steps: int | None = None
+    seed: int | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
+    phase_changes: Mapping[str, Any] = field(default_factory=dict)
     tensorboard: bool | None = None
     order: Order | None = None
     overwrite: bool = False
@@ -150,7 +152,10 @@ def train_settings(options: TrainOptions, phase: str = "training") -> config.Tra
     raw = settings.model_dump(mode="json")
     if isinstance(settings, config.ArigTraining):
         phase = "training"
-    raw["listener"] |= options.changes
+    for key, value in options.changes.items():
+        raw["listener"][key] = raw["listener"][key] | value if isinstance(value, Mapping) else value
+    raw[phase] |= options.phase_changes
+    raw["seed"] = settings.seed if options.seed is None else options.seed
     if options.steps is not None:
         raw[phase]["steps"] = options.steps
     return parse_training(raw, options.file)

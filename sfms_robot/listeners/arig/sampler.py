@@ -27,13 +27,18 @@ from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, ind
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
 BEYOND_ALL = 1e4  # deviations: an estimate that is not clamped is clamped to this, which 16 bits hold
 COSINE_END = 0.98  # share of the quarter circle that the schedule covers
+FINEST = 0.01  # deviations of noise at the first logarithmic level: most motion from frame to frame is larger
 
 
-def cosine_alpha_bar(levels: int) -> Tensor:
+def noise_levels(settings: config.Diffusion) -> Tensor:
     """Return alpha-bar of every noise level (levels,), float64, falling from nearly 1."""
     # Nichol and Dhariwal 2021: ab = cos^2 of an angle that grows evenly with the level.
-    angle = torch.arange(1, levels + 1, dtype=torch.float64) / levels
-    return torch.cos(angle * COSINE_END * math.pi / 2) ** 2
+    share = torch.arange(1, settings.train_steps + 1, dtype=torch.float64) / settings.train_steps
+    if settings.schedule == "cosine":
+        return torch.cos(share * COSINE_END * math.pi / 2) ** 2
+    # Ours: noise over motion n = sqrt((1 - ab) / ab) grows by the same factor each level, to where the cosine ends.
+    most = math.tan(COSINE_END * math.pi / 2)
+    return 1 / (1 + (FINEST * (most / FINEST) ** share) ** 2)
 
 
 class Denoiser(nn.Module):
@@ -46,7 +51,7 @@ class Denoiser(nn.Module):
         most = 8.0 if settings.clamp else BEYOND_ALL
         self.low = nn.Buffer(torch.full((channels,), -most))  # range of standardised motion in the data
         self.high = nn.Buffer(torch.full((channels,), most))
-        self.alpha_bar = nn.Buffer(cosine_alpha_bar(settings.train_steps).float(), persistent=False)
+        self.alpha_bar = nn.Buffer(noise_levels(settings).float(), persistent=False)
         self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)  # of all noise levels
         # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
         self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
@@ -160,7 +165,7 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
     M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
     DDIM keeps the noise: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
     """
-    alpha_bars = cosine_alpha_bar(settings.train_steps)[list(levels)].tolist()
+    alpha_bars = noise_levels(settings)[list(levels)].tolist()
     out = []
     for index in reversed(range(len(alpha_bars))):
         now, after = alpha_bars[index], alpha_bars[index - 1] if index else 1.0

@@ -136,12 +136,12 @@ class Tokenizer(nn.Module):
         member = [[float(name in group.channels) for name in settings.channels] for group in groups]
         self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
         levels = [group.levels for group in groups]
-        self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims)
+        self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims, settings.squashed)
         self.inpainter = Inpainter(self.quantizer, settings)
         # Only learned placement has scores to learn; the others carry no dead weights.
         scores = settings.scores
         self.score: ScoreNetwork | ConditionalScore | None = None
-        if settings.placement == "learned_paper":
+        if settings.placement in ("learned_paper", "adaptive"):
             channels = len(settings.channels)
             self.score = ScoreNetwork(channels, len(groups), scores.width, scores.heads, scores.layers)
         elif settings.placement == "learned":

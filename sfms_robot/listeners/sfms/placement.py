@@ -1,13 +1,15 @@
-"""Keyframe discovery (IV-B2): where the keyframes go. One function, `place(motion, k, ...) -> mask`, six strategies.
+"""Keyframe discovery (IV-B2): where the keyframes go. One function, `place(motion, k, ...) -> mask`, seven strategies.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
     penalised      as many as pay for themselves: least error plus a cost per keyframe (`place_penalised`)
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
     learned_paper  the paper's: one pass of the score network, Gumbel top-k by Algorithm 1
+    adaptive       the paper's that it gave up (IV-B3): a frame is one by its own score, (8) holds the number
     learned        ours: conditional scores, computed again at each of the k steps, then swept over (`choose`, `sweep`)
 
-Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, except `penalised`.
+Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, except `penalised`
+and `adaptive`.
 N = B * G tracks.
 """
 
@@ -32,7 +34,7 @@ from sfms_robot.listeners.sfms.piecewise_linear import (
     segments,
 )
 
-Strategy = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "learned"]
+Strategy = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "adaptive", "learned"]
 EPSILON = 1e-20  # of Algorithm 1, line 9: a chosen frame falls by 46, more than any two scores differ
 MOST_CURVES = 3  # principal curves of a group that the network sees
 STILL = 1e-3  # root mean square, standardised, below which motion counts as noise
@@ -204,10 +206,10 @@ def place(
         return place_exact(motion, k, member, max_gap)
     if strategy in ("static", "static_paper"):
         return place_static(motion, k, centred=strategy == "static")
-    if strategy == "learned_paper":
+    if strategy in ("learned_paper", "adaptive"):
         if not isinstance(score, ScoreNetwork):
-            raise ValueError("learned_paper placement needs a score network of the paper's kind")
-        return place_learned(score(motion), k)[0]
+            raise ValueError(f"{strategy} placement needs a score network of the paper's kind")
+        return place_learned(score(motion), k)[0] if strategy == "learned_paper" else place_adaptive(score(motion))[0]
     if not isinstance(score, ConditionalScore):
         raise ValueError(f"{strategy} placement needs a conditional score network")
     return place_conditional(motion, k, member, score, sweeps)
@@ -257,22 +259,49 @@ def _check(count: int, frames: int, max_gap: int | None = None) -> None:
 
 
 def place_learned(
-    scores: Tensor, k: Sequence[int], temperature: float = 0.0, generator: torch.Generator | None = None
+    scores: Tensor,
+    k: Sequence[int],
+    temperature: float = 0.0,
+    generator: torch.Generator | None = None,
+    *,
+    tempered: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return (mask, relaxed mask), both (B, T, G), of scores (B, T, G): Gumbel top-k by Algorithm 1.
 
     The mask is exactly k-hot going forward and carries the gradient of the relaxed one (line 18). Temperature 0 is
-    evaluation: the k largest scores, no noise, no gradient.
+    evaluation: the k largest scores, no noise, no gradient. In Algorithm 1 the mask that is drawn does not depend on
+    the temperature: line 11 divides scores and noise alike. `tempered`: the first frame drawn is of
+    Categorical(exp(s / temperature)), as equation (6) reads, so the noise grows with the temperature.
     """
     if temperature == 0.0:
         hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
         return hard, hard
-    source = scores.device if generator is None else generator.device
-    uniform = torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
-    noisy = scores - torch.log(-torch.log(uniform))  # lines 3 to 6: s_i + g_i, equation (6)
+    gumbel = -torch.log(-torch.log(_uniform_like(scores, generator)))
+    noisy = scores + gumbel * (temperature if tempered else 1.0)  # lines 3 to 6: s_i + g_i
     relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
     hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
     return hard - relaxed.detach() + relaxed, relaxed  # line 18
+
+
+def place_adaptive(
+    scores: Tensor, temperature: float = 0.0, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return (mask, relaxed mask) of scores (B, T, G), each frame separately (IV-B3): log-odds of being a keyframe.
+
+    Temperature 0 is evaluation. A track of which no frame is likely has its likeliest one.
+    """
+    noisy, relaxed = scores, torch.sigmoid(scores)
+    if temperature:
+        uniform = _uniform_like(scores, generator)
+        noisy = scores + torch.log(uniform) - torch.log1p(-uniform)
+        relaxed = torch.sigmoid(noisy / temperature)
+    hard = torch.maximum((noisy > 0).float(), F.one_hot(noisy.argmax(1), scores.shape[1]).transpose(1, 2).float())
+    return (hard - relaxed.detach() + relaxed if temperature else hard), relaxed
+
+
+def _uniform_like(scores: Tensor, generator: torch.Generator | None) -> Tensor:
+    source = scores.device if generator is None else generator.device
+    return torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
 
 
 def _relaxed_k_hot(noisy: Tensor, count: int, temperature: float) -> Tensor:

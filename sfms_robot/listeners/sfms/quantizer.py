@@ -178,11 +178,17 @@ class Quantizer(nn.Module):
     """
 
     def __init__(
-        self, member: Tensor, levels: Sequence[Sequence[int]], kind: Literal["fsq", "vq"] = "fsq", dims: int = 4
+        self,
+        member: Tensor,
+        levels: Sequence[Sequence[int]],
+        kind: Literal["fsq", "vq"] = "fsq",
+        dims: int = 4,
+        squashed: bool = False,
     ) -> None:
         """Make one for groups `member` (G, C), 1 where a channel belongs to a group, with prod(levels) codes each.
 
-        A channel of no group is not drawn: it stays 0. `dims` are those of a learned codebook.
+        A channel of no group is not drawn: it stays 0. `dims` are those of a learned codebook, `squashed`: which
+        lies in -1..1, as a grid does.
         """
         super().__init__()
         groups, _ = member.shape
@@ -200,7 +206,7 @@ class Quantizer(nn.Module):
         self.place = nn.Buffer(self.owner * most + slot, persistent=False)  # (C,) of a channel in all slots
         sizes = [math.prod(row) for row in levels]
         self.codebook: Grid | Codebook = Grid(levels) if kind == "fsq" else Codebook(sizes, dims)
-        self.dims = self.codebook.dims
+        self.dims, self.squashed = self.codebook.dims, squashed and kind == "vq"
         self.encoder = GroupMLP(groups, most, self.dims)
         self.decoder = GroupMLP(groups, self.dims, most)
 
@@ -208,7 +214,7 @@ class Quantizer(nn.Module):
         """Return (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""
         # E of equation (3), of every frame: which of them are keyframes is decided apart.
         out: Tensor = self.encoder(motion[..., self.slots] * self.filled)
-        return out
+        return torch.tanh(out) if self.squashed else out
 
     def encode(self, motion: Tensor) -> Tensor:
         """Return codes (B, T, G, D) of the codebook of standardised motion (B, T, C)."""

@@ -11,7 +11,7 @@ from tiny_arig_training import dyad, settings, write
 
 from sfms_robot.cli.main import main
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.evaluation.arig_tables import _PAPER, _PAPER_2
+from sfms_robot.lab.evaluation.arig_tables import _PAPER, _PAPER_2, READINGS
 from sfms_robot.lab.learning.arig.trainer import train_arig
 
 
@@ -27,7 +27,7 @@ def lively(data, tmp_path_factory):
     shutil.copytree(data, folder, dirs_exist_ok=True)
     for place, scene in ((".", "listening"), ("interaction", "interaction")):
         motion = rng.uniform(0.1, 0.3, (2, 300, 58)).astype(np.float32)
-        clips.save(folder / place / "validation", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
+        clips.save(folder / place / "test", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
     return folder
 
 
@@ -95,7 +95,9 @@ def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, liv
     words = ("listener", "--table", table, "--data", lively, "--models", tmp_path / "m", "--config", file, "--json")
     words += ("--listener", listener)
     code, out, _ = evaluate(*words)
-    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {"GT", *paper, str(listener)}
+    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {
+        "GT", *paper, str(listener), *(READINGS if table == "arig-1" else ()),
+    }  # fmt: skip
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
     assert evaluate(*words)[1] == out and before == {path: path.stat().st_mtime_ns for path in before}
 
@@ -124,6 +126,6 @@ def test_a_table_needs_clips_that_are_long_enough(evaluate, listener, tmp_path):
         name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states", "head_of_gaze_rad")
     }
     sounds = {name: getattr(one, name)[: 200 * 640] for name in ("audio", "agent_audio")}
-    clips.save(tmp_path / "validation", [replace(one, **parts, **sounds)])
+    clips.save(tmp_path / "test", [replace(one, **parts, **sounds)])
     code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", tmp_path)
-    assert code == 2 and "no validation dyad is as long as a clip of 250 frames" in err
+    assert code == 2 and "no test dyad is as long as a clip of 250 frames" in err

@@ -154,17 +154,38 @@ def columns(rows):
 
 
 def test_rows_share_their_columns_and_hold_the_papers():
-    rows = tables.rows_of(2, clips(), clips(1), {"mine": clips(2)})
+    rows, _ = tables.rows_of(2, clips(), clips(1), {"mine": clips(2)})
     assert columns(rows)[:2] == ("name", "source")
-    assert rows[-1] == {"name": "ARIG", "source": "paper", "FD exp": 18.39, "FD pose": 0.06, "RPCC exp": 0.05,
-                        "RPCC pose": 0.01, "SID exp": 4.82, "SID pose": 3.94,
+    assert rows[-1] == {"name": "ARIG", "source": "paper", "trainings": None, "FD exp": 18.39, "FD pose": 0.06,
+                        "RPCC exp": 0.05, "RPCC pose": 0.01, "SID exp": 4.82, "SID pose": 3.94,
                         "Var exp": 2.91, "Var pose": 0.17}  # fmt: skip
 
 
 @pytest.mark.parametrize("number", [1, 4])
 def test_ablations_stand_beside_the_papers(number):
-    rows = tables.rows_of(number, clips(), clips(1), {"ARIG": clips(2)})
+    rows, _ = tables.rows_of(number, clips(), clips(1), {"ARIG": clips(2)})
     by_name = {row["name"]: row for row in rows}
     assert by_name["ARIG"]["paper RPCC"] == 0.125 and by_name["ARIG"]["source"] == "here"
     assert set(tables.ABLATIONS[number]) <= set(by_name)
     assert "paper RPCC" in columns(rows)
+
+
+def verdicts(size: float, trainings: int = 3) -> dict[str, str]:
+    """Return the verdicts of `claims` on ARIG with `size` times people's variance, beside a row with 0.75."""
+    name, noise = "w/o continuous AR modeling", np.random.default_rng(0).normal(1, 0.01, 200)
+    rows, draws = {}, {}
+    for row, times in (("GT", 1.0), ("ARIG", size), (name, 0.75)):
+        figures = {"SID": times, "RPCC": 1 / times, "Var": times * clips().var(), "FD": 0.0}
+        of_parts = {f"{key} {part}": value for key, value in figures.items() for part in tables.PARTS}
+        rows[row] = {"trainings": trainings, **of_parts}
+        draws[row] = {key: value * noise for key, value in of_parts.items()}
+    found = tables.claims(4, rows, draws, clips())
+    assert {claim["name"] for claim in found} == {name}, "the other row is not there"
+    return {claim["figure"]: claim["verdict"] for claim in found}
+
+
+def test_a_statement_of_the_paper_holds_by_one_rule_and_noise_decides_nothing():
+    assert set(verdicts(1.0).values()) == {"holds"}, "three quarters of people's motion, and all of it"
+    noisy = verdicts(6.0)
+    assert noisy["Var exp"] == "does not hold" and noisy["SID exp"] == "open", "six times as much has every kind"
+    assert set(verdicts(1.0, trainings=1).values()) == {"open"}

@@ -5,7 +5,16 @@ import pytest
 from scipy.stats import t as student_t
 from tiny_arig_training import dyad
 
-from sfms_robot.lab.evaluation.intervals import distance, estimates, jackknife, people_of, quotient, ratio
+from sfms_robot.lab.evaluation.intervals import (
+    bootstrap,
+    distance,
+    estimates,
+    intervals,
+    people_of,
+    quotient,
+    ratio,
+    verdict,
+)
 
 
 def people(rng, count=24, mean=2.0):
@@ -52,27 +61,64 @@ def test_the_distance_of_two_histograms():
     assert [found[key].value for key in ("a a", "a b", "a c")] == [0.0, 1.0, pytest.approx(0.5)]
 
 
-# --- leaving out one person at a time ---------------------------------------------------------------------------
+# --- metrics that pool all clips --------------------------------------------------------------------------------
 
 
 def _mean_of(values):
     return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
 
 
+def _interval(values, people, **more):
+    return intervals(bootstrap(_mean_of(values), people, **more))
+
+
 def test_intervals_over_people_are_those_of_their_means() -> None:
-    """One clip each: the jackknife of a mean is Student's interval."""
-    values = np.random.default_rng(0).normal(3.0, 2.0, 20)
-    found = jackknife(_mean_of(values), [str(number) for number in range(20)])
-    low, high = student_t.interval(0.95, 19, values.mean(), values.std(ddof=1) / np.sqrt(20))
-    assert found == {"mean": (pytest.approx(low), pytest.approx(high))}
+    """One clip each: the interval of a mean is about Student's, and a figure that is never defined has none."""
+    values = np.random.default_rng(0).normal(3.0, 2.0, 40)
+    found = _interval(values, [str(number) for number in range(40)], draws=2000)
+    low, high = student_t.interval(0.95, 39, values.mean(), values.std(ddof=1) / np.sqrt(40))
+    assert found == {"mean": (pytest.approx(low, abs=0.1), pytest.approx(high, abs=0.1))}
 
 
 def test_clips_of_one_person_hang_together() -> None:
     values = np.repeat(np.random.default_rng(1).normal(0, 1, 6), 50)
-    (low, high) = jackknife(_mean_of(values), [str(number) for number in np.repeat(range(6), 50)])["mean"]
-    (near, far) = jackknife(_mean_of(values), [str(number) for number in range(300)])["mean"]
+    low, high = _interval(values, [str(number) for number in np.repeat(range(6), 50)])["mean"]
+    near, far = _interval(values, [str(number) for number in range(300)])["mean"]
     assert high - low > 3 * (far - near)
-    assert jackknife(_mean_of(values), ["a", "b"] * 150) == {}
+    assert bootstrap(_mean_of(values), ["a", "b"] * 150) == {}
+
+
+def test_a_figure_that_cannot_be_negative_has_no_negative_end() -> None:
+    values = np.random.default_rng(2).exponential(1.0, 6) ** 4
+    assert _interval(values, [*"abcdef"])["mean"][0] > 0
+
+
+def test_trainings_that_differ_widen_the_interval() -> None:
+    values = np.repeat([0.0, 1.0, 5.0], 10) + np.tile(np.linspace(0, 0.1, 10), 3)
+    people, runs = [*"abcdefghij"] * 3, np.repeat(range(3), 10).tolist()
+    (low, high), (near, far) = (_interval(values, people, runs=each)["mean"] for each in (runs, ()))
+    assert high - low > 10 * (far - near)
+
+
+def test_rows_are_compared_over_the_same_people() -> None:
+    values = np.random.default_rng(3).normal(0, 5, 20)
+    people = [str(number) for number in range(20)]
+    ours, theirs = (bootstrap(_mean_of(each), people)["mean"] for each in (values + 0.1, values))
+    assert ours - theirs == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("interval", "comparable", "said"),
+    [
+        ((0.1, 0.4), True, "holds"),
+        ((-0.4, 0.0), True, "does not hold"),
+        ((-0.1, 0.4), True, "open"),
+        ((0.1, 0.4), False, "open"),
+        (None, True, "open"),
+    ],
+)
+def test_one_rule_says_what_holds(interval, comparable, said) -> None:
+    assert verdict(interval, comparable=comparable) == said
 
 
 def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:

@@ -11,7 +11,15 @@ from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, Dataset
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.listener_tables import Clips, collect, heuristics, shared_space, spread_clips, table
+from sfms_robot.lab.evaluation.listener_tables import (
+    Clips,
+    collect,
+    held,
+    heuristics,
+    shared_space,
+    spread_clips,
+    table,
+)
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
 from sfms_robot.listeners.sfms.model import SfmsModel
@@ -79,7 +87,8 @@ def test_a_table_has_the_truth_the_heuristics_the_listener_and_the_paper(space, 
     result = table(number, clips, given, samples=2)
     json.dumps(result, allow_nan=False)
     rows = {row["name"]: row for row in result["rows"] if row["source"] == "here"}
-    assert list(rows) == ["Ground truth", "Random", "Median", "Mime", "MeanFr", "tiny"]
+    told = ["tiny"] if number == 1 else ["Last frame held", "tiny", "tiny, true past"]
+    assert list(rows) == ["Ground truth", "Random", "Median", "Mime", "MeanFr", *told]
     assert {row["name"] for row in result["rows"] if row["source"] == "paper"} >= {"Ground truth", "Random", "SFMS"}
     wanted = [f"{part} {key}" for part in ("expression", "rotation") for key in columns] if number == 1 else columns
     assert all(isinstance(rows["tiny"][key], float) for key in wanted)
@@ -110,12 +119,30 @@ def test_what_clips_say_one_by_one_is_what_the_metrics_say_of_them_together():
     truth, speaker, train = rng.normal(0, 1, (3, 4, 60, 58))
     made = rng.normal(0, 1, (4, 2, 60, 58)).cumsum(axis=2)
     made[1, 0] = 0.5  # no lag can be told of what never moves
-    found = table(2, clips_of(truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][5]
+    found = table(2, clips_of(truth, speaker, train, [*"aabc"]), {"ours": made}, 2)["rows"][6]
     assert found["FRCorr"] == pytest.approx(2 * metrics.frc(made, truth))
     assert found["FRDist"] == pytest.approx(metrics.reactface_frd(made, truth))
     assert found["FRDiv"] == pytest.approx(metrics.frdiv(made)) and found["FRVar"] == pytest.approx(metrics.frvar(made))
     assert found["FRSyn"] == pytest.approx(metrics.frsyn(made, speaker, as_challenge=False))
     assert set(found["interval"]) == {*COLUMNS[2], "FRCorr per sample"}
+
+
+def test_the_last_true_frame_held_scores_high_without_any_listener():
+    """FRCorr of a repeated past: a plan of 8 frames that begins from the truth is scored beside it."""
+    truth = np.cumsum(np.random.default_rng(4).normal(0, 1, (3, 400, 58)), axis=1)
+    still = held(truth)
+    assert np.array_equal(still[:, 8:16], np.repeat(truth[:, 7:8], 8, axis=1)) and np.array_equal(
+        still[:, 0], truth[:, 0]
+    )
+    assert metrics.frc(still[:, None], truth) > 0.9
+
+
+def test_a_plan_from_the_true_past_begins_where_the_truth_is():
+    one, model = dyad("a", 90), listener(hop=8)
+    free, told = (offline_rollout(model, one, [1], true_past=true).motion[0].numpy() for true in (False, True))
+    truth, first = one.listener, np.arange(57, 90, 8)  # the first frame of each plan
+    near, far = (np.abs(motion[first] - truth[first]).mean() for motion in (told, free))
+    assert near < 0.7 * far
 
 
 def test_what_is_no_whole_clip_is_not_played():

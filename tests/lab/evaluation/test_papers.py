@@ -19,7 +19,7 @@ def lively(tmp_path: Path) -> Path:
     folder, rng = write(tmp_path / "data"), np.random.default_rng(0)
     for place, scene in ((".", "listening"), ("interaction", "interaction")):
         motion = rng.uniform(0.1, 0.3, (2, 300, 58)).astype(np.float32)
-        clips.save(folder / place / "validation", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
+        clips.save(folder / place / "test", [replace(dyad("v", scene, 2), speaker=motion[0], listener=motion[1])])
     return folder
 
 

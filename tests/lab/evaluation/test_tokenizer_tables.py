@@ -19,8 +19,10 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     TableModel,
     keyframe_bits,
     load_tokenizer,
+    recipe_of,
     recipes,
     save_tokenizer,
+    seeded,
 )
 from sfms_robot.lab.evaluation.table_training import load_history, train
 from sfms_robot.lab.evaluation.tokenizer_tables import Windows, cluster, integrity, restoration_errors
@@ -95,7 +97,9 @@ def test_first_frames_of_short_takes_are_none() -> None:
 
 
 @pytest.mark.parametrize(
-    "recipe", [sparse(), sparse("learned"), sparse("learned_paper"), dense()], ids=lambda r: r.model.kind
+    "recipe",
+    [sparse(), sparse("learned"), sparse("learned_paper"), sparse("adaptive"), dense()],
+    ids=lambda r: r.model.kind,
 )
 def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Recipe, tmp_path: Path) -> None:
     seen = Windows.of(faces(seed=2), 48)
@@ -149,6 +153,68 @@ def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
     assert every == set(RECIPES), "none is trained in vain"
 
 
+def test_names_say_seed_steps_and_learning_rate() -> None:
+    assert [recipe_of(name).seed for name in seeded("sparse-all-k3", 3)] == [1, 2, 3]
+    written = "sparse-all-k7-as-written"
+    assert (
+        recipe_of(f"{written}-8000-seed2").training.steps == 8000
+        and recipe_of(f"{written}-8000", steps=2).training.steps == 2
+    )
+    assert recipe_of(f"{written}-slower-scores").training.score_learning_rate == 3e-4
+    assert recipe_of(f"{written}-tempered").training.tempered_draws
+
+
+def test_a_table_shares_the_inpainter_and_the_dimensions_of_its_codes() -> None:
+    for spec in tokenizer_tables.TABLES["3-placements"]:
+        residual = RECIPES[spec.tokenizer].model.inpainter == "residual"
+        assert residual == (spec.note == "our inpainter")
+    alike = [TableModel(RECIPES[f"sparse-all-k10{ending}"]) for ending in ("", "-vq-256-1d")]
+    assert len({sum(p.numel() for p in one.parameters()) for one in alike}) == 1
+    latent = alike[1].sparse().quantizer.latent(3 * torch.randn(2, 5, 58))
+    assert latent.shape[-1] == 1 and float(latent.detach().abs().max()) <= 1
+
+
+def test_without_rounding_a_row_is_restored_from_what_codes_were_chosen_by(tmp_path: Path) -> None:
+    train("one", sparse(), faces(), tmp_path, Run())
+    model, motion = load_tokenizer(tmp_path / "one"), torch.randn(2, 48, 58)
+    coarse, fine = (model.restore(motion, rounded=rounded) for rounded in (True, False))
+    assert not torch.equal(coarse, fine) and torch.equal(coarse, model.restore(motion, model.mask(motion)))
+
+
+def test_keyframes_that_lie_side_by_side_are_counted_and_so_are_scores_that_decide_alone() -> None:
+    model, mask = TableModel(sparse("learned_paper", "one", 4)).eval(), torch.zeros(1, 48, 1)
+    mask[0, [3, 4, 20, 40]] = 1.0
+    with torch.inference_mode():
+        model.sparse().score.out.weight.zero_()
+        found = tokenizer_tables.placed(model, torch.randn(1, 48, 58), mask)
+    assert found["keyframes"] == 4 and found["neighbours"] == 0.5
+    assert found["score_deviation"] == 0 and found["draw_overlap"] < 0.6, "the noise alone decides"
+
+
+def test_three_seeds_on_one_side_decide_what_the_paper_says() -> None:
+    def row(name: str, *mse: float) -> dict:
+        return {"name": name, "note": "our inpainter", "k": 7, "mse": np.mean(mse), "mse_by_seed": [*mse]}
+
+    even = row("Static, centred", 0.2, 0.2, 0.2)
+    for mse, said in (((0.1, 0.1, 0.19), "holds"), ((0.1, 0.1, 0.3), "open"), ((0.3, 0.3, 0.3), "does not hold")):
+        (claim,) = tokenizer_tables.claims([row("Algorithm 1", *mse), even])
+        assert claim["verdict"] == said and claim["ratio"] == pytest.approx(np.mean(mse) / 0.2, abs=1e-3)
+    (claim,) = tokenizer_tables.claims([row("Algorithm 1", 0.1), even])
+    assert (claim["seeds"], claim["verdict"]) == (1, "open")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"only": "none*"}, r"--only none\*: expected a pattern of tokenizers of this table \(valid: sparse-all-k7-"),
+        ({"seeds": 3}, "--seeds 3: needs --models DIR, where tokenizers of other seeds"),
+    ],
+)
+def test_rows_that_cannot_be_had_are_named(options, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        tokenizer_tables.evaluate_table("3-placements", **options)
+
+
 def test_a_broken_history_is_named(tmp_path: Path) -> None:
     assert load_history(tmp_path) == []
     (tmp_path / "history.json").write_text('[{"stride": 1}]')
@@ -160,6 +226,8 @@ def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> 
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
     snapshots = load_history(tmp_path / "one")
+    train("one", sparse("learned"), faces(), tmp_path, Run(resume=False), seen.motion[:2])
+    assert load_history(tmp_path / "one") == snapshots, "trained again, it begins again"
     assert {snapshot.window for snapshot in snapshots} == {0, 1}
     assert snapshots[0].step == 0 and snapshots[-1].step == 2
     for snapshot in snapshots:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 from tiny_arig_training import HZ, dyad, settings, write
 
 from sfms_robot import config
@@ -37,6 +38,7 @@ from sfms_robot.lab.learning.arig.trainer import (
     weights_of,
 )
 from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.train_runs import TrainOptions, train_settings
 from sfms_robot.listeners import audio_frontend, checkpoint
 from sfms_robot.listeners.arig.event_curves import features
 from sfms_robot.listeners.arig.model import ArigModel
@@ -296,6 +298,31 @@ def test_lost_states_are_drawn_and_unknown_ones_wait():
     assert torch.equal(previous_states(states, 0, torch.Generator(), 7)[0, :2], torch.tensor([3, FIRST]))
     kept = previous_states(states, 0.7, torch.Generator().manual_seed(0), 7)[:, ::2] == 3
     assert float(kept.float().mean()) == pytest.approx(0.3 + 0.7 / 7, abs=0.05)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_states_that_are_fed_back_do_not_come_from_the_labels(corpus, own):
+    student = a_student()
+    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:3], WINDOW)
+    phase = quiet(own_states=own)
+    with torch.no_grad():
+        first, second = (
+            loss_parts(student, told, states, told.agent_motion, phase, torch.Generator().manual_seed(0)).motion
+            for states in (torch.zeros_like(told.states), torch.full_like(told.states, 4))
+        )
+    assert torch.equal(first, second) == own
+
+
+def test_a_change_of_one_key_leaves_its_neighbours(tmp_path):
+    file = tmp_path / "arig.yaml"
+    file.write_text(yaml.safe_dump(settings().model_dump(mode="json")))
+    options = TrainOptions(
+        file=file, data=tmp_path, out=tmp_path, seed=3, changes={"diffusion": {"schedule": "logarithmic"}},
+        phase_changes={"own_states": True},
+    )  # fmt: skip
+    found = train_settings(options)
+    assert found.seed == 3 and found.training.own_states and found.training.steps == settings().training.steps
+    assert found.listener.diffusion == settings().listener.diffusion.model_copy(update={"schedule": "logarithmic"})
 
 
 def test_unlabelled_frames_have_no_state_loss(corpus):

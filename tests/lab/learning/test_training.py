@@ -19,7 +19,15 @@ from sfms_robot.lab.learning.corpus import windows
 from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.sfms.features import LEAST_SPEED, SfmsCorpus, fit_scales, gather, place_all
+from sfms_robot.lab.learning.sfms.features import (
+    LEAST_SPEED,
+    SfmsCorpus,
+    fit_scales,
+    gather,
+    keyframe_tokens,
+    place_all,
+    window_tokens,
+)
 from sfms_robot.lab.learning.train_runs import calibrate
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
@@ -211,6 +219,27 @@ def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement
     assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
     for part in mask.split(corpus.lengths):
         assert (part[:, 0].nonzero()[:, 0].diff() <= 48).all()
+
+
+@pytest.mark.parametrize("placement", ["exact", "static"])
+def test_tokens_of_a_window_do_not_depend_on_where_in_a_dyad_it_lies(placement):
+    model, corpus = SfmsModel(settings(placement).listener), _corpus()
+    fit_scales(model, corpus, CHANNELS)
+    motion = model.standardise(corpus.frames.motion)
+    dense, starts = keyframe_tokens(model, motion), torch.arange(0, 240, 24)
+    own = window_tokens(model, motion, dense, starts)
+    assert torch.equal(own[3], window_tokens(model, motion[60:], dense[60:], starts[:1] + 12)[0])
+    assert torch.equal((own > 0).sum(1), torch.full((10, 2), 8))
+    later, earlier = own[1:, :24] > 0, own[:-1, 24:] > 0
+    assert torch.equal(later, earlier) == (placement == "static"), "the same frames, in another window"
+
+
+def test_the_predictor_trains_on_tokens_of_each_window(data, tmp_path):
+    phase = {"steps": 4, "batch": 4, "learning_rate": 5e-3, "tokens": "windows", "calibration_rounds": 0}
+    training = settings("static", predictor=phase, tokenizer={"steps": 2, "batch": 4, "learning_rate": 5e-3})
+    tokenizer.train_tokenizer(training, data, tmp_path)
+    figures = listener.train_listener(training, data, tmp_path)
+    assert np.isfinite(figures["held_out_loss"]) and 0 <= figures["keyframe_recall"] <= 1
 
 
 def test_a_perturbed_history_moves_keyframes_by_one_level_and_nothing_else():

@@ -16,6 +16,7 @@ from sfms_robot.listeners.sfms.placement import (
     Strategy,
     choose,
     place,
+    place_adaptive,
     place_exact,
     place_learned,
     place_penalised,
@@ -53,7 +54,7 @@ def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
     return (ScoreNetwork(3, 2, 8, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
 
 
-@pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised"}))
+@pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised", "adaptive"}))
 @pytest.mark.parametrize("k", [(1, 1), (3, 7), (48, 10)])
 def test_every_strategy_places_exactly_k(strategy, k):
     motion = torch.randn(3, 48, 3)
@@ -69,6 +70,29 @@ def test_sampled_placement_has_exactly_k_and_reaches_every_score(count: int, tem
     torch.testing.assert_close(mask.detach().round().sum(1), torch.full((2, 1), float(count)))
     assert ((mask.detach() - mask.detach().round()).abs() < 1e-5).all()
     assert relaxed.sum(1).allclose(torch.full((2, 1), float(count)), atol=1e-3)
+
+
+def shared(scores: torch.Tensor, temperature: float, tempered: bool) -> float:
+    """Share of the keyframes that two masks of the same scores have in common."""
+    generator = torch.Generator().manual_seed(0)
+    first, second = (place_learned(scores, [7], temperature, generator, tempered=tempered)[0] > 0.5 for _ in range(2))
+    return float((first & second).sum() / first.sum())
+
+
+def test_the_temperature_acts_on_the_draw_in_one_reading_of_equation_6_alone():
+    scores = 5 * torch.randn(200, 48, 1, generator=torch.Generator().manual_seed(1))
+    letter = [shared(scores, temperature, tempered=False) for temperature in (0.1, 20.0)]
+    read = [shared(scores, temperature, tempered=True) for temperature in (0.1, 20.0)]
+    assert letter[0] == pytest.approx(letter[1], abs=0.05), "line 11 divides scores and noise alike"
+    assert read[0] > 0.95 and read[1] < 0.3
+
+
+def test_adaptive_placement_takes_every_likely_frame_and_one_at_least():
+    scores = torch.tensor([[-1.0, 2.0, 3.0, -4.0], [-2.0, -1.0, -3.0, -4.0]])[..., None].requires_grad_()
+    assert place_adaptive(scores)[0][..., 0].tolist() == [[0, 1, 1, 0], [0, 1, 0, 0]]
+    mask, relaxed = place_adaptive(scores, 0.5, torch.Generator().manual_seed(0))
+    (mask.sum() + relaxed.sum()).backward()
+    assert {*mask.detach().round().unique().tolist()} <= {0.0, 1.0} and bool((scores.grad != 0).all())
 
 
 def test_sampling_frequencies_follow_the_categorical_law():

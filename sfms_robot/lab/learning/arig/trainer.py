@@ -246,7 +246,8 @@ def loss_parts(
     weights = None
     if phase.group_weights is not None:
         weights = sent(channel_weights(model.settings, phase.group_weights), truth.device)
-    found = model.condition(told, previous_states(states, phase.state_noise, generator, len(model.settings.states)))
+    before = previous_states(states, phase.state_noise, generator, len(model.settings.states))
+    found = model.condition(told, None if phase.own_states else before)
     target = model.standardise(truth[:, 1:])
     to_draw = model.moved(target, model.standardise(told.agent_motion[:, :-1]), model.rows(told))
     motion = model.sample_loss(found.z.flatten(0, 1), to_draw.flatten(0, 1), phase.draws, generator, weights).mean()

@@ -148,8 +148,9 @@ def context(
     louder: Tensor | None = None,
     held: Tensor | None = None,
 ) -> Context[Tensor]:
-    """Return the predictor's inputs at the seam of each window; `tokens` (N, G), those of the future undecided.
+    """Return the predictor's inputs at the seam of each window, the tokens of the future undecided.
 
+    `tokens`: (N, G) of the corpus, or (B, T, G) of separate windows.
     `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
     `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
@@ -163,7 +164,7 @@ def context(
     if louder is not None:
         sound = sound + louder.view(-1, 1, 1, 1)
     sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
-    own = windows(tokens, starts, past)
+    own = windows(tokens, starts, past) if tokens.ndim == 2 else tokens[:, :past].clone()
     if held is not None:
         own[:, 0] = held[starts.to(held.device)]
     undecided = own.new_full((len(own), future, own.shape[2]), UNDECIDED)
@@ -233,6 +234,19 @@ def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
     """Return the tokens (N, G) of each frame of standardised motion (N, C) as a keyframe."""
     quantizer = model.tokenizer.quantizer
     return torch.cat([quantizer.codebook.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
+
+
+@torch.no_grad()
+def window_tokens(model: SfmsModel, motion: Tensor, dense: Tensor, starts: Tensor) -> Tensor:
+    """Return the tokens (B, T, G) of windows, each placed separately, as the paper's are (V-B, V-C).
+
+    `motion` (N, C) standardised; `dense` (N, G): `keyframe_tokens` of it.
+    """
+    tokenizer = model.tokenizer
+    mask = tokenizer.place(windows(motion, starts, tokenizer.window))
+    if tokenizer.strategy == "penalised":  # a window begins where the last keyframe is held
+        mask[:, 0] = 1.0
+    return torch.where(mask > 0.5, windows(dense, starts, tokenizer.window), 0)
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from sfms_robot.lab.learning.sfms.features import (
     held_tokens,
     keyframe_tokens,
     tokenise,
+    window_tokens,
     without_last_keyframes,
 )
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
@@ -39,6 +40,7 @@ from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
 
+TokensOf = Literal["dyads", "windows"]
 HELD_OUT_BATCHES, HELD_OUT_BATCH = 20, 64
 
 
@@ -70,7 +72,7 @@ def train_listener(
     if run.group.first:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    scores = keyframe_scores(model.cpu(), held_out, listener)
+    scores = keyframe_scores(model.cpu(), held_out, listener, settings.predictor.tokens)
     return {**asdict(outcome), "held_out_loss": last, **scores}
 
 
@@ -101,7 +103,7 @@ def listener_job(
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    tokens_at, held = placed_tokens(model, corpus, tokens, listener, phase.tokens)
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
@@ -115,11 +117,10 @@ def listener_job(
         gain = _louder(phase, batch, generator, device) if listener.audio == "mel" else None
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
-        seen = context(
-            model, corpus, tokens, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held
-        )
+        own = tokens_at(chosen)
+        seen = context(model, corpus, own, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held)
         seen = augment(seen, levels, neutral, phase, noise)
-        target = windows(tokens, chosen + listener.past_frames, listener.future_frames)
+        target = own[:, listener.past_frames :]
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
         count = _drawn(listener, target, generator)
         if phase.missed_keyframes:
@@ -158,6 +159,21 @@ def _louder(phase: config.PredictorTraining, batch: int, generator: torch.Genera
     """Draw how much louder (B,) each window is, in logarithms of power: microphones differ."""
     gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
     return gain.to(device, non_blocking=True)
+
+
+def placed_tokens(
+    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, placed: TokensOf
+) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
+    """Return the tokens (B, T, G) of windows by their first frames, and those held (N, G) at a window's first frame.
+
+    `tokens` (N, G) are those of whole dyads; `placed`: `PredictorTraining.tokens`.
+    """
+    if placed == "dyads":
+        held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+        return lambda starts: windows(tokens, starts, listener.window_frames), held
+    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    dense = keyframe_tokens(model, motion)
+    return lambda starts: window_tokens(model, motion, dense, starts), None
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
@@ -269,34 +285,42 @@ def held_out_loss(
     tokens = tokenise(model, corpus) if tokens is None else tokens
     generator = torch.Generator().manual_seed(0)
     losses = []
-    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator):
+    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator, settings.predictor.tokens):
         meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
         losses.append(float(_loss(model, seen, meant, _drawn(settings.listener, target, generator), settings)))
     return sum(losses) / len(losses)
 
 
 def some_windows(
-    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, generator: torch.Generator
+    model: SfmsModel,
+    corpus: SfmsCorpus,
+    tokens: Tensor,
+    listener: config.Sfms,
+    generator: torch.Generator,
+    placed: TokensOf = "dyads",
 ) -> Iterator[tuple[Context[Tensor], Tensor]]:
-    """Yield batches of contexts and the tokens (B, H, G) that came next."""
+    """Yield batches of contexts and the tokens (B, H, G) that came next; `placed`: `PredictorTraining.tokens`."""
     starts = corpus.starts(listener.window_frames)
     past, future = listener.past_frames, listener.future_frames
-    held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
+    tokens_at, held = placed_tokens(model, corpus, tokens, listener, placed)
     for _ in range(HELD_OUT_BATCHES):
         chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
-        yield context(model, corpus, tokens, chosen, past, future, held=held), windows(tokens, chosen + past, future)
+        own = tokens_at(chosen)
+        yield context(model, corpus, own, chosen, past, future, held=held), own[:, past:]
 
 
 @torch.no_grad()
-def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms) -> dict[str, float]:
+def keyframe_scores(
+    model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms, placed: TokensOf = "dyads"
+) -> dict[str, float]:
     """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
-    All groups and future frames pooled, on windows drawn with a fixed seed.
+    All groups and future frames pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
     """
     model.eval()
     tokens = tokenise(model, corpus)
     hit = said = true = 0
-    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0)):
+    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0), placed):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())

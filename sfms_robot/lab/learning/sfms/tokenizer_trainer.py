@@ -31,6 +31,7 @@ from sfms_robot.listeners.sfms.placement import (
     Strategy,
     Tracks,
     place,
+    place_adaptive,
     place_learned,
     tracks,
 )
@@ -224,12 +225,23 @@ def learned_loss(
     assert isinstance(tokenizer.score, ScoreNetwork)
     scores = tokenizer.score(batch)
     noise = noise_of(generator, batch.device)
-    draws = [place_learned(scores, tokenizer.keyframes, temperature, noise) for _ in range(DRAWS)]
+    k, adaptive = tokenizer.keyframes, tokenizer.strategy == "adaptive"
+    draws = [
+        place_adaptive(scores, temperature, noise)
+        if adaptive
+        else place_learned(scores, k, temperature, noise, tempered=phase.tempered_draws)
+        for _ in range(DRAWS)
+    ]
     scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
     best = torch.stack([error for _, error in scored]).argmin(0)  # (B,)
     masks = torch.stack([mask for mask, _ in draws])
     target = masks[best, torch.arange(len(batch), device=batch.device)]
     motion = torch.stack([loss for loss, _ in scored]).mean()
+    if adaptive:  # equation (8)
+        wanted = torch.tensor(k, device=batch.device)
+        motion = (
+            motion + phase.sparsity * torch.stack([(mask.sum(1) - wanted).abs().mean() for mask, _ in draws]).mean()
+        )
     return motion + phase.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
 
 
