@@ -37,9 +37,8 @@ FAU_VALUE: Final = (1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 14, 15, 16, 17, 18, 20, 22,
 FULL: Final = 2.0  # the intensity at which its columns saturate: shown as 1
 # 23 (lip tightener) and 25 (lips part) have no shape of their own, 30 (jaw sideways) does not tell the side.
 WITHOUT_SHAPE: Final = tuple(unit for unit in FAU_VALUE if unit not in SHAPES_OF_UNIT)
-WITHOUT_UNIT: Final = tuple(
-    shape for shape in BLENDSHAPES if not any(shape in shapes for shapes in SHAPES_OF_UNIT.values())
-)
+_SHOWN: Final = {shape for unit in FAU_VALUE for shape in SHAPES_OF_UNIT.get(unit, ())}
+WITHOUT_UNIT: Final = tuple(shape for shape in BLENDSHAPES if shape not in _SHOWN)
 _PLACES: Final = [
     (column, [BLENDSHAPES.index(shape) for shape in SHAPES_OF_UNIT[unit]])
     for column, unit in enumerate(FAU_VALUE)

@@ -64,13 +64,8 @@ _SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", 
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
 _FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
-_WEIGHTS: Final = (
-    4.0,
-    3.0,
-    2.0,
-    3,
-    100.0,
-)  # base + nods a minute, up to + a nod after a phrase, up to + addressed time
+# Base + nods a minute, up to + a nod after a phrase, up to + addressed time.
+_WEIGHTS: Final = (4.0, 3.0, 2.0, 3, 100.0)
 
 _FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
 
