@@ -131,6 +131,8 @@ class _NetworkBatch:
         self._inputs = [torch.zeros((size, *each.shape[1:]), dtype=each.dtype, device=device) for each in like]
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: tuple[Tensor, ...] = ()
+        # Waiting for a blocking event leaves the core to the other processes of `serve`; copying to the CPU would spin.
+        self._done = torch.cuda.Event(blocking=True) if device.type == "cuda" else None
 
     def capture(self, pool: Any) -> None:
         """Capture the network as a graph; what it makes once, such as places, is made before."""
@@ -147,6 +149,9 @@ class _NetworkBatch:
         if self._graph is not None:
             self._graph.replay()
         outputs = self._outputs if self._graph is not None else self._network(*self._inputs)
+        if self._done is not None:
+            self._done.record()
+            self._done.synchronize()
         return tuple(each[:streams].to("cpu", copy=True).numpy() for each in outputs)
 
 
