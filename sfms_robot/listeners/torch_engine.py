@@ -132,7 +132,7 @@ class _NetworkBatch:
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: tuple[Tensor, ...] = ()
         # Waiting for a blocking event leaves the core to the other processes of `serve`; copying to the CPU would spin.
-        self._done = torch.cuda.Event(blocking=True) if device.type == "cuda" else None
+        self._done = torch.Event(device, blocking=True) if device.type == "cuda" else None
 
     def capture(self, pool: Any) -> None:
         """Capture the network as a graph; what it makes once, such as places, is made before."""
