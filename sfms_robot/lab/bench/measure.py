@@ -247,12 +247,16 @@ def listen_to_silence() -> None:
     sys.stdout.write(json.dumps([memory_mb("VmRSS"), memory_mb("VmHWM")]) + "\n")
 
 
-# --- docs/science/performance.md
-# --------------------------------------------------------------------------------------------
+# --- docs/science/performance.md --------------------------------------------------------------------------------------
+
+_ON_A_GPU: Final = "\n## On a GPU\n"  # measured elsewhere: stays on the page
 
 
 def write_page(file: Path, rows: Mapping[str, Any], minutes: float) -> None:
-    """Write every row, and how it was measured, as a page. Raises ConfigError if the file cannot be written."""
+    """Write every row, and how it was measured, as a page; what it has of GPUs stays.
+
+    Raises ConfigError if the file cannot be written.
+    """
 
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.3g}"
@@ -265,6 +269,7 @@ def write_page(file: Path, rows: Mapping[str, Any], minutes: float) -> None:
     ]
     head = _PAGE.format(when=datetime.now(UTC).date().isoformat(), machine=machine(), minutes=minutes)
     try:
-        file.write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
+        kept = file.read_text(encoding="utf-8").partition(_ON_A_GPU)[1:] if file.is_file() else ()
+        file.write_text(head + "\n".join(lines) + "\n" + "".join(kept), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--write {file}: cannot be written: {error.strerror}") from error
