@@ -16,6 +16,7 @@ RUNS = {
     "servos_alone.py": ([], "arrived: True"),
     "puppeteer.py": (["0.5"], "'blinks':"),
     "voice_agent.py": (["1.5"], "frames heard"),
+    "json_avatar.py": (["2"], "avatar.png: 2 faces"),
 }
 
 
@@ -25,7 +26,7 @@ def test_every_example_is_tried_and_under_forty_lines():
         assert len(path.read_text(encoding="utf-8").splitlines()) < 40, path.name
 
 
-SLOW = ("own_source.py", "puppeteer.py", "servos_alone.py", "voice_agent.py")
+SLOW = ("json_avatar.py", "own_source.py", "puppeteer.py", "servos_alone.py", "voice_agent.py")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in RUNS])
