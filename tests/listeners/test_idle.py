@@ -190,13 +190,6 @@ def test_a_broken_file_is_one_line(tmp_path, problem):
     assert str(file) in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"no weights"])
-def test_a_file_that_is_none_is_one_line(tmp_path, content):
-    (tmp_path / "a.safetensors").write_bytes(content)
-    with pytest.raises(ModelError, match="not a readable safetensors file"):
-        IdleMotion.load(tmp_path / "a.safetensors")
-
-
 def planned(hop, idle, said=range(0)):
     """What a listener with this idle motion plans, which speaks itself in these frames."""
     nothing = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))

@@ -100,14 +100,6 @@ def test_an_event_is_told_once_though_it_is_sent_with_three_plans_and_some_are_l
     assert len(told) >= 0.95 * sum(len(plan.events) for _, plan in lossless.plans)
 
 
-def test_frames_that_are_lost_do_not_shift_time():
-    network = Network(0.02, 0.0, 0.10, seed=5)
-    head = robot(network).run(30.0)
-    assert head.server.core.counts["lost_frames"] > 50
-    (stream,) = head.server.core._streams.values()
-    assert abs(stream.memory[1] - 30.0 / 0.04) <= 10
-
-
 def test_a_refusal_for_good_ends_the_start_with_both_sides_named():
     head = robot()
     head.link.ask = lambda message: head.link.arrived(

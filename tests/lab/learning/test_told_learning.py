@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import rollouts
@@ -71,17 +72,7 @@ def dyad(name: str = "a", frames: int = 500, seed: int = 0) -> Dyad:
         during = (since >= 0) & (since < event.duration_s)
         motion[:, CHANNEL_INDEX["pitch"]] += during * 0.05 * (1 - np.cos(2 * np.pi * 2 * since / event.duration_s))
         events.append(event)
-    audio = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    listening = np.ones(frames, bool)
-    return Dyad(
-        name=name,
-        audio=audio,
-        speaker=motion * 0,
-        listener=motion,
-        listening=listening,
-        events=tuple(events),
-        head_of_gaze_rad=head,
-    )
+    return made_dyad(motion, name=name, events=tuple(events), head_of_gaze_rad=head)
 
 
 def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them():

@@ -62,15 +62,6 @@ def is_offline(listener):
         np.testing.assert_allclose(plan.frames, expected[index], atol=1e-5)
 
 
-def test_a_plan_keeps_the_tokens_of_the_one_before(tiny):
-    memory, last = tiny.start(1), None
-    for frame in speech(30):
-        plan, memory = tiny.step(frame, memory)
-        if plan is not None and last is not None:
-            np.testing.assert_array_equal(memory.tokens[-8:-4], last[-4:])
-        last = memory.tokens if plan is not None else last
-
-
 def test_sampling_follows_the_probabilities_of_the_nucleus():
     logits = np.log(np.array([0.1, 0.4, 0.3, 0.2], np.float32))
     chance = np.random.default_rng(0).random((2000, 1))

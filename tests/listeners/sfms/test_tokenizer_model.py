@@ -36,10 +36,3 @@ def test_every_kind_of_tokenizer_encodes_and_decodes(placement, quantizer):
         assert tokens[..., group].max() <= one.codes
     at_mask = tokenizer.inpaint(tokenizer.quantizer.encode(motion), mask)
     torch.testing.assert_close(tokenizer.decode(tokens), at_mask)
-
-
-def test_a_tokenizer_can_be_asked_for_another_number_or_placement():
-    tokenizer = Tokenizer(tiny_settings(placement="learned", scores={"width": 8, "layers": 1, "heads": 2}))
-    motion = torch.randn(1, 48, 58)
-    for strategy in ("exact", "static", "learned"):
-        assert tokenizer.place(motion, [3, 11], strategy).sum(1).tolist() == [[3.0, 11.0]]
