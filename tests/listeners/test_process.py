@@ -10,20 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remote_rig import frames
 from virtual_time import Time
 
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Plan
 from sfms_robot.listeners.process import REVIEW_S, SETTLED_FRAMES, ListenerProcess, plan_times_s
 from sfms_robot.listeners.thread import HUNG_S, Inbox, listen
 from sfms_robot.processes import LIMITS
 
-SILENCE = np.zeros(640, np.float32)
 RESTART_S = LIMITS["listener"].silent_s
-
-
-def frames(count):
-    return [SpeakerFrame((i + 1) * FRAME_S, SILENCE) for i in range(count)]
 
 
 class Slow:

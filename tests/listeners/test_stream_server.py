@@ -1,6 +1,5 @@
 """Many heads, one model: batches, deadlines, admission, and nobody in anybody's way."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -14,6 +13,7 @@ from sfms_robot.listeners.capacity import Capacity, measure_capacity
 from sfms_robot.listeners.remote_messages import (
     OURS,
     Join,
+    Notice,
     SentFrame,
     Welcome,
     frame_message,
@@ -23,6 +23,8 @@ from sfms_robot.listeners.remote_messages import (
 )
 from sfms_robot.listeners.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
 from sfms_robot.listeners.thread import MOST_WAITING
+
+LEAVE = words_message(Notice("leave"))
 
 
 def joined(server, client="a", now_s=0.0, seed=0):
@@ -118,7 +120,7 @@ def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
                 sent = SentFrame(now - first, people[index][now - first], 0.0)
                 server.receive(streams[index], frame_message(sent), 0.0)
         if now == 20:  # one goes
-            server.receive(streams[1], words_message_leave(), 0.0)
+            server.receive(streams[1], LEAVE, 0.0)
         for stream, sent in stepped(server):
             plans.setdefault(stream, []).append(sent.plan)
     for index in (0, 2):
@@ -131,10 +133,6 @@ def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
         assert len(found) == len(alone)
         for one, other in zip(found, alone, strict=True):
             assert np.abs(one.frames - other.frames).max() < 1e-5
-
-
-def words_message_leave():
-    return json.dumps({"type": "notice", "kind": "leave"}).encode()
 
 
 def test_who_is_silent_is_given_up_and_told_when_it_speaks_again():
@@ -207,7 +205,7 @@ def test_heads_are_admitted_until_the_deadline_cannot_be_held_and_the_reason_has
     refusal = parse_words(server.join(words_message(Join("one more", 0)), 0.0))
     assert not refusal.final and "is full" in refusal.reason and "80 ms are promised" in refusal.reason
     gone = next(iter(server._streams))
-    server.receive(gone, words_message_leave(), 0.0)
+    server.receive(gone, LEAVE, 0.0)
     joined(server, "one more")
 
 

@@ -31,7 +31,7 @@ IMPOSSIBLE = {(case, board) for case in (STORED, MANY_TURNS) for board in BOARDS
 }
 EVERY_RUN = ("dynamixel2", "maestro")  # families of `make test`
 SOME = [each if each in EVERY_RUN else pytest.param(each, marks=pytest.mark.slow) for each in FAMILIES]
-SHORT = ("drop", "corrupt", "silent", "brownout", "hangup")
+SHORT = ("drop", "corrupt", "silent", "brownout", "hangup", "request-drop", "request-delay")
 
 
 @pytest.fixture
@@ -79,13 +79,6 @@ def test_corrupted_byte_moves_no_servo_out_of_its_limits_where_packets_have_a_ch
         assert shortest_us <= outcome.pulse_us[0] <= outcome.pulse_us[1] <= longest_us
     else:
         assert outcome.outside == 0 and said["goals"] == "0 outside limits"
-
-
-@pytest.mark.parametrize("family", ["dynamixel2", "sts", "maestro-crc", "ssc32"])
-@pytest.mark.parametrize("fault", ["request-drop", "request-delay"])
-def test_requests_that_come_late_or_never_do_no_harm(family, fault):
-    outcome = one(family, fault, ticks=300)
-    assert outcome.passed and not outcome.outside, outcome
 
 
 @pytest.mark.parametrize("family", BOARDS)

@@ -134,12 +134,16 @@ def test_no_border_between_dyads_counts_as_motion():
     assert torch.equal(held_tokens(tokens, both.lengths), torch.cat([held_tokens(t, [500]) for t in tokens.split(500)]))
 
 
+def learner():
+    listener = settings().listener
+    return SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
+
+
 def test_a_window_begins_with_the_keyframe_that_is_held_there():
     tokens = torch.tensor([[0, 3], [2, 0], [0, 0], [0, 5], [0, 0]])
     assert held_tokens(tokens, [5]).tolist() == [[0, 3], [2, 3], [2, 3], [2, 5], [2, 5]]
     assert held_tokens(tokens, [2, 3]).tolist() == [[0, 3], [2, 3], [0, 0], [0, 5], [0, 5]]
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
+    model, corpus = learner()
     placed = torch.zeros(500, 2).long()
     placed[10] = 4
     at = torch.tensor([5, 30])
@@ -155,9 +159,8 @@ def corpus_with_sound(corpus):
 
 
 def test_windows_of_a_tokenizer_begin_with_a_keyframe():
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
-    fit_scales(model, corpus, listener.channels)
+    model, corpus = learner()
+    fit_scales(model, corpus, model.settings.channels)
     draw = batches(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths, 8)
     _, mask = draw(8, torch.Generator().manual_seed(0))
     assert mask.shape == (8, 48, 2) and (mask[:, 0] == 1).all() and mask.mean() < 0.5
@@ -174,8 +177,8 @@ def test_windows_with_events_have_one_in_their_future():
 
 def test_a_stream_that_has_just_begun_was_told_of_nothing_before():
     training = settings(neutral_prefix=1.0).predictor
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), corpus_with_sound(gather([dyad()], 48, ARKIT, None, listener))
+    model, corpus = learner()
+    corpus = corpus_with_sound(corpus)
     corpus = replace(corpus, frames=replace(corpus.frames, control=torch.ones(500, len(COLUMNS))))
     with torch.no_grad():
         seen = context(model, corpus, torch.zeros(500, 2).long(), torch.arange(6), 40, 8)
