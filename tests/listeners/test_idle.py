@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from people_rad import PEOPLE_RAD
 from safetensors.numpy import save_file
-from tiny_sfms import speech, told_listener
+from tiny_sfms import plans_of, speech, told_listener
 
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
@@ -194,12 +194,8 @@ def planned(hop, idle, said=range(0)):
     """What a listener with this idle motion plans, which speaks itself in these frames."""
     nothing = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
     listener = EventfulListener(told_listener(hop=hop), EventModel.load(), nothing, idle)
-    memory, plans = listener.start(5), []
-    for index, frame in enumerate(speech(120)):
-        own = frame.audio if index in said else None
-        plan, memory = listener.step(changed(frame, agent_audio=own), memory)
-        plans += [] if plan is None else [plan]
-    return plans
+    speaker = [changed(frame, agent_audio=frame.audio if at in said else None) for at, frame in enumerate(speech(120))]
+    return plans_of(listener, speaker, seed=5).values()
 
 
 @pytest.mark.parametrize("hop", [2, 4])

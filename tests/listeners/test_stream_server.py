@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from remote_rig import SILENCE, Counting, Network, Robot, Server
-from tiny_sfms import speech, tiny_listener
+from tiny_sfms import plans_of, speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners.capacity import Capacity, measure_capacity
@@ -124,11 +124,10 @@ def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
         for stream, sent in stepped(server):
             plans.setdefault(stream, []).append(sent.plan)
     for index in (0, 2):
-        memory, alone = listener.start(index), []
-        for each in people[index]:
-            heard = np.clip(np.rint(each.audio * 32768), -32768, 32767).astype(np.float32) / 32768
-            plan, memory = listener.step(SpeakerFrame(each.time_s, heard, each.face), memory)
-            alone += [] if plan is None else [plan]
+        heard = [np.clip(np.rint(each.audio * 32768), -32768, 32767) / 32768 for each in people[index]]
+        pairs = zip(people[index], heard, strict=True)
+        speaker = [SpeakerFrame(each.time_s, audio.astype(np.float32), each.face) for each, audio in pairs]
+        alone = [*plans_of(listener, speaker, seed=index).values()]
         found = plans[streams[index]]
         assert len(found) == len(alone)
         for one, other in zip(found, alone, strict=True):

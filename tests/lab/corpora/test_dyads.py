@@ -12,7 +12,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import ListenerEvent
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, usable
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset
 from sfms_robot.signals import mel
 
 RNG = np.random.default_rng(0)
@@ -148,9 +148,3 @@ def test_mistakes_of_ours_are_not_taken_for_broken_files():
     dataset, _ = lazy(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         dataset[0]
-
-
-def test_usable_dyads_are_all_but_the_broken_ones_which_are_named(caplog):
-    dataset, _ = lazy(dyad(), OSError("gone"), dyad())
-    assert len(list(usable(dataset))) == 2
-    assert "1 of 3 clips cannot be used: clip1: gone" in caplog.text

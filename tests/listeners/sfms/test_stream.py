@@ -50,11 +50,7 @@ def offline(listener, speaker, seed):
 @pytest.mark.parametrize("hop", [1, 4, 8])
 @pytest.mark.parametrize("changes", [{}, {"sequential": False, "phase": False}, {"audio": "mfcc78"}])
 def test_stream_equals_offline(hop: int, changes: dict):
-    is_offline(tiny_listener(hop=hop, **changes))
-
-
-def is_offline(listener):
-    speaker = speech(61)
+    listener, speaker = tiny_listener(hop=hop, **changes), speech(61)
     expected = offline(listener, speaker, seed=3)
     streamed = plans_of(listener, speaker, seed=3)
     assert list(streamed) == list(expected)
