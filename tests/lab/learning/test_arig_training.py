@@ -1,7 +1,6 @@
 """ARIG on half a minute of made-up conversation: it learns, repeats, resumes, and hears what it should."""
 
 import shutil
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -36,8 +35,7 @@ from sfms_robot.lab.learning.arig.trainer import (
     train_arig,
     weights_of,
 )
-from sfms_robot.lab.learning.job import Run
-from sfms_robot.listeners import audio_frontend, checkpoint
+from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig.event_curves import features
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import FIRST, NODDING
@@ -121,19 +119,6 @@ def test_losses_fall(data, tmp_path):
     more = train_arig(settings(steps=60), data, tmp_path / "more")
     for part in ("noise", "state", "coarse"):
         assert more[f"held_out_{part}"] < 0.9 * few[f"held_out_{part}"]
-
-
-def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path):
-    def stop(report):
-        if report.position.step == 3:
-            signal.raise_signal(signal.SIGINT)
-
-    train_arig(settings(steps=6), data, tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt, match="--resume continues"):
-        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watches=(stop,)))
-    train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
-    whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
-    assert whole == parts
 
 
 def test_the_curriculum_decides_where_windows_come_from(corpus):
