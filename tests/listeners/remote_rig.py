@@ -16,6 +16,10 @@ SERVER_CLOCK_S = 1_000.0  # ahead of the robot's
 SILENCE = np.zeros(640, np.float32)
 
 
+def frames(count):
+    return [SpeakerFrame((index + 1) * FRAME_S, SILENCE) for index in range(count)]
+
+
 class Counting:
     """Plans every `hop` frames, of the number of frames that it has heard; nods now and then. Batches."""
 

@@ -5,12 +5,11 @@ import pytest
 import torch
 from safetensors.numpy import save_file as save_numpy
 from safetensors.torch import load_file, save_file
-from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
+from tiny_sfms import plans_of, speech
 
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.registry import load_folder
-from sfms_robot.listeners.sfms.model import SfmsModel
 
 
 @pytest.fixture
@@ -98,13 +97,6 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_nothing_is_left(tmp_pat
             write()
         assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_learned_placement_carries_its_scores(tmp_path):
-    listener = tiny_listener(placement="learned")
-    names = listener.model.state_dict()
-    assert any(name.startswith("tokenizer.score.") for name in names)
-    assert not any(name.startswith("tokenizer.score.") for name in SfmsModel(tiny_settings()).state_dict())
 
 
 def test_tensors_are_read_one_at_a_time(tmp_path):

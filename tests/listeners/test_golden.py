@@ -50,6 +50,6 @@ def test_outputs_are_those_on_file(name: str):
         np.testing.assert_allclose(found, kept[key], rtol=1e-3, atol=1e-4 if key == "logits" else 1e-3)
 
 
-if __name__ == "__main__":  # writes the files anew, for a change of the architecture that is meant
+if __name__ == "__main__":  # with PYTHONPATH=tests: writes the files anew, where the architecture is meant to change
     for name, outputs in KINDS.items():
         np.savez_compressed(ASSETS / f"{name}.npz", **outputs())

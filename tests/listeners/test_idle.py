@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from people_rad import PEOPLE_RAD
 from safetensors.numpy import save_file
-from tiny_sfms import speech, told_listener
+from tiny_sfms import plans_of, speech, told_listener
 
 from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
@@ -190,23 +190,12 @@ def test_a_broken_file_is_one_line(tmp_path, problem):
     assert str(file) in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"no weights"])
-def test_a_file_that_is_none_is_one_line(tmp_path, content):
-    (tmp_path / "a.safetensors").write_bytes(content)
-    with pytest.raises(ModelError, match="not a readable safetensors file"):
-        IdleMotion.load(tmp_path / "a.safetensors")
-
-
 def planned(hop, idle, said=range(0)):
     """What a listener with this idle motion plans, which speaks itself in these frames."""
     nothing = Calmness(**dict.fromkeys(EVENT_KINDS, 0.0))
     listener = EventfulListener(told_listener(hop=hop), EventModel.load(), nothing, idle)
-    memory, plans = listener.start(5), []
-    for index, frame in enumerate(speech(120)):
-        own = frame.audio if index in said else None
-        plan, memory = listener.step(changed(frame, agent_audio=own), memory)
-        plans += [] if plan is None else [plan]
-    return plans
+    speaker = [changed(frame, agent_audio=frame.audio if at in said else None) for at, frame in enumerate(speech(120))]
+    return plans_of(listener, speaker, seed=5).values()
 
 
 @pytest.mark.parametrize("hop", [2, 4])

@@ -4,15 +4,17 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
+from tiny_arig import talk
 
 from sfms_robot.config.listener import parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, FaceFrame, SpeakerFrame
+from sfms_robot.frames import SpeakerFrame
 from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, save_config
 from sfms_robot.listeners.engine import HALF, OnnxEngine, digest, integers, read_graphs
@@ -24,14 +26,12 @@ SHIPPED = ["sfms-small", "arig-small"]
 FOLDERS = sorted(file.parent for file in LISTENERS.glob("*/config.yaml"))
 
 
-def people(frames: int, seed: int = 0) -> list[SpeakerFrame]:
+def people(frames: int) -> list[SpeakerFrame]:
     """Both talk in turns; one frame in five shows no face, one in seven has no sound."""
-    rng, out = np.random.default_rng(seed), []
+    out = talk(frames)
     for index in range(frames):
-        time_s, talks = (index + 1) * FRAME_S, index % 50 < 30
-        theirs, ours = (rng.normal(0, 0.1 * each, FRAME_SAMPLES).astype(np.float32) for each in (talks, not talks))
-        face = FaceFrame.of(time_s, rng.uniform(0, 0.3, 58)) if index % 5 else None
-        out.append(SpeakerFrame(time_s, theirs if index % 7 else theirs[:0], face, ours))
+        out[index] = out[index] if index % 5 else replace(out[index], face=None)
+        out[index] = out[index] if index % 7 else replace(out[index], audio=out[index].audio[:0])
     return out
 
 

@@ -1,19 +1,19 @@
 """Many heads, one model: batches, deadlines, admission, and nobody in anybody's way."""
 
-import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from remote_rig import SILENCE, Counting, Network, Robot, Server
-from tiny_sfms import speech, tiny_listener
+from tiny_sfms import plans_of, speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners.capacity import Capacity, measure_capacity
 from sfms_robot.listeners.remote_messages import (
     OURS,
     Join,
+    Notice,
     SentFrame,
     Welcome,
     frame_message,
@@ -23,6 +23,8 @@ from sfms_robot.listeners.remote_messages import (
 )
 from sfms_robot.listeners.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
 from sfms_robot.listeners.thread import MOST_WAITING
+
+LEAVE = words_message(Notice("leave"))
 
 
 def joined(server, client="a", now_s=0.0, seed=0):
@@ -118,23 +120,18 @@ def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
                 sent = SentFrame(now - first, people[index][now - first], 0.0)
                 server.receive(streams[index], frame_message(sent), 0.0)
         if now == 20:  # one goes
-            server.receive(streams[1], words_message_leave(), 0.0)
+            server.receive(streams[1], LEAVE, 0.0)
         for stream, sent in stepped(server):
             plans.setdefault(stream, []).append(sent.plan)
     for index in (0, 2):
-        memory, alone = listener.start(index), []
-        for each in people[index]:
-            heard = np.clip(np.rint(each.audio * 32768), -32768, 32767).astype(np.float32) / 32768
-            plan, memory = listener.step(SpeakerFrame(each.time_s, heard, each.face), memory)
-            alone += [] if plan is None else [plan]
+        heard = [np.clip(np.rint(each.audio * 32768), -32768, 32767) / 32768 for each in people[index]]
+        pairs = zip(people[index], heard, strict=True)
+        speaker = [SpeakerFrame(each.time_s, audio.astype(np.float32), each.face) for each, audio in pairs]
+        alone = [*plans_of(listener, speaker, seed=index).values()]
         found = plans[streams[index]]
         assert len(found) == len(alone)
         for one, other in zip(found, alone, strict=True):
             assert np.abs(one.frames - other.frames).max() < 1e-5
-
-
-def words_message_leave():
-    return json.dumps({"type": "notice", "kind": "leave"}).encode()
 
 
 def test_who_is_silent_is_given_up_and_told_when_it_speaks_again():
@@ -207,7 +204,7 @@ def test_heads_are_admitted_until_the_deadline_cannot_be_held_and_the_reason_has
     refusal = parse_words(server.join(words_message(Join("one more", 0)), 0.0))
     assert not refusal.final and "is full" in refusal.reason and "80 ms are promised" in refusal.reason
     gone = next(iter(server._streams))
-    server.receive(gone, words_message_leave(), 0.0)
+    server.receive(gone, LEAVE, 0.0)
     joined(server, "one more")
 
 

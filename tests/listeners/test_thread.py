@@ -2,15 +2,10 @@
 
 import numpy as np
 import pytest
+from remote_rig import frames
 
 from sfms_robot.frames import FRAME_S, Plan, SpeakerFrame
 from sfms_robot.listeners.thread import CATCH_UP, LATE_S, MOST_WAITING, Inbox, Lateness
-
-SILENCE = np.zeros(640, np.float32)
-
-
-def frames(count):
-    return [SpeakerFrame((i + 1) * FRAME_S, SILENCE) for i in range(count)]
 
 
 def filled(items):

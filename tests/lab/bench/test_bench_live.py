@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from virtual_time import Time
 
 from sfms_robot.frames import FRAME_S, FaceFrame, Plan, SpeakerFrame
 from sfms_robot.lab.bench.live_bench import GOALS, goals
@@ -13,32 +14,25 @@ TICK_S = 0.01
 SOUND = np.zeros(640, np.float32)
 
 
-class Time:
-    s = 0.0
-
-    def now(self):
-        return self.s
-
-
 def stamped(seconds, hop, source_s, plan_s, write_s=0.0, skip=()):
     """A run in made-up time: frames come `source_s` late, plans `plan_s` after the frame that they are made of."""
     time = Time()
-    stamps = Stamps(time.now, lambda: source_s / 2, 1 / TICK_S)
+    stamps = Stamps(time.now_s, lambda: source_s / 2, 1 / TICK_S)
     given, plans = 0, []
     for tick in range(round(seconds / TICK_S)):
         if tick in skip:
             continue
-        time.s = tick * TICK_S
-        while (end_s := (given + 1) * FRAME_S) + source_s <= time.s + 1e-9:
+        time.t = tick * TICK_S
+        while (end_s := (given + 1) * FRAME_S) + source_s <= time.t + 1e-9:
             face = FaceFrame(end_s - 0.01, np.zeros(6, np.float32), np.zeros(52, np.float32))
             stamps.heard(SpeakerFrame(end_s, SOUND, face))
             if given % hop == 0:
-                plans.append((time.s + plan_s, end_s))
+                plans.append((time.t + plan_s, end_s))
             given += 1
-        while plans and plans[0][0] <= time.s + 1e-9:
+        while plans and plans[0][0] <= time.t + 1e-9:
             made_at_s = plans.pop(0)[1]
             stamps.planned(Plan(made_at_s, np.array([made_at_s + FRAME_S]), np.zeros((1, 58), np.float32)))
-        time.s += write_s
+        time.t += write_s
         stamps.tick(Tick(tick * TICK_S, np.zeros(58, np.float32), np.zeros(1), {}))
     return stamps.report()
 

@@ -27,21 +27,13 @@ def test_a_joint_that_stands_still_has_no_delay():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", HEADS)
 def test_led_by_its_lag_every_joint_is_less_than_a_tick_late(name):
-    found = delays(name, duration_s=4.0)
+    found = delays(name, duration_s=4.0) if name in QUICK else delays(name)
     moved = np.isfinite(found.led_s)
-    assert moved.any()
+    assert moved.any() if name in QUICK else moved.mean() > 0.8
     assert np.abs(found.led_s[moved]).max() < 0.010
-    assert found.unled_s[moved].min() > 0.030
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in HEADS if name not in QUICK])
-def test_led_by_its_lag_every_joint_of_the_larger_heads_is_less_than_a_tick_late(name):
-    found = delays(name)
-    moved = np.isfinite(found.led_s)
-    assert moved.mean() > 0.8 and np.abs(found.led_s[moved]).max() < 0.010
+    assert name not in QUICK or found.unled_s[moved].min() > 0.030
 
 
 def test_a_tick_is_measured_part_by_part_beside_a_matrix_product():

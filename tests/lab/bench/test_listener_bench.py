@@ -51,7 +51,8 @@ def test_hearing_and_planning_are_told_apart_and_a_frame_is_their_mean():
 
 def test_both_engines_do_the_same():
     both = _both()
-    assert distance(both["onnx"], both["torch"], talk(20)) < 1e-4
+    assert 0 < distance(both["onnx"], both["torch"], talk(20)) < 1e-4
+    assert distance(both["onnx"], both["onnx"], talk(20)) == 0
 
 
 def test_a_listener_process_says_when_it_plans_and_what_memory_it_takes():

@@ -2,13 +2,13 @@
 
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import dataset_writers as write
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
 from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import ConfigError
@@ -34,10 +34,7 @@ def composed(root: Path) -> Path:
 def plain(name: str, frames: int = 60, **more) -> Dyad:
     motion = write.RNG.uniform(0, 0.5, (frames, 58)).astype(np.float32)
     audio = write.RNG.normal(0, 0.1, frames * 640).astype(np.float32).clip(-1, 1)
-    return replace(
-        Dyad(name=name, audio=audio, speaker=motion, listener=motion[::-1].copy(), listening=np.ones(frames, bool)),
-        **more,
-    )
+    return made_dyad(motion, name=name, audio=audio, speaker=motion[::-1].copy(), **more)
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
@@ -24,13 +25,11 @@ def dyad(frames: int, fps: float, space: str = "arkit58", mel: bool = False) -> 
     motion = np.tile(0.05 * ends_s[:, None], (1, width)).astype(np.float32)
     audio = RNG.normal(0, 0.1, samples_of(frames, fps)).astype(np.float32)
     audio[len(audio) // 2 :] *= 1e-3
-    rows = None
+    sound = {"audio": audio}
     if mel:
         rows = np.repeat(np.where(ends_s < ends_s[-1] / 2, -5.0, -20.0), 4)[:, None] * np.ones(128)
-    return Dyad(
-        name="one", audio=None if mel else audio, speaker=motion.copy(), listener=motion, listening=ends_s < 1.0,
-        space=space, fps=fps, mel=None if rows is None else rows.astype(np.float32),
-    )  # fmt: skip
+        sound = {"audio": None, "mel": rows.astype(np.float32)}
+    return made_dyad(motion, speaker=motion.copy(), listening=ends_s < 1.0, space=space, fps=fps, **sound)
 
 
 @pytest.mark.parametrize("fps", [24.0, 30.0, 50.0, 60.0])

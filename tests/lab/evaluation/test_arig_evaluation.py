@@ -1,6 +1,5 @@
 """`evaluate interaction` and the ARIG tables on half a minute of made-up conversation."""
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -9,10 +8,11 @@ import pytest
 import yaml
 from tiny_arig_training import dyad, settings, write
 
-from sfms_robot.cli.main import main
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.evaluation.arig_tables import _PAPER, _PAPER_2, READINGS
 from sfms_robot.lab.learning.arig.trainer import train_arig
+
+TABLE_2 = ("evaluate", "listener", "--table", "arig-2")
 
 
 @pytest.fixture(scope="module")
@@ -38,24 +38,11 @@ def listener(data, tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def evaluate(capsys):
-    """Exit code, stdout and stderr of a command line of `evaluate`."""
-
-    def run(*words: object) -> tuple[object, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(["evaluate", *map(str, words)])
-        told = capsys.readouterr()
-        return ended.value.code, told.out, told.err
-
-    return run
-
-
 @pytest.mark.slow
-def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_gets(evaluate, listener, data):
-    code, out, _ = evaluate("interaction", "--listener", listener, "--data", data, "--json")
-    found = json.loads(out)
-    assert code == 0 and found["dyads"] == {"listening": 1, "speaking": 1, "interaction": 1}
+def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_gets(command_line, listener, data):
+    ended = command_line("evaluate", "interaction", "--listener", listener, "--data", data, "--json")
+    found = ended.told
+    assert ended.code == 0 and found["dyads"] == {"listening": 1, "speaking": 1, "interaction": 1}
     assert found["voice_rule_accuracy"] > 0.8 > 0.6 > found["majority_accuracy"] > 0.3, "it hears turns a little late"
     assert 0 <= found["state_accuracy"] <= 1 and -1 <= found["lips_speaking_correlation"] <= 1
     table = found["confusion"]["label_by_answer"]
@@ -63,43 +50,40 @@ def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_
 
 
 @pytest.mark.slow
-def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(evaluate, listener, data, tmp_path):
+def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(command_line, listener, data, tmp_path):
     shutil.copytree(data, tmp_path, dirs_exist_ok=True)
     for place, scene in ((".", "listening"), ("speaking", "speaking"), ("interaction", "interaction")):
         shutil.rmtree(tmp_path / place / "train")
         clips.save(tmp_path / place / "train", [replace(dyad("a0", scene, 0), states=None)])
-    code, out, _ = evaluate("interaction", "--listener", listener, "--data", tmp_path, "--json")
-    found = json.loads(out)
-    assert code == 0 and "state_accuracy" in found and "voice_rule_accuracy" not in found
+    ended = command_line("evaluate", "interaction", "--listener", listener, "--data", tmp_path, "--json")
+    found = ended.told
+    assert ended.code == 0 and "state_accuracy" in found and "voice_rule_accuracy" not in found
 
 
-def test_interaction_is_for_listeners_that_speak(evaluate, data):
-    code, _, err = evaluate("interaction", "--listener", "sfms-small", "--data", data)
-    assert code == 2 and "--listener sfms-small: does not speak; this command evaluates listeners of kind arig" in err
+def test_interaction_is_for_listeners_that_speak(command_line, data):
+    ended = command_line("evaluate", "interaction", "--listener", "sfms-small", "--data", data)
+    assert ended.code == 2 and "sfms-small: does not speak; this command evaluates listeners of kind arig" in ended.err
 
 
-def test_table_2_has_a_row_for_every_listener_given_and_the_papers(evaluate, listener, lively):
-    code, out, _ = evaluate(
-        "listener", "--table", "arig-2", "--listener", listener, "--listener", "sfms-small", "--data", lively, "--json"
-    )
-    rows = json.loads(out)["rows"]
-    assert code == 0
-    assert [row["name"] for row in rows] == ["Ground truth", str(listener), "sfms-small", *_PAPER_2]
+def test_table_2_has_a_row_for_every_listener_given_and_the_papers(command_line, listener, lively):
+    ended = command_line(*TABLE_2, "--listener", listener, "--listener", "sfms-small", "--data", lively, "--json")
+    assert ended.code == 0
+    assert [row["name"] for row in ended.told["rows"]] == ["Ground truth", str(listener), "sfms-small", *_PAPER_2]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("table", "paper"), [("arig-1", _PAPER[1]), ("arig-4", _PAPER[4])])
-def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, lively, tmp_path, table, paper):
+def test_ablations_that_are_missing_are_trained_and_kept(command_line, listener, lively, tmp_path, table, paper):
     file = tmp_path / "arig.yaml"
     file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))
-    words = ("listener", "--table", table, "--data", lively, "--models", tmp_path / "m", "--config", file, "--json")
-    words += ("--listener", listener)
-    code, out, _ = evaluate(*words)
-    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} == {
+    words = ("evaluate", "listener", "--table", table, "--data", lively, "--listener", listener)
+    words += ("--models", tmp_path / "m", "--config", file, "--json")
+    ended = command_line(*words)
+    assert ended.code == 0 and {row["name"] for row in ended.told["rows"]} == {
         "GT", *paper, str(listener), *(READINGS if table == "arig-1" else ()),
     }  # fmt: skip
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
-    assert evaluate(*words)[1] == out and before == {path: path.stat().st_mtime_ns for path in before}
+    assert command_line(*words).out == ended.out and before == {path: path.stat().st_mtime_ns for path in before}
 
 
 @pytest.mark.parametrize(
@@ -110,22 +94,22 @@ def test_ablations_that_are_missing_are_trained_and_kept(evaluate, listener, liv
         (("--table", "arig-3"), "'arig-3' is not one of"),
     ],
 )
-def test_what_a_table_cannot_do_without_is_named(evaluate, data, words, said):
-    code, _, err = evaluate("listener", *words, "--data", data)
-    assert code == 2 and said in err
+def test_what_a_table_cannot_do_without_is_named(command_line, data, words, said):
+    ended = command_line("evaluate", "listener", *words, "--data", data)
+    assert ended.code == 2 and said in ended.err
 
 
-def test_a_table_needs_faces_that_move(evaluate, listener, data):
-    code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", data)
-    assert code == 2 and "the clips' own motion: 250 frames differ too little to make 40 clusters" in err
+def test_a_table_needs_faces_that_move(command_line, listener, data):
+    ended = command_line(*TABLE_2, "--listener", listener, "--data", data)
+    assert ended.code == 2 and "the clips' own motion: 250 frames differ too little to make 40 clusters" in ended.err
 
 
-def test_a_table_needs_clips_that_are_long_enough(evaluate, listener, tmp_path):
+def test_a_table_needs_clips_that_are_long_enough(command_line, listener, tmp_path):
     one = dyad("short", "listening", 0)
     parts = {
         name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states", "head_of_gaze_rad")
     }
     sounds = {name: getattr(one, name)[: 200 * 640] for name in ("audio", "agent_audio")}
     clips.save(tmp_path / "test", [replace(one, **parts, **sounds)])
-    code, _, err = evaluate("listener", "--table", "arig-2", "--listener", listener, "--data", tmp_path)
-    assert code == 2 and "no test dyad is as long as a clip of 250 frames" in err
+    ended = command_line(*TABLE_2, "--listener", listener, "--data", tmp_path)
+    assert ended.code == 2 and "no test dyad is as long as a clip of 250 frames" in ended.err

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
+from made_dyads import meeting_person
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FaceFrame, SpeakerFrame
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson, phrases
+from sfms_robot.lab.corpora.compose.ami import phrases
 from sfms_robot.lab.corpora.compose.voices import read_voice
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, listener_meeting, part, shifted
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.motion_primitives import read_motions
-
-NONE = np.zeros((0, 2))
 
 
 @pytest.fixture(scope="module")
@@ -20,14 +19,18 @@ def person():
     starts = np.arange(1.0, 115.0, 5.0)
     a = [(start, start + 3.0, "A") for start in starts]
     c = [(start + 1.0, start + 1.5, "C") for start in starts[::4]]
-    return MeetingPerson(
-        meeting="M1a", agent="B", participant="MEE1", until_s=120.0, nods=np.stack([starts + 3.2, starts + 4.0],
-        axis=1), shakes=NONE, tilts=NONE,
-        unseen=np.array([[100.0, 110.0]]), gaze=((2.0, 40.0, "A"), (40.0, 50.0, "table"), (50.0, 120.0, "A")),
-        laughs=np.array([[50.0, 51.0]]), talk=np.array([[80.0, 82.0]]), backchannels=NONE,
-        others=phrases((start, end) for start, end, _ in (*a, *c)), floor=tuple(sorted(a + c)), others_laughs=NONE,
-        asked=np.zeros(0), looked_at=((0.0, 60.0, "A"),), gaze_known=frozenset("A"),
-    )  # fmt: skip
+    return meeting_person(
+        until_s=120.0,
+        nods=np.stack([starts + 3.2, starts + 4.0], axis=1),
+        unseen=np.array([[100.0, 110.0]]),
+        gaze=((2.0, 40.0, "A"), (40.0, 50.0, "table"), (50.0, 120.0, "A")),
+        laughs=np.array([[50.0, 51.0]]),
+        talk=np.array([[80.0, 82.0]]),
+        others=phrases((start, end) for start, end, _ in (*a, *c)),
+        floor=tuple(sorted(a + c)),
+        looked_at=((0.0, 60.0, "A"),),
+        gaze_known=frozenset("A"),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +45,7 @@ def at(seconds):
 
 
 def test_it_is_as_it_was(person, one):
-    assert one.frames == len(one.speaker) == at(120) and one.participant == "MEE1"
+    assert one.frames == len(one.speaker) == at(120) and one.participant == person.participant
     np.testing.assert_array_equal(one.spans_s["nod"], person.nods)
     assert len(one.spans_s["laugh"]) == 1 and one.aside.tolist() == [False, True, False]
     voiced = voice_activity(np.concatenate([frame.audio for frame in one.speaker]))

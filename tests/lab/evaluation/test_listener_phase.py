@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
+from tiny_sfms import tiny_listener
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
@@ -14,26 +16,17 @@ from sfms_robot.lab.evaluation.rollout import frames_of_dyad
 from sfms_robot.lab.learning.corpus import fit_sound
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, keyframe_scores
-from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
-from sfms_robot.listeners.torch_engine import torch_engine
 
 OFF = {"steps": 1, "batch": 1, "learning_rate": 1, "neutral_prefix": 0, "drop_audio": 0, "drop_face": 0}
 
 
 def listener(**changes) -> SfmsListener:
-    raw = {
-        "kind": "sfms",
-        "groups": {
-            "neck": {"channels": POSE_CHANNELS, "levels": (5, 3), "keyframes": 8},
-            "face": {"channels": BLENDSHAPES, "levels": (2, 2), "keyframes": 4},
-        },
-        "placement": "static", "tokenizer_width": 16, "predictor_width": 16, "predictor_layers": 1, "heads": 2,
-    }  # fmt: skip
-    settings = config.parse(config.Sfms, raw | changes, "tiny")
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return SfmsListener(settings, torch_engine(SfmsModel(settings)))
+    groups = {
+        "neck": {"channels": POSE_CHANNELS, "levels": (5, 3), "keyframes": 8},
+        "face": {"channels": BLENDSHAPES, "levels": (2, 2), "keyframes": 4},
+    }
+    return tiny_listener(groups=groups, placement="static", **changes)
 
 
 def dyad(frames: int = 60) -> Dyad:
@@ -43,7 +36,7 @@ def dyad(frames: int = 60) -> Dyad:
     audio[20 * FRAME_SAMPLES : 35 * FRAME_SAMPLES] = 0  # a pause
     speaker = rng.uniform(0, 0.3, (frames, 58)).astype(np.float32)
     speaker[7:12] = np.nan
-    return Dyad(name="a", audio=audio, speaker=speaker, listener=motion, listening=np.ones(frames, bool))
+    return made_dyad(motion, audio=audio, speaker=speaker)
 
 
 def corpus_of(one: SfmsListener, *dyads: Dyad) -> SfmsCorpus:

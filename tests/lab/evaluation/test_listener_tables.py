@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
+from made_dyads import made_dyad
+from tiny_sfms import tiny_listener
 
-from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, SPACE_CHANNELS
 from sfms_robot.lab.corpora.clips import Dyad
@@ -22,9 +22,7 @@ from sfms_robot.lab.evaluation.listener_tables import (
 )
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
-from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
-from sfms_robot.listeners.torch_engine import torch_engine
 
 COLUMNS = {
     1: ("L2", "FD", "Var", "SI", "P-FD", "RPCC"),
@@ -37,19 +35,8 @@ def clips_of(truth, speaker, train, people=(), space="arkit58") -> Clips:
 
 
 def listener(space: str = "arkit58", **changes) -> SfmsListener:
-    raw = {
-        "kind": "sfms",
-        "motion_space": space,
-        "groups": {"preset": "one", "levels": [3, 2], "keyframes": 6},
-        "tokenizer_width": 16,
-        "predictor_width": 16,
-        "predictor_layers": 1,
-        "heads": 2,
-    }
-    settings = config.parse(config.Sfms, raw | changes, "tiny")
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return SfmsListener(settings, torch_engine(SfmsModel(settings)))
+    groups = {"preset": "one", "levels": [3, 2], "keyframes": 6}
+    return tiny_listener(motion_space=space, groups=groups, **changes)
 
 
 def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> Dyad:
@@ -64,9 +51,7 @@ def dyad(name: str, frames: int = 70, seed: int = 0, space: str = "arkit58") -> 
         audio, rows = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32), None
     else:  # as L2L comes: mel rows and no waveform
         audio, rows = None, rng.normal(-5, 1, (4 * frames, 128)).astype(np.float32)
-    return Dyad(
-        name=name, audio=audio, speaker=speaker, listener=motion, listening=np.ones(frames, bool), space=space, mel=rows
-    )
+    return made_dyad(motion, name=name, audio=audio, speaker=speaker, space=space, mel=rows)
 
 
 @pytest.mark.parametrize("changes", [{}, {"hop": 1}, {"phase": False, "sequential": False}, {"audio": "mfcc78"}])

@@ -6,10 +6,10 @@ from collections import Counter
 import numpy as np
 import pytest
 import soundfile
+from made_dyads import made_dyad
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.people_study import (
     NEITHER,
     QUESTIONS,
@@ -70,11 +70,7 @@ def test_all_answered_is_the_end_and_an_answer_counts_once(tmp_path):
 def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
     draw, frames = np.random.default_rng(0), 60
     speaker, listener = draw.uniform(0, 0.4, (2, frames, 58)).astype(np.float32)
-    audio = draw.normal(0, 0.1, frames * 640).astype(np.float32).clip(-1, 1)
-    clips.save(
-        tmp_path / "data" / "test",
-        [Dyad(name="one", audio=audio, speaker=speaker, listener=listener, listening=np.ones(frames, bool))],
-    )
+    clips.save(tmp_path / "data" / "test", [made_dyad(listener, speaker=speaker)])
     options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5)
     made = prepare(**options)
     shown = {

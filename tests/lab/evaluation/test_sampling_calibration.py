@@ -3,24 +3,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
+from tiny_sfms import tiny_settings
 
 from sfms_robot import config
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.learning.train_runs import LEAST, coursed, placing
 from sfms_robot.listeners.sfms.model import SfmsModel
 
 
 def settings(**changes) -> config.Sfms:
-    raw = {
-        "kind": "sfms",
-        "groups": {
-            "neck": {"channels": POSE_CHANNELS, "levels": (5, 3), "keyframes": 8},
-            "face": {"channels": BLENDSHAPES, "levels": (2, 2), "keyframes": 4},
-        },
-        "tokenizer_width": 16, "predictor_width": 16, "predictor_layers": 1, "heads": 2,
-    }  # fmt: skip
-    return config.parse(config.Sfms, raw | changes, "tiny")
+    groups = {
+        "neck": {"channels": POSE_CHANNELS, "levels": (5, 3), "keyframes": 8},
+        "face": {"channels": BLENDSHAPES, "levels": (2, 2), "keyframes": 4},
+    }
+    return tiny_settings(**{"groups": groups} | changes)
 
 
 def dyad(frames: int = 200, nods: int = 4) -> Dyad:
@@ -28,8 +26,7 @@ def dyad(frames: int = 200, nods: int = 4) -> Dyad:
     for nod in range(nods):
         at = 15 + nod * 47
         motion[at : at + 26, CHANNEL_INDEX["pitch"]] = 0.1 * (0.5 - 0.5 * np.cos(np.linspace(0, 4 * np.pi, 26)))
-    audio = np.random.default_rng(0).normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    return Dyad(name="a", audio=audio, speaker=motion * 0, listener=motion, listening=np.ones(frames, bool))
+    return made_dyad(motion)
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +59,7 @@ def nodding(sizes_rad) -> Dyad:
         at = 25 + 50 * number
         motion[at : at + 40, CHANNEL_INDEX["pitch"]] = size * np.concatenate([swing, 0.6 * swing])
         nods.append(ListenerEvent("nod", at * 0.04, 1.6, float(size), swings=2))
-    frames = len(motion)
-    audio = np.random.default_rng(0).normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    return Dyad(
-        name="a", audio=audio, speaker=motion * 0, listener=motion, listening=np.ones(frames, bool), events=tuple(nods)
-    )
+    return made_dyad(motion, events=tuple(nods))
 
 
 def told_settings(**changes) -> config.Sfms:
@@ -102,16 +95,7 @@ def smiling(count: int) -> Dyad:
         for name in ("mouthSmileLeft", "mouthSmileRight"):
             motion[:, CHANNEL_INDEX[name]] += event.size * np.interp(times_s, knots_s, [0, 1, 1, 0])
         smiles.append(event)
-    frames = len(motion)
-    silence = np.zeros(frames * FRAME_SAMPLES, np.float32)
-    return Dyad(
-        name="a",
-        audio=silence,
-        speaker=motion * 0,
-        listener=motion,
-        listening=np.ones(frames, bool),
-        events=tuple(smiles),
-    )
+    return made_dyad(motion, events=tuple(smiles))
 
 
 def test_the_course_of_smiles_is_found_at_every_size():

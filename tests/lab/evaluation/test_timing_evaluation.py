@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from made_dyads import meeting_person
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings
 from sfms_robot.lab.evaluation.intervals import estimates
@@ -15,7 +15,6 @@ from sfms_robot.lab.evaluation.rollout import rollout, speaker_frames, spread
 from sfms_robot.lab.evaluation.timing import CELLS, cells
 from sfms_robot.signals.phase import times
 
-NONE = np.zeros((0, 2))
 MINUTES = 40
 FRAMES = MINUTES * 60 * FRAME_HZ
 
@@ -247,12 +246,7 @@ def event_spans(mask):
 
 
 def someone(meeting="TS3003a", participant="P1", **changed):
-    whole = {
-        "meeting": meeting, "agent": "B", "participant": participant, "until_s": 300.0, "nods": NONE, "shakes": NONE,
-        "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE, "backchannels": NONE, "others": NONE,
-        "floor": (), "others_laughs": NONE, "asked": np.zeros(0),
-    }  # fmt: skip
-    return MeetingPerson(**whole | changed)
+    return meeting_person(meeting=meeting, participant=participant, **changed)
 
 
 def test_people_who_were_trained_on_are_refused_unless_asked_for():

@@ -1,7 +1,6 @@
 """ARIG on half a minute of made-up conversation: it learns, repeats, resumes, and hears what it should."""
 
 import shutil
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -37,9 +36,8 @@ from sfms_robot.lab.learning.arig.trainer import (
     train_arig,
     weights_of,
 )
-from sfms_robot.lab.learning.job import Run
 from sfms_robot.lab.learning.train_runs import TrainOptions, train_settings
-from sfms_robot.listeners import audio_frontend, checkpoint
+from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig.event_curves import features
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.stream import FIRST, NODDING
@@ -73,11 +71,26 @@ def a_student(**changes) -> Student:
     return Student(ArigModel(settings(listener=changes).listener))
 
 
+def fitted(corpus, **changes) -> ArigModel:
+    model = a_student(**changes).model
+    fit_scales(model, corpus, settings().listener.channels)
+    return model
+
+
 def quiet(**changes) -> config.ArigPhase:
     """A phase that leaves windows as they are, but for `changes`."""
     noises = ("history_noise", "speaking_noise", "state_noise")
     off = {name: 0 for name in (*noises, "drop_audio", "drop_face", "drop_agent", "gain_db", "colour_db", "grain_db")}
     return settings(**(off | changes)).training
+
+
+def augmented(told, model: ArigModel | None = None, **changes):
+    return augment(told, model or a_student().model, quiet(**changes), torch.Generator().manual_seed(0))
+
+
+def one_window(corpus):
+    """The same window 400 times."""
+    return cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
 
 
 @pytest.mark.parametrize(
@@ -110,19 +123,6 @@ def test_losses_fall(data, tmp_path):
         assert more[f"held_out_{part}"] < 0.9 * few[f"held_out_{part}"]
 
 
-def test_an_interrupted_run_that_is_resumed_writes_the_same_bytes(data, tmp_path):
-    def stop(report):
-        if report.position.step == 3:
-            signal.raise_signal(signal.SIGINT)
-
-    train_arig(settings(steps=6), data, tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt, match="--resume continues"):
-        train_arig(settings(steps=6), data, tmp_path / "parts", Run(watches=(stop,)))
-    train_arig(settings(steps=6), data, tmp_path / "parts", Run(resume=True))
-    whole, parts = ((tmp_path / name / checkpoint.WEIGHTS).read_bytes() for name in ("whole", "parts"))
-    assert whole == parts
-
-
 def test_the_curriculum_decides_where_windows_come_from(corpus):
     phase = settings(steps=100).training
     starts = corpus.starts_by_scene(WINDOW)
@@ -149,7 +149,7 @@ def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data,
 def test_a_silent_agent_may_lack_its_track_but_one_that_speaks_never(corpus):
     starts = corpus.starts_by_scene(WINDOW)
     told = cut(corpus, torch.cat([starts["speaking"][:20], starts["listening"][:20]]), WINDOW)
-    found, _ = augment(told, a_student().model, quiet(drop_agent=1), torch.Generator().manual_seed(0))
+    found, _ = augmented(told, drop_agent=1)
     speaks = told.voiced[..., 0].any(1)
     assert speaks.any() and not speaks.all()
     assert torch.equal(found.agent_heard.any(1), speaks)
@@ -157,8 +157,7 @@ def test_a_silent_agent_may_lack_its_track_but_one_that_speaks_never(corpus):
 
 def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:10], WINDOW)
-    model = a_student().model
-    found, _ = augment(told, model, quiet(drop_audio=1, drop_face=1), torch.Generator().manual_seed(0))
+    found, _ = augmented(told, drop_audio=1, drop_face=1)
     assert told.voiced[..., 1].any()
     assert not (found.user_heard.any() or found.voiced[..., 1].any() or found.user_seen.any())
     assert torch.equal(found.voiced[..., 0], told.voiced[..., 0])
@@ -166,7 +165,7 @@ def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
 
 def test_without_augmentation_windows_stay_as_they_are(corpus):
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:5], WINDOW)
-    found, truth = augment(told, a_student().model, quiet(), torch.Generator().manual_seed(0))
+    found, truth = augmented(told)
     assert torch.equal(truth, told.agent_motion)
     for name in ("user_sound", "agent_sound", "user_heard", "agent_motion", "voiced"):
         assert torch.equal(getattr(found, name), getattr(told, name))
@@ -179,7 +178,7 @@ def test_a_quiet_room_takes_from_what_is_no_speech_down_to_digital_silence(corpu
     room = torch.zeros_like(told.user_sound)
     room[..., :MEL_WIDTH] = 3.0
     told = replace(told, user_sound=told.user_sound + room)
-    found, _ = augment(told, a_student().model, quiet(quiet_room=1), torch.Generator().manual_seed(0))
+    found, _ = augmented(told, quiet_room=1)
     voiced, floor = told.voiced[..., 1], np.log(FLOOR)
     assert voiced.any() and not voiced.all() and torch.equal(found.user_sound[voiced], told.user_sound[voiced])
     before, after = (each.user_sound[..., :MEL_WIDTH][~voiced] - floor for each in (told, found))
@@ -192,7 +191,7 @@ def test_a_quiet_room_takes_from_what_is_no_speech_down_to_digital_silence(corpu
 
 def test_a_silent_user_is_heard_as_a_stream_hears_silence(corpus):
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][::9][:10], WINDOW)
-    found, _ = augment(told, a_student().model, quiet(silent_user=1), torch.Generator().manual_seed(0))
+    found, _ = augmented(told, silent_user=1)
     state, heard = audio_frontend.TRACKS.start(), []
     for _ in range(WINDOW):
         sound, _, (state,) = hear_each([np.zeros(FRAME_SAMPLES, np.float32)], [state])
@@ -205,11 +204,11 @@ def test_a_silent_user_is_heard_as_a_stream_hears_silence(corpus):
 def sounds_off(corpus, sound: str = "mel", **changes) -> torch.Tensor:
     """(400, N, A) what augmentation adds to the agent's sound."""
     student = Student(ArigModel(settings({"sound": sound}).listener))
-    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    told = one_window(corpus)
     if sound != "mel":
         zeros = torch.zeros(400, WINDOW, student.model.sound_width)
         told = replace(told, user_sound=zeros, agent_sound=zeros)
-    found, _ = augment(told, student.model, quiet(**changes), torch.Generator().manual_seed(0))
+    found, _ = augmented(told, student.model, **changes)
     return found.agent_sound - told.agent_sound
 
 
@@ -229,12 +228,11 @@ def test_grain_is_drawn_anew_for_every_band_and_row(corpus):
 
 
 def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_back(corpus):
-    model = a_student().model
-    fit_scales(model, corpus, settings().listener.channels)
+    model = fitted(corpus)
     model.step_std.zero_()  # leaves the slow part alone
-    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    told = one_window(corpus)
     told = replace(told, voiced=torch.zeros_like(told.voiced))
-    found, truth = augment(told, model, quiet(history_noise=0.4), torch.Generator().manual_seed(0))
+    found, truth = augmented(told, model, history_noise=0.4)
     off = (found.agent_motion - told.agent_motion) / model.motion_std
     assert float((off.flatten(1).abs().amax(1) < 1e-4).float().mean()) == pytest.approx(0.67, abs=0.1)  # 0.3 never jump
     after = (truth - told.agent_motion) / model.motion_std
@@ -255,14 +253,12 @@ def test_a_past_that_goes_elsewhere_glides_there_evenly():
 
 
 def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_once(corpus):
-    model = a_student().model
-    fit_scales(model, corpus, settings().listener.channels)
-    told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:1].repeat(400), WINDOW)
+    model = fitted(corpus)
+    told = one_window(corpus)
     speaks = torch.zeros_like(told.voiced)
     speaks[:, WINDOW // 2 :, 0] = True
     told = replace(told, voiced=speaks)
-    phase = quiet(history_noise=0.4, speaking_noise=1.0)
-    found, truth = augment(told, model, phase, torch.Generator().manual_seed(0))
+    found, truth = augmented(told, model, history_noise=0.4, speaking_noise=1.0)
     off = ((found.agent_motion - told.agent_motion) / model.motion_std)[:, WINDOW // 2 :]
     lips = torch.tensor([name.startswith(("jaw", "mouth", "tongue")) for name in CHANNELS])
     assert float(off[..., lips].std()) > 3 * float(off[..., ~lips].std()) > 0
@@ -272,16 +268,14 @@ def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_onc
 
 @pytest.mark.parametrize("draws", ["motion", "step", "innovation"])
 def test_what_is_drawn_is_the_inverse_of_what_is_learned(corpus, draws):
-    model = a_student(draws=draws).model
-    fit_scales(model, corpus, settings().listener.channels)
+    model = fitted(corpus, draws=draws)
     motion = model.standardise(corpus.frames.agent_motion)
     last = motion.roll(1, 0)
     assert torch.allclose(model.drawn(model.moved(motion, last), last), motion, atol=1e-4)
 
 
 def test_steps_from_one_dyad_into_the_next_are_no_steps(corpus):
-    model = a_student(draws="step").model
-    fit_scales(model, corpus, settings().listener.channels)
+    model = fitted(corpus, draws="step")
     motion = model.standardise(corpus.frames.agent_motion).split(corpus.lengths)
     largest = torch.stack([(one.diff(dim=0) / model.step_std).abs().amax(0) for one in motion]).amax(0)
     assert torch.allclose(torch.maximum(model.head.high, -model.head.low), largest, atol=1e-3)
@@ -500,7 +494,7 @@ def test_a_head_whose_past_is_not_told_is_as_it_was(data):
     corpus = gather(open_scenes(data, "train"), WINDOW, ARKIT, model.settings)
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:50], WINDOW)
     fit_scales(model, corpus, settings().listener.channels)
-    found, truth = augment(told, model, quiet(history_noise=1.0), torch.Generator().manual_seed(0))
+    found, truth = augmented(told, model, history_noise=1.0)
     assert torch.equal(found.agent_motion[..., :6], told.agent_motion[..., :6])
     assert torch.equal(truth[..., :6], told.agent_motion[..., :6])
     assert not torch.equal(found.agent_motion[..., 6:], told.agent_motion[..., 6:])
@@ -514,8 +508,7 @@ def test_what_events_do_on_average_is_fitted_on_the_data_and_has_no_side():
         at = round(event.start_s * HZ)
         motion[at : at + 15, :3] += 0.05 * bump[:, None]
     corpus = gather({"a": [replace(one, listener=motion)]}, WINDOW, ARKIT, A_TOLD)
-    model = a_student(events=True, draws="innovation").model
-    fit_scales(model, corpus, settings().listener.channels)
+    model = fitted(corpus, events=True, draws="innovation")
     found = features(corpus.frames.control) @ model.told
     standard = model.standardise(corpus.frames.agent_motion)
     assert float(torch.corrcoef(torch.stack([found[:, 1], standard[:, 1]]))[0, 1]) > 0.95
@@ -523,8 +516,7 @@ def test_what_events_do_on_average_is_fitted_on_the_data_and_has_no_side():
 
 
 def test_states_are_known_by_how_long_they_last_and_by_the_voices_they_go_with(corpus):
-    model = a_student(events=True).model
-    fit_scales(model, corpus, settings().listener.channels)
+    model = fitted(corpus, events=True)
     speaking, listening = STATES.index("speaking"), STATES.index("listening")
     assert model.states.durations[speaking].max() == HZ and model.states.durations[speaking].min() >= 1
     assert model.states.possible[1, 0, speaking] and not model.states.possible[1, 0, listening]

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from tiny_sfms import tiny_settings
 
 from sfms_robot import config
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import imitation, lively, regrets, states, tokenizer_loss
@@ -89,17 +90,14 @@ def test_scores_that_learned_from_the_teacher_beat_even_keyframes_on_unseen_moti
 
 @pytest.mark.parametrize("quantizer", ["fsq", "vq"])
 def test_a_step_in_half_precision_is_finite_and_reaches_codes_inpainter_and_scores(quantizer):
-    raw = {
-        "kind": "sfms",
-        "placement": "learned",
-        "quantizer": quantizer,
-        "groups": {"preset": "four", "levels": [4, 4], "keyframes": 3},
-        "scores": {"width": 8, "layers": 1, "heads": 2},
-        "tokenizer_width": 16,
-        "heads": 2,
-    }
+    settings = tiny_settings(
+        placement="learned",
+        quantizer=quantizer,
+        groups={"preset": "four", "levels": [4, 4], "keyframes": 3},
+        scores={"width": 8, "layers": 1, "heads": 2},
+    )
     torch.manual_seed(0)
-    tokenizer, drawn = Tokenizer(config.parse(config.Sfms, raw, "tiny")), torch.Generator().manual_seed(0)
+    tokenizer, drawn = Tokenizer(settings), torch.Generator().manual_seed(0)
     phase = config.TokenizerTraining(steps=1, batch=4, learning_rate=1e-3)
     batch = torch.randn(4, 48, 58).cumsum(1) / 4
     torch.nn.init.normal_(tokenizer.inpainter.out.weight)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import rollouts
@@ -71,17 +72,7 @@ def dyad(name: str = "a", frames: int = 500, seed: int = 0) -> Dyad:
         during = (since >= 0) & (since < event.duration_s)
         motion[:, CHANNEL_INDEX["pitch"]] += during * 0.05 * (1 - np.cos(2 * np.pi * 2 * since / event.duration_s))
         events.append(event)
-    audio = rng.normal(0, 0.05, frames * FRAME_SAMPLES).astype(np.float32)
-    listening = np.ones(frames, bool)
-    return Dyad(
-        name=name,
-        audio=audio,
-        speaker=motion * 0,
-        listener=motion,
-        listening=listening,
-        events=tuple(events),
-        head_of_gaze_rad=head,
-    )
+    return made_dyad(motion, name=name, events=tuple(events), head_of_gaze_rad=head)
 
 
 def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them():
@@ -143,12 +134,16 @@ def test_no_border_between_dyads_counts_as_motion():
     assert torch.equal(held_tokens(tokens, both.lengths), torch.cat([held_tokens(t, [500]) for t in tokens.split(500)]))
 
 
+def learner():
+    listener = settings().listener
+    return SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
+
+
 def test_a_window_begins_with_the_keyframe_that_is_held_there():
     tokens = torch.tensor([[0, 3], [2, 0], [0, 0], [0, 5], [0, 0]])
     assert held_tokens(tokens, [5]).tolist() == [[0, 3], [2, 3], [2, 3], [2, 5], [2, 5]]
     assert held_tokens(tokens, [2, 3]).tolist() == [[0, 3], [2, 3], [0, 0], [0, 5], [0, 5]]
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
+    model, corpus = learner()
     placed = torch.zeros(500, 2).long()
     placed[10] = 4
     at = torch.tensor([5, 30])
@@ -164,9 +159,8 @@ def corpus_with_sound(corpus):
 
 
 def test_windows_of_a_tokenizer_begin_with_a_keyframe():
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), gather([dyad()], 48, ARKIT, None, listener)
-    fit_scales(model, corpus, listener.channels)
+    model, corpus = learner()
+    fit_scales(model, corpus, model.settings.channels)
     draw = batches(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths, 8)
     _, mask = draw(8, torch.Generator().manual_seed(0))
     assert mask.shape == (8, 48, 2) and (mask[:, 0] == 1).all() and mask.mean() < 0.5
@@ -183,8 +177,8 @@ def test_windows_with_events_have_one_in_their_future():
 
 def test_a_stream_that_has_just_begun_was_told_of_nothing_before():
     training = settings(neutral_prefix=1.0).predictor
-    listener = settings().listener
-    model, corpus = SfmsModel(listener), corpus_with_sound(gather([dyad()], 48, ARKIT, None, listener))
+    model, corpus = learner()
+    corpus = corpus_with_sound(corpus)
     corpus = replace(corpus, frames=replace(corpus.frames, control=torch.ones(500, len(COLUMNS))))
     with torch.no_grad():
         seen = context(model, corpus, torch.zeros(500, 2).long(), torch.arange(6), 40, 8)

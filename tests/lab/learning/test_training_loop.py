@@ -267,34 +267,30 @@ def test_both_optimizers_follow_the_schedule_from_their_own_rate(tmp_path):
     assert seen == [[0.05 * schedule(s, job.phase), 0.02 * schedule(s, job.phase)] for s in range(20)]
 
 
+def precision_of(tmp_path, precision, device="cpu"):
+    """The numbers that a model on this device computes with."""
+    job, seen = toy(precision=precision), set()
+    model = job.model.to(device)
+
+    def loss_of(step, generator, batch):
+        x = torch.randn(4, 4, generator=generator).to(device)
+        out = model(x)
+        seen.add(out.dtype)
+        return ((out - x.sum(1, keepdim=True)) ** 2).mean()
+
+    assert math.isfinite(fit(replace(job, loss_of=loss_of, held_out=None), tmp_path).loss)
+    return seen
+
+
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("has_it", [True, False])
 def test_bf16_is_for_processors_that_have_it(tmp_path, monkeypatch, precision, has_it):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: has_it)
-    job = toy(precision=precision)
-    seen = []
-
-    def loss_of(step, generator, batch):
-        x = torch.randn(4, 4, generator=generator)
-        out = job.model(x)
-        seen.append(out.dtype)
-        return ((out - x.sum(1, keepdim=True)) ** 2).mean()
-
-    assert math.isfinite(fit(replace(job, loss_of=loss_of, held_out=None), tmp_path).loss)
-    assert set(seen) == {torch.bfloat16 if has_it and precision == "bf16" else torch.float32}
+    wanted = torch.bfloat16 if has_it and precision == "bf16" else torch.float32
+    assert precision_of(tmp_path, precision) == {wanted}
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_bf16_trains_on_a_gpu(tmp_path):
-    job = toy(precision="bf16")
-    model = job.model.cuda()
-
-    def loss_of(step, generator, batch):
-        x = torch.randn(4, 4, generator=generator).cuda()
-        out = model(x)
-        assert out.dtype == torch.bfloat16
-        return ((out - x.sum(1, keepdim=True)) ** 2).mean()
-
-    outcome = fit(replace(job, loss_of=loss_of, held_out=None), tmp_path)
-    assert math.isfinite(outcome.loss)
+    assert precision_of(tmp_path, "bf16", "cuda") == {torch.bfloat16}

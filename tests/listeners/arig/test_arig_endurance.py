@@ -1,4 +1,4 @@
-"""Ten minutes of what conversations do not have: silence of both, and two clocks that drift apart."""
+"""Ten minutes of talk and events, and what comes after them: a head where people hold theirs, a face at rest."""
 
 import dataclasses
 
@@ -7,8 +7,8 @@ import pytest
 from people_rad import PEOPLE_RAD
 
 from sfms_robot.data import data_dir
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent, SpeakerFrame
-from sfms_robot.listeners import audio_frontend, checkpoint
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent, SpeakerFrame
+from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.idle import sway_at
 from sfms_robot.listeners.registry import load_folder
 from sfms_robot.signals.audio import read_audio
@@ -16,34 +16,8 @@ from sfms_robot.signals.control import COLUMNS, control_track
 
 FRAMES = 600 * FRAME_HZ
 SILENCE = np.zeros(FRAME_SAMPLES, np.float32)
-PPM = 200e-6
 SHIPPED = data_dir("configs") / "listeners" / "arig-small"
 SETTLED_S = 0.4  # after a nod
-
-
-def silent_minutes(listener, frames: int = FRAMES) -> np.ndarray:
-    """(frames, 58)."""
-    memory, out = listener.start(0), np.zeros((frames, 58), np.float32)
-    for index in range(frames):
-        plan, memory = listener.step(SpeakerFrame((index + 1) * FRAME_S, SILENCE, None, SILENCE), memory)
-        out[index] = plan.frames[0]
-    return out
-
-
-def head_speed_rad_s(motion: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(motion[:, :3].astype(float), axis=0), axis=1) / FRAME_S
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (SHIPPED / checkpoint.WEIGHTS).is_file(), reason="arig-small has no weights here")
-def test_the_shipped_listener_lives_calmly_through_ten_silent_minutes():
-    out = silent_minutes(load_folder(SHIPPED))
-    assert np.isfinite(out).all()
-    speed = head_speed_rad_s(out)
-    assert np.percentile(speed, 99) < 1.0 and speed.max() < 3.0  # slower than a neck's 2 to 3 rad/s may be
-    late = out[-60 * FRAME_HZ :, :3]
-    assert 1e-4 < late.std(0).max() < 0.3  # alive in the last minute, and near where a head is held
-    assert np.abs(late.mean(0)).max() < 0.5
 
 
 def minutes_of_events(minutes: float) -> list[ListenerEvent]:
@@ -112,33 +86,3 @@ def test_whatever_its_face_was_left_in_it_comes_back_to_rest():
         plans, memories = zip(*listener.step_each(frames, memories, control), strict=True)
     left = [plan.frames[0, part] for plan, part in zip(plans, parts, strict=True)]
     assert max(left) < 0.15, channels[parts[int(np.argmax(left))]]
-
-
-def drifting(samples: np.ndarray, ppm: float) -> list[np.ndarray]:
-    """The agent's track as it arrives with the frames of a microphone whose clock runs slower by `ppm`."""
-    ends = np.floor(np.arange(len(samples) // FRAME_SAMPLES + 1) * FRAME_SAMPLES * (1 + ppm)).astype(int)
-    return [samples[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end <= len(samples)]
-
-
-@pytest.mark.parametrize("ppm", [PPM, pytest.param(-PPM, marks=pytest.mark.slow)])
-def test_ten_minutes_of_clock_drift_do_not_add_up(ppm: float):
-    """What is heard in a frame is what was said in it: 1920 samples of drift in all, one at most in any frame."""
-    rng = np.random.default_rng(0)
-    loud = np.repeat(rng.random(300) > 0.5, 2 * AUDIO_HZ)  # bursts of 2 s
-    said = (rng.normal(0, 0.1, len(loud)) * np.where(loud, 1.0, 1e-3)).astype(np.float32)
-    frames = drifting(said, ppm)
-    assert {len(frame) for frame in frames} == {FRAME_SAMPLES, FRAME_SAMPLES + (1 if ppm > 0 else -1)}
-    ears, heard, at = audio_frontend.TRACKS.start(), [], 0
-    levels = []
-    for frame in frames:
-        _, (present,), (ears,) = audio_frontend.hear_each([audio_frontend.fit_frame(frame)], [ears])
-        assert present
-        heard.append(ears.voiced)
-        levels.append(bool(loud[at : at + len(frame)].mean() > 0.5))
-        at += len(frame)
-    truth, found = np.array(levels), np.array(heard)
-    edges = np.flatnonzero(np.diff(truth.astype(int)))
-    near = np.zeros(len(truth), bool)
-    for edge in edges:
-        near[edge - 1 : edge + 4] = True  # two loud frames in a row are speech
-    np.testing.assert_array_equal(found[100:][~near[100:]], truth[100:][~near[100:]])

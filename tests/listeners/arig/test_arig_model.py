@@ -11,8 +11,7 @@ from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import LongRange
-from sfms_robot.listeners.arig.stream import FIRST, rotary
-from sfms_robot.listeners.layers import windows
+from sfms_robot.listeners.arig.stream import rotary
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
@@ -109,17 +108,6 @@ def test_a_batch_is_its_rows(tiny):
         torch.testing.assert_close(tiny.condition(dyad).z[1:], tiny.condition(second).z)
 
 
-def test_the_answer_of_a_stream_is_its_own_previous_state(tiny):
-    """Told the states it found itself, the parallel pass finds the same."""
-    dyad = random_dyad(tiny)
-    with torch.no_grad():
-        rolled = tiny.condition(dyad)
-        found = torch.cat([torch.full((2, 1), FIRST), rolled.states.argmax(-1)], dim=1)
-        told = tiny.condition(dyad, found)
-    torch.testing.assert_close(told.states, rolled.states)
-    torch.testing.assert_close(told.z, rolled.z)
-
-
 def test_without_phase_it_hears_the_sound_alone():
     model = arig_model(phase=False)
     sound, heard, absent = torch.randn(3, model.sound_width), torch.ones(3, dtype=torch.bool), torch.zeros(16)
@@ -128,11 +116,6 @@ def test_without_phase_it_hears_the_sound_alone():
     torch.testing.assert_close(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
     other[:, 0] += 1.0
     assert not torch.equal(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
-
-
-def test_windows_repeat_the_first_frame():
-    x = torch.arange(4.0).view(1, 4, 1)
-    assert windows(x, 3)[0, :, :, 0].tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, ListenerEvent
 from sfms_robot.listeners.arig import event_curves as curves
 from sfms_robot.signals.control import COLUMNS, KINDS, control_track
 
-PITCH, SMILE = CHANNEL_INDEX["pitch"], CHANNEL_INDEX["mouthSmileLeft"]
+PITCH = CHANNEL_INDEX["pitch"]
 
 
 def rows_of(*events: ListenerEvent, frames: int = 100) -> torch.Tensor:

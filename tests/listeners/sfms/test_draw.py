@@ -30,7 +30,6 @@ SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
 LAUGH = ListenerEvent("laugh", 1.0, 1.0, 0.8)
 CODES = np.linspace(0, 1, 11)
 HOW = SmileCourse(spread=0.1)
-NOD = ListenerEvent("nod", 0.9, 1.2, 0.1, swings=3)
 NODDING = NodCourse(spread=0.06)
 FACE = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]
 

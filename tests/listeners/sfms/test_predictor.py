@@ -25,12 +25,6 @@ def logits(predictor, seen: Context, target: torch.Tensor | None = None) -> torc
     return predictor.teacher_forced(seen, torch.ones(1, 8, 2).long() if target is None else target)
 
 
-def test_every_group_gets_its_codes_and_the_transition_for_every_future_frame(tiny):
-    out = logits(tiny.model.predictor, context())
-    assert out.shape == (1, 8, 2, 9)
-    assert out.isfinite().sum(-1)[0, 0].tolist() == [7, 9]
-
-
 @pytest.mark.parametrize("changed", [0, 3, 6])
 def test_a_frame_knows_the_keyframes_before_it_and_none_behind(tiny, changed: int):
     one, other = torch.ones(1, 8, 2).long(), torch.ones(1, 8, 2).long()

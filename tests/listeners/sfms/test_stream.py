@@ -50,25 +50,12 @@ def offline(listener, speaker, seed):
 @pytest.mark.parametrize("hop", [1, 4, 8])
 @pytest.mark.parametrize("changes", [{}, {"sequential": False, "phase": False}, {"audio": "mfcc78"}])
 def test_stream_equals_offline(hop: int, changes: dict):
-    is_offline(tiny_listener(hop=hop, **changes))
-
-
-def is_offline(listener):
-    speaker = speech(61)
+    listener, speaker = tiny_listener(hop=hop, **changes), speech(61)
     expected = offline(listener, speaker, seed=3)
     streamed = plans_of(listener, speaker, seed=3)
     assert list(streamed) == list(expected)
     for index, plan in streamed.items():
         np.testing.assert_allclose(plan.frames, expected[index], atol=1e-5)
-
-
-def test_a_plan_keeps_the_tokens_of_the_one_before(tiny):
-    memory, last = tiny.start(1), None
-    for frame in speech(30):
-        plan, memory = tiny.step(frame, memory)
-        if plan is not None and last is not None:
-            np.testing.assert_array_equal(memory.tokens[-8:-4], last[-4:])
-        last = memory.tokens if plan is not None else last
 
 
 def test_sampling_follows_the_probabilities_of_the_nucleus():

@@ -5,16 +5,7 @@ import torch
 from tiny_sfms import tiny_settings
 
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.piecewise_linear import Neighbours
 from sfms_robot.listeners.sfms.placement import Strategy
-
-
-def test_ends_are_held_and_a_window_without_keyframes_is_finite(tiny):
-    mask = torch.zeros(1, 10, 1)
-    mask[0, 4] = 1.0
-    values = torch.full((1, 10, 1, 1), 2.0)
-    assert torch.equal(Neighbours.in_mask(mask).interpolate(values), values)
-    assert tiny.model.tokenizer.decode(torch.zeros(1, 48, 2).long()).isfinite().all()
 
 
 @pytest.mark.parametrize("quantizer", ["fsq", "vq"])
@@ -36,10 +27,3 @@ def test_every_kind_of_tokenizer_encodes_and_decodes(placement, quantizer):
         assert tokens[..., group].max() <= one.codes
     at_mask = tokenizer.inpaint(tokenizer.quantizer.encode(motion), mask)
     torch.testing.assert_close(tokenizer.decode(tokens), at_mask)
-
-
-def test_a_tokenizer_can_be_asked_for_another_number_or_placement():
-    tokenizer = Tokenizer(tiny_settings(placement="learned", scores={"width": 8, "layers": 1, "heads": 2}))
-    motion = torch.randn(1, 48, 58)
-    for strategy in ("exact", "static", "learned"):
-        assert tokenizer.place(motion, [3, 11], strategy).sum(1).tolist() == [[3.0, 11.0]]

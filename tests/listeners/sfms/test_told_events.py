@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_dyads import made_dyad
 from tiny_sfms import plans_of, speech, told_listener
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_SAMPLES, POSE_CHANNELS, ListenerEvent
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout
 from sfms_robot.listeners.sfms.draw import KEPT_FRAMES, UNDECIDED, Context, passed, revoked
@@ -26,12 +27,8 @@ def told():
 
 
 def dyad(frames: int = 60, events=(NOD, SMILE)) -> Dyad:
-    rng = np.random.default_rng(0)
-    audio = rng.normal(0, 0.1, frames * FRAME_SAMPLES).astype(np.float32)
-    faces = rng.uniform(0, 0.3, (2, frames, 58)).astype(np.float32)
-    return Dyad(
-        name="a", audio=audio, speaker=faces[0], listener=faces[1], listening=np.ones(frames, bool), events=events
-    )
+    faces = np.random.default_rng(0).uniform(0, 0.3, (2, frames, 58)).astype(np.float32)
+    return made_dyad(faces[1], speaker=faces[0], events=events)
 
 
 @pytest.mark.parametrize("hop", [1, 2, 4, 8])

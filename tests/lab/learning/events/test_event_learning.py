@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from ami_tables import UNTIL_S, words, write_tables
+from made_dyads import NONE, meeting_person
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson, phrases
+from sfms_robot.lab.corpora.compose.ami import phrases
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
     GROUPS,
@@ -19,24 +20,19 @@ from sfms_robot.lab.learning.events.event_trainer import (
     student,
     teach,
 )
+from sfms_robot.lab.learning.events.event_training import save, train_events
 from sfms_robot.listeners.events.evidence import AT
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, HazardBank, load_tables
-
-NONE = np.zeros((0, 2))
 
 
 def person(nods=NONE, other=None, **more):
     """A listener who says nothing, in a meeting with one other."""
     other = words(0) if other is None else other
     talk = phrases(map(tuple, other.tolist()))
-    given = {
-        "shakes": NONE, "tilts": NONE, "unseen": NONE, "gaze": None, "laughs": NONE, "talk": NONE,
-        "backchannels": NONE, "others_laughs": NONE, "asked": np.zeros(0),
-    } | more  # fmt: skip
-    return MeetingPerson(
-        meeting="M1a", agent="A", participant="one", until_s=UNTIL_S, nods=nods, others=talk,
-        floor=tuple((a, b, "B") for a, b in talk), words={"A": NONE, "B": other}, **given,
-    )  # fmt: skip
+    floor = tuple((a, b, "B") for a, b in talk)
+    return meeting_person(
+        agent="A", until_s=UNTIL_S, nods=nods, others=talk, floor=floor, words={"A": NONE, "B": other}, **more
+    )
 
 
 def answering():
@@ -134,8 +130,6 @@ def test_counts_of_a_person_are_his_own():
     ("data", "out", "problem"), [("none", "a.yaml", "no such folder"), (".", "gone/a.yaml", "--out")]
 )
 def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
-    from sfms_robot.lab.learning.events.event_training import train_events
-
     with pytest.raises(ConfigError, match=problem) as raised:
         train_events(tmp_path / data, tmp_path / out, False, 1)
     assert "\n" not in str(raised.value)
@@ -143,8 +137,6 @@ def test_a_folder_that_is_not_there_is_one_line(tmp_path, data, out, problem):
 
 @pytest.mark.parametrize("kind", ["gaze_shift", "laugh"])
 def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind):
-    from sfms_robot.lab.learning.events.event_training import train_events
-
     write_tables(tmp_path, lacking=kind)
     with pytest.raises(ConfigError, match=f"there is no {kind}") as raised:
         train_events(tmp_path, None, False, 1)
@@ -152,8 +144,6 @@ def test_meetings_in_which_nobody_does_it_teach_nobody_and_say_so(tmp_path, kind
 
 
 def test_without_people_of_validation_nothing_is_ranked(tmp_path):
-    from sfms_robot.lab.learning.events.event_training import train_events
-
     write_tables(tmp_path)
     found = train_events(tmp_path, tmp_path / "events.yaml", False, 1)
     assert found["people"]["validation"] == 0 and "rollout" not in found
@@ -167,8 +157,6 @@ def test_smiles_last_as_long_as_composed_ones():
 
 
 def test_what_is_saved_is_loaded(tmp_path):
-    from sfms_robot.lab.learning.events.event_training import save
-
     shipped = EventModel.load().tables
     save(tmp_path / "events.yaml", shipped)
     assert load_tables(tmp_path / "events.yaml") == shipped

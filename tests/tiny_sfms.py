@@ -67,11 +67,11 @@ def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) ->
 def plans_of(listener, speaker, seed=1, events=()):
     """Every plan of a stream, by the index of the frame it was made at; of `events` each is told 3 frames ahead."""
     memory, plans = listener.start(seed), {}
-    past, ahead = listener.control_frames
+    past, ahead = getattr(listener, "control_frames", (0, 0))
     for index, frame in enumerate(speaker):
         told = [event for event in events if event.start_s <= (index + 3) * FRAME_S + 1e-9]
         control = control_track(told, index + 1 - past, past + ahead) if past else None
-        plan, memory = listener.step(frame, memory, control)
+        plan, memory = listener.step(frame, memory, *([control] if past else []))
         if plan is not None:
             plans[index] = plan
     return plans
