@@ -187,10 +187,3 @@ def test_a_folder_that_holds_something_is_not_written_into_and_no_usable_clip_is
     ended = command_line("data", "convert", tmp_path / "mute", tmp_path / "other")
     assert ended.code == 2 and "no usable clip" in ended.complaint and ".wav: no such file" in ended.complaint
     assert not list((tmp_path / "other").iterdir())
-
-
-def test_a_source_that_is_no_text_is_named(tmp_path, command_line):
-    convert_data(write.dualtalk(tmp_path / "in"), tmp_path / "out")
-    (tmp_path / "out" / "source.yaml").write_text("licence: [1]\n")
-    report = command_line("data", "check", tmp_path / "out", "--json").told
-    assert "source.yaml: licence = [1] is not text" in report["splits"][0]["problems"][0]["first"]

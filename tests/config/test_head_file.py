@@ -140,11 +140,6 @@ def test_a_register_that_renumbers_or_turns_a_servo_is_refused_by_name(tmp_path,
     assert "position_p_gain" in choices and register not in choices
 
 
-def test_head_check_tells_registers_too(tmp_path):
-    (line,) = check_head(written(tmp_path, more="safety: {registers: {goal_position: 1}}", joint=", safety: {}"))[:1]
-    assert "joints.jaw.safety.registers.goal_position = 1" in line and "not the file's to set" in line
-
-
 def test_what_is_stored_is_stored_for_good_and_fits():
     table = load_firmware_map("xl330-m288")
     assert not [*register_problems(Safety(stored={"drive_mode": 1, "homing_offset": -5}), table)]

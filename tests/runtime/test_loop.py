@@ -161,12 +161,6 @@ def test_an_interruption_still_comes_to_rest(chain: Chain) -> None:
     assert_at_rest(ran.servos)
 
 
-def test_an_exception_still_comes_to_rest_and_is_passed_on(chain: Chain) -> None:
-    ran = run(chain, nodder(raises_from=30))
-    assert ran.outcome == "the listener broke"
-    assert_at_rest(ran.servos)
-
-
 def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
     ran = run(chain, nodder(nan_from=20))
     assert ran.outcome == "done" and ran.log.refused_plans > 0

@@ -3,14 +3,11 @@
 import gzip
 import itertools
 import json
-import logging
 import os
 import queue
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 from contextlib import ExitStack, closing, contextmanager
 from urllib.error import HTTPError
@@ -237,16 +234,6 @@ def test_too_much_nonsense_and_a_message_that_is_too_long_end_the_connection(pag
         assert heard(another)["type"] == "hello"
 
 
-@pytest.mark.slow
-def test_while_one_floods_the_others_are_served(page):
-    with visit(page) as flooder, visit(page) as other:
-        assert heard(other)["type"] == "hello"
-        for number in range(400):
-            says(flooder, "ping", id=number)
-        says(other, "ping", id="here")
-        assert heard(other) == {"type": "pong", "id": "here"}
-
-
 @pytest.mark.parametrize("text", [b"\xff", b'{"type":"ping","id":"\xc3"}', [b"\xc3", b"("]])
 def test_a_text_that_is_not_utf_8_ends_its_connection_with_code_1007_and_without_a_word(capfd, text):
     with closing(PageProcess(Address(port=0))) as page:
@@ -422,41 +409,3 @@ def test_a_page_whose_process_dies_takes_no_run_with_it(caplog):
             page.say("status", status={})
         page._supervised.child.reader.join(WAIT_S)
         assert page.visitors == 0 and "page: its process died" in caplog.text
-
-
-def test_a_page_whose_process_hangs_is_named_once_and_once_when_it_is_back(caplog):
-    caplog.set_level(logging.INFO)
-    with closing(PageProcess(Address(port=0))) as page:
-        page.wait()
-        page.watch(now_s := 3600.0)  # the run itself stood still: that is no silence of the page
-        assert page.statistics() == {"hung": False, "hangs": 0}
-        os.kill(page.process_id, signal.SIGSTOP)
-        os.waitid(os.P_PID, page.process_id, os.WSTOPPED)
-        while not page.hung:
-            page.watch(now_s := now_s + 0.125)
-        for _ in range(100):
-            page.watch(now_s := now_s + 0.125)
-        assert page.statistics() == {"hung": True, "hangs": 1}
-        os.kill(page.process_id, signal.SIGCONT)
-        while page.hung:
-            page.watch(now_s := now_s + 1e-6)
-        page.watch(0.0)  # another run begins
-        assert page.statistics() == {"hung": False, "hangs": 1}
-    told = [(each.levelname, each.message) for each in caplog.records if each.name.endswith("processes")]
-    assert told == [
-        ("WARNING", "page (running): no sign of life for 2.6 s; the run continues"),
-        ("INFO", "page: answers again"),
-    ]
-
-
-def test_it_ends_with_who_began_it():
-    code = (
-        "import os; from sfms_robot.viewer.page_process import Address, PageProcess\n"
-        "page = PageProcess(Address(port=0)); page.wait(); print(page.url, flush=True); os._exit(0)"
-    )
-    began = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=WAIT_S * 2)
-    port = int(began.stdout.rstrip("/\n").rpartition(":")[2])
-    answers = True
-    while answers:  # its pipe is at an end: the port is given back
-        with socket.socket() as asking:
-            answers = asking.connect_ex(("127.0.0.1", port)) == 0
