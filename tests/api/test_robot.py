@@ -173,19 +173,6 @@ def test_what_cannot_be_right_is_refused_before_anything_is_opened(options, erro
         sr.Robot(**{"head": HEAD, **options})
 
 
-def test_knobs_are_checked_and_name_the_regions():
-    robot = sr.Robot(HEAD)
-    knob = robot.knobs["neck"]
-    knob.intensity, knob.style = 0.5, 2.0
-    assert (robot.knobs["neck"].intensity, robot.knobs["neck"].style) == (0.5, 2.0)
-    for value in (-0.1, 2.1, float("nan")):
-        with pytest.raises(sr.InputError, match="is not in 0..2"):
-            knob.intensity = value
-    with pytest.raises(sr.InputError, match="'mouth_of_truth' is not a region of this head"):
-        _ = robot.knobs["mouth_of_truth"]
-    assert robot.knobs["neck"].intensity == 0.5 and "neck" in list(robot.knobs)
-
-
 def test_hear_with_another_source_raises():
     robot = sr.Robot(HEAD, audio="katie")
     for push in (robot.hear, robot.say):
@@ -318,6 +305,3 @@ def test_what_is_said_elsewhere_is_not_played(sound_server):
 
     with pytest.raises(sr.InputError, match="play='person': what a source of your own says is not played"):
         sr.Robot("interbotix_wxxms", source=Nobody(), play="person")
-    robot = sr.Robot("interbotix_wxxms", listener=Still(0.0), audio="katie", play="person")
-    with pytest.raises(sr.ConfigError, match="^--play person: nothing is played of --agent-audio none"):
-        robot.start()

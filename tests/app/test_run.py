@@ -157,8 +157,6 @@ def test_hobby_servos_on_a_real_port_move_only_when_that_is_confirmed():
 def test_an_emulated_head_has_the_supply_of_the_real_one():
     seen = run(RunOptions(head="reachy_mini", duration_s=1.0, fast=True, dry_run=True))
     assert all(reading["fault"] is None for reading in seen["readings"].values())  # alert and all: the head allows it
-    done = run(RunOptions(head="reachy_mini", duration_s=1.0, fast=True))
-    assert (done["exit"], done["bus"]["faults"], done["limits"]["violations"]) == ("done", [], 0)
 
 
 @pytest.mark.slow

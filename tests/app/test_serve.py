@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,41 +11,31 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from ended import PROGRAM
+from ros2_graph import free_endpoint
 
 pytestmark = pytest.mark.realtime
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytest.importorskip("prometheus_client", reason="needs the extra [remote]")
 
-START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 240
 LONG = ["--duration", "1200"]  # a busy machine takes a minute to load a listener
 
 
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
-
-
 def started(*words, **more):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
     return subprocess.Popen(
-        [*START, *map(str, words)], env=environment, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        [*PROGRAM, *map(str, words)], env=environment, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, **more,
     )  # fmt: skip
-
-
-def ended(process):
-    out, err = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, err
-    return json.loads(out.splitlines()[-1])
 
 
 @pytest.fixture
 def zenoh_files(tmp_path):
     """Configurations of a server and of a robot, at a port of their own."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     queue = {"link": {"tx": {"queue": {"size": {"real_time": 16}}}}}
     quiet = {"scouting": {"multicast": {"enabled": False}}, "transport": queue}
     retry = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1}

@@ -90,6 +90,10 @@ CASES = [
     ("head show face28", 2, ["face28.yaml: head = 'op3_head' is another head (face28)"]),  # its overlay is of another
     ("bench startup --write {tmp}/folder.png", 2, ["--write", "{tmp}/folder.png"]),  # before any work, as the next two
     ("export sfms-small --out {tmp}/file", 2, ["--out", "{tmp}/file"]),
+    *(
+        (f"export sfms-small --out {{tmp}}/w --weight-bits {bits}", 2, [f"--weight-bits {bits}: must be 8, 16 or 32"])
+        for bits in (0, 4, 12, -8)
+    ),
     ("servo dump --port sim {tmp}/file", 2, ["{tmp}/file", "is there already"]),
     ("servo restore {tmp}/file --port sim", 2, ["{tmp}/file: expected keys with values"]),
     ("data compose --data {tmp} --out {tmp}/file", 2, ["--out"]),

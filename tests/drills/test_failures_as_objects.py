@@ -46,23 +46,18 @@ def twice(running):
 RUN = ["run", "--audio", "none", "--head", HEAD]
 
 
-@pytest.mark.parametrize(
-    ("words", "press", "named"),
-    [
-        pytest.param([*RUN, "--duration", "1"], nothing, "pan", id="run"),
-        pytest.param([*RUN, "--duration", "600"], once, "pan", id="once", marks=pytest.mark.slow),
-        pytest.param([*RUN, "--duration", "600"], twice, "pan", id="twice", marks=pytest.mark.slow),
-        pytest.param(["replay", "RECORDING"], nothing, "pan", id="replay", marks=pytest.mark.slow),
-        pytest.param(["head", "pose", HEAD, "nod"], nothing, "pan", id="pose", marks=pytest.mark.slow),
-        pytest.param(
-            ["servo", "move", PAN, "--by", "600", "--baud", "1000000"],
-            nothing,
-            "id 1",
-            id="move",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
+ENDED = [
+    (RUN + ["--duration", "1"], nothing, "pan"),
+    (RUN + ["--duration", "600"], once, "pan"),
+    (RUN + ["--duration", "600"], twice, "pan"),
+    (["replay", "RECORDING"], nothing, "pan"),
+    (["head", "pose", HEAD, "nod"], nothing, "pan"),
+    (["servo", "move", PAN, "--by", "600", "--baud", "1000000"], nothing, "id 1"),
+]
+SLOW = [pytest.param(*each, marks=pytest.mark.slow) for each in ENDED[1:]]
+
+
+@pytest.mark.parametrize(("words", "press", "named"), [ENDED[0], *SLOW])
 def test_torque_that_is_not_confirmed_off_is_exit_4_and_in_the_object(words, press, named, device, chain, request):
     words = [request.getfixturevalue("recording") if word == "RECORDING" else word for word in words]
     with Command(*words, "--port", device, "--json") as running:

@@ -391,8 +391,6 @@ def test_an_address_that_is_not_this_machines_is_refused_in_one_line():
 
 def test_https_needs_a_certificate_and_its_key(tmp_path):
     (tmp_path / "a.pem").write_text("nothing")
-    with pytest.raises(ConfigError, match="https needs both"):
-        Address.parsed("auto", tmp_path / "a.pem", None)
     with pytest.raises(ConfigError, match="^--view-key .*: no such file"):
         Address.parsed("auto", tmp_path / "a.pem", tmp_path / "b.pem")
     address = Address.parsed("0", tmp_path / "a.pem", tmp_path / "a.pem")
