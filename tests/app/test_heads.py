@@ -47,20 +47,6 @@ def test_register_that_cannot_be_written_is_refused_before_a_port_is_opened(safe
         build_bus(head_of(safety=safety), {"face": "/dev/null", "neck": "/dev/null"}, RealClock())
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"safety": {"on_fault": "explode"}}, "safety.on_fault = 'explode'"),
-        ({"safety": {"pinch": {"current_mA": -1, "for_s": 1}}}, "safety.pinch.current_mA = -1"),
-        ({"faults": {"thresholds": {"shock": {"max": 1}}}}, r"thresholds.*'shock': .*\(input voltage\|overheating\)"),
-        ({"faults": {"masks": ["overload"]}}, "'masks' is not a known key"),
-    ],
-)
-def test_mistake_in_the_file_is_named(more, message):
-    with pytest.raises(ConfigError, match=message):
-        head_of(**more)
-
-
 def test_current_limit_that_cannot_be_kept_is_refused():
     head = head_of()
     jaw = head.joints["jaw"].model_copy(update={"model": "xl430-w250", "safety": Safety(current_limit_mA=300)})

@@ -172,6 +172,10 @@ WRONG = {
                        {"keep": {"beak": -1, "lid_right": 1}, "at_least": 0, "moving": ["lid_right"]}]},
         "couplings.0.moving: 'beak' is also in couplings.1, one would undo the other",
     ),
+    "threshold of a fault that has no reading": (
+        {"faults": {"thresholds": {"shock": {"max": 1}}}},
+        "faults.thresholds.shock",
+    ),
     "two regions": (
         {"regions": {"a": {"joints": ["beak"]}, "b": {"joints": ["beak"]}}},
         "regions.b.joints: 'beak' is already in region a",
