@@ -114,10 +114,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     stop = halted + round(STOPS_S * RATE_HZ)
     assert np.array_equal(goals[stop], goals[late])  # stands, for as long as it is halted
     assert seen == {joint: joint in NECK for joint in JOINTS}
-    assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-2:] == [
-        "listening",
-        "stopping",
-    ]
+    assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-2:] == ["listening", "stopping"]
     after = goals[late + round((EASE_S + 0.5) * RATE_HZ) :]
     assert np.ptp(after, axis=0)[JOINTS.index(NECK[1])] > 0.05  # it nods again
 
@@ -210,10 +207,7 @@ def test_all_causes_are_named_and_a_halt_that_ends_before_the_head_stands_ends_n
         }  # fmt: skip
 
     ran = run(chain, does, seconds=5.0)
-    assert ran.ticks[151].why == ("key",) and ran.ticks[152].why == ran.ticks[155].why == (
-        "key",
-        "page",
-    )
+    assert ran.ticks[151].why == ("key",) and ran.ticks[152].why == ran.ticks[155].why == ("key", "page")
     assert ran.outcome == "done" and ran.states[2:] == ["halted", "starting", "listening", "stopping"]
 
 

@@ -9,7 +9,7 @@ import signal
 import socket
 import struct
 import threading
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -260,25 +260,7 @@ HALF_OPEN = (
 )
 
 
-def all_end(url, count=150):
-    """Open so many requests that are not whole; others are answered meanwhile, and the server ends them all."""
-    place = ("127.0.0.1", int(url.split(":")[2].partition("/")[0]))
-    with ExitStack() as stack:
-        visitor = stack.enter_context(connect(url.replace("http", "ws", 1) + "ws", open_timeout=WAIT_S))
-        half_open = [stack.enter_context(socket.create_connection(place, WAIT_S)) for _ in range(count)]
-        for index, client in enumerate(half_open):
-            client.sendall(HALF_OPEN[index % len(HALF_OPEN)])
-        assert b"<!doctype html>" in got(url)[0]
-        for client in half_open:
-            try:
-                while client.recv(4096):
-                    pass
-            except ConnectionResetError:
-                pass
-        assert visitor.ping().wait(WAIT_S)  # whose request was whole
-
-
-def test_150_half_open_requests_are_ended_in_time():
+def test_half_open_requests_are_ended_in_time_and_others_are_answered_meanwhile():
     class Prompt(PromptConnection):
         limit_s = CONNECTION_S / 20
 
@@ -286,8 +268,19 @@ def test_150_half_open_requests_are_ended_in_time():
     listening = socket.create_server(("127.0.0.1", 0), backlog=200)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()
+    place = listening.getsockname()
     try:
-        all_end(f"http://127.0.0.1:{listening.getsockname()[1]}/")
+        with ExitStack() as stack:
+            visitor = stack.enter_context(connect(f"ws://127.0.0.1:{place[1]}/ws", open_timeout=WAIT_S))
+            half_open = [stack.enter_context(socket.create_connection(place, WAIT_S)) for _ in range(150)]
+            for index, client in enumerate(half_open):
+                client.sendall(HALF_OPEN[index % len(HALF_OPEN)])
+            assert b"<!doctype html>" in got(f"http://127.0.0.1:{place[1]}/")[0]
+            for client in half_open:
+                with suppress(ConnectionResetError):
+                    while client.recv(4096):
+                        pass
+            assert visitor.ping().wait(WAIT_S)  # whose request was whole
     finally:
         server.should_exit = True
         thread.join(WAIT_S)
