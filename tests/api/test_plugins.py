@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
 
 import sfms_robot as sr
 from sfms_robot.data import data_dir
-from sfms_robot.servo.families import families
+from sfms_robot.sources.registry import open_source
 
 PACKAGE = """
 import numpy as np
@@ -107,38 +108,10 @@ def test_a_run_listens_with_it_in_its_own_process(installed):
     assert '"listener_state": {"state": "listening"' in done.stdout.splitlines()[-1]
 
 
-def test_a_bus_family_of_another_package_is_in_the_table(installed):
-    code = (
-        "from sfms_robot.servo.families import family_named\n"
-        "family = family_named('somebodys'); print(family.title, family.build())"
-    )
-    done = program(installed, code=code)
-    assert done.stdout.strip() == "Somebody's servos <class 'somebodys_servos.Bus'>", done.stderr
-
-
-class Hearer:
-    """A `Listener` that keeps what it hears and does nothing."""
-
-    hop, horizon = 1, 1
-
-    def __init__(self):
-        self.heard = []
-
-    def start(self, seed):
-        return None
-
-    def step(self, speaker, memory):
-        self.heard.append(speaker)
-        return None, memory
-
-
-def test_a_robot_listens_to_a_source_of_another_package(installed, monkeypatch):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(installed))
-    listener = Hearer()
-    with sr.Robot("reachy_mini", audio="hum:0.25", duration_s=0.4, listener=listener) as robot:
-        robot.wait()
-    assert robot.report()["frames"] == 10
-    assert listener.heard and all((frame.audio == 0.25).all() for frame in listener.heard)
+def test_a_source_of_another_package_is_opened_by_its_name(installed):
+    with closing(open_source("hum:0.25", duration_s=0.4)) as source:
+        frames = source.read(0.4)
+    assert len(frames) == 10 and all((frame.audio == 0.25).all() for frame in frames)
 
 
 @pytest.fixture
@@ -172,13 +145,3 @@ def test_a_head_on_a_bus_of_another_package_runs_on_emulated_servos(installed, t
     assert report["exit"] == "done" and report["limits"]["violations"] == 0
     assert report["bus"]["whose"] == "somebody's"
     assert report["joints"]["head_tilt"]["travel_rad"] > 0.1
-
-
-def test_a_robot_moves_a_head_on_a_bus_of_another_package(installed, their_head, monkeypatch):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(installed))
-    families.cache_clear()
-    with sr.open_bus(str(their_head), port="sim") as bus:
-        bus.enable()
-        assert bus.move(bus.rest_rad + 0.1)
-    families.cache_clear()
-    assert bus.report()["exit"] == "interrupted"

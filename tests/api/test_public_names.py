@@ -10,10 +10,6 @@ import pytest
 import sfms_robot
 
 
-def done_in_a_fresh_interpreter(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-
-
 @pytest.mark.parametrize("name", sfms_robot.__all__)
 def test_every_public_name_is_there(name):
     assert getattr(sfms_robot, name) is not None
@@ -32,28 +28,26 @@ def test_an_unknown_name_is_an_attribute_error():
         _ = sfms_robot.run_head
 
 
-def test_importing_the_package_imports_nothing_else():
-    done = done_in_a_fresh_interpreter(
-        "import sys; before = set(sys.modules); import sfms_robot\n"
-        "new = {name.split('.')[0] for name in set(sys.modules) - before} - {'sfms_robot', *sys.stdlib_module_names}\n"
-        "sys.exit(f'loaded {new}' if new else 0)"
-    )
-    assert done.returncode == 0, done.stderr
+LIGHT = {
+    "the package": """
+import sys; before = set(sys.modules); import sfms_robot
+loaded = {name.split(".")[0] for name in set(sys.modules) - before} - {"sfms_robot", *sys.stdlib_module_names}
+""",
+    "retargeting": """
+import sys, numpy as np, sfms_robot as sr
+angles = sr.Retargeter(sr.load_head("face28")).angles(np.zeros(58, np.float32))
+assert angles.shape == (28,) and angles.dtype == np.float64
+loaded = {"torch", "serial", "dynamixel_sdk", "ruckig"} & set(sys.modules)
+""",
+    "servos and robot": """
+import sys, sfms_robot as sr; sr.Robot, sr.open_bus
+loaded = {"torch"} & set(sys.modules)
+""",
+}
 
 
-def test_retargeting_loads_neither_torch_nor_a_serial_port():
-    done = done_in_a_fresh_interpreter(
-        "import sys, numpy as np, sfms_robot as sr\n"
-        "angles = sr.Retargeter(sr.load_head('face28')).angles(np.zeros(58, np.float32))\n"
-        "assert angles.shape == (28,) and angles.dtype == np.float64\n"
-        "heavy = {'torch', 'serial', 'dynamixel_sdk', 'ruckig'} & set(sys.modules)\n"
-        "sys.exit(f'loaded {heavy}' if heavy else 0)"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_servos_and_robot_load_no_torch():
-    done = done_in_a_fresh_interpreter(
-        "import sys, sfms_robot as sr; sr.Robot, sr.open_bus; sys.exit('torch' in sys.modules)"
-    )
+@pytest.mark.parametrize("code", LIGHT.values(), ids=LIGHT)
+def test_nothing_heavy_is_loaded_before_it_is_used(code):
+    code += "sys.exit(f'loaded {loaded}' if loaded else 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

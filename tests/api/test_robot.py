@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 import time
-from itertools import groupby
 
 import numpy as np
 import pytest
@@ -173,19 +172,6 @@ def test_what_cannot_be_right_is_refused_before_anything_is_opened(options, erro
         sr.Robot(**{"head": HEAD, **options})
 
 
-def test_knobs_are_checked_and_name_the_regions():
-    robot = sr.Robot(HEAD)
-    knob = robot.knobs["neck"]
-    knob.intensity, knob.style = 0.5, 2.0
-    assert (robot.knobs["neck"].intensity, robot.knobs["neck"].style) == (0.5, 2.0)
-    for value in (-0.1, 2.1, float("nan")):
-        with pytest.raises(sr.InputError, match="is not in 0..2"):
-            knob.intensity = value
-    with pytest.raises(sr.InputError, match="'mouth_of_truth' is not a region of this head"):
-        _ = robot.knobs["mouth_of_truth"]
-    assert robot.knobs["neck"].intensity == 0.5 and "neck" in list(robot.knobs)
-
-
 def test_hear_with_another_source_raises():
     robot = sr.Robot(HEAD, audio="katie")
     for push in (robot.hear, robot.say):
@@ -257,15 +243,16 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
         robot.halt()
         robot.wait(0.3)
         assert robot.state == "halted"
-        robot._run.halt.switches["button"] = lambda: True
-        with pytest.raises(sr.HaltedError, match="button: still on"):
-            robot.resume()
-        robot._run.halt.switches.clear()
         robot.resume()
         robot.wait(0.3)
         assert robot.state == "starting"
-    changes = groupby(change["state"] for change in robot.report()["states"]["changes"])  # a tick may see the button
-    assert [state for state, _ in changes] == ["starting", "halted", "starting", "stopping", "stopped"]
+    assert [change["state"] for change in robot.report()["states"]["changes"]] == [
+        "starting",
+        "halted",
+        "starting",
+        "stopping",
+        "stopped",
+    ]
 
 
 @pytest.mark.parametrize("opens", [sr.Robot, sr.open_bus])
@@ -318,6 +305,3 @@ def test_what_is_said_elsewhere_is_not_played(sound_server):
 
     with pytest.raises(sr.InputError, match="play='person': what a source of your own says is not played"):
         sr.Robot("interbotix_wxxms", source=Nobody(), play="person")
-    robot = sr.Robot("interbotix_wxxms", listener=Still(0.0), audio="katie", play="person")
-    with pytest.raises(sr.ConfigError, match="^--play person: nothing is played of --agent-audio none"):
-        robot.start()

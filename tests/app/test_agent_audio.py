@@ -122,22 +122,3 @@ def test_a_robot_that_stops_speaking_while_somebody_talks_listens_within_a_secon
         states.append(STATES[paper_state(memory.how.state)])
     assert "listening" not in states[75:99] and set(states[75:99]) <= {"speaking", "interrupted", "giving_feedback"}
     assert set(states[125:]) <= {"listening", "giving_feedback"}
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ("nowhere.wav", ["nowhere.wav", "no such file", "none", "katie"]),
-        ("text.wav", ["text.wav"]),
-        ("empty.wav", ["empty.wav"]),
-        (".", ["is a folder, not a sound file"]),
-        ("loopback", ["loopback", "no such file"]),
-    ],
-)
-def test_a_voice_that_cannot_be_used_is_one_clear_line(given: str, said, seeded, tmp_path, command_line, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "text.wav").write_text("hello")
-    soundfile.write(tmp_path / "empty.wav", [], 16_000)
-    ended = command_line("run", "--fast", "--duration", 1, "--listener", seeded, "--agent-audio", given)
-    assert ended.code == 2
-    assert all(word in ended.complaint for word in said)

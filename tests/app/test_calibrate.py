@@ -367,14 +367,6 @@ def test_the_command_that_a_refusal_names_records_the_value_and_the_head_starts(
     assert (own.read_bytes() == before) == shipped == overlay_file("interbotix_wxxms").exists()
 
 
-def test_a_head_on_emulated_servos_is_refused_and_mended_by_the_same_commands(turret, command_line):
-    (turret / "emulate.yaml").write_text("joints: {tilt: {drive_mode: 0}}\n")
-    start = ("run", "--head", turret, "--port", "sim", "--duration", 0.2, "--fast", "--yes", "--json")
-    assert command_line(*start).code == 4
-    assert command_line("doctor", "--head", turret, "--port", "sim", "--fix", "--yes").code == 0
-    assert command_line(*start).code == 0
-
-
 def test_less_protection_is_one_warning_and_a_line_in_the_report(turret, command_line, caplog):
     (turret / "emulate.yaml").write_text("joints: {tilt: {shutdown: 0}, pan: {shutdown: 0}}\n")
     ended = command_line("run", "--head", turret, "--duration", 0.2, "--fast", "--json")

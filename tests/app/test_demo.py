@@ -73,14 +73,6 @@ def elsewhere(folder, *words):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_the_demo_runs_on_a_computer_without_pseudo_terminals(tmp_path):
-    told = elsewhere(tmp_path, "demo", "--view", "0", "--duration", "2")
-    assert told["exit"] == "done" and told["report"]["bus"]["errors"] == 0 and told["report"]["bus"]["silent"] == []
-    assert (tmp_path / "runs" / "demo" / "run.png").is_file()
-
-
 def test_a_head_receives_the_same_bytes_over_tcp_as_over_a_pseudo_terminal(tmp_path, command_line):
     words = ("run", "--fast", "--duration", "1", "--head", "reachy_mini", "--audio", "katie")
     assert elsewhere(tmp_path, *words)["wire"] == command_line(*words, "--json").told["wire"]

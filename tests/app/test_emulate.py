@@ -10,12 +10,8 @@ from sfms_robot.errors import ConfigError
 
 def test_servos_are_plugged_in_the_middle_of_their_range_at_a_rate_they_have():
     servos = parse_servos("xl330-m288:1-3,7,ax-12a:20,ssc-32:0-1")
-    assert [(s.model, s.id) for s in servos] == [
-        *(("xl330-m288", i) for i in (1, 2, 3, 7)),
-        ("ax-12a", 20),
-        ("ssc-32", 0),
-        ("ssc-32", 1),
-    ]
+    assert [s.id for s in servos] == [1, 2, 3, 7, 20, 0, 1]
+    assert [s.model for s in servos] == ["xl330-m288"] * 4 + ["ax-12a"] + ["ssc-32"] * 2
     assert [s.start_ticks for s in servos[3:5]] == [2048, 512]
     assert [s.baud for s in servos[3:6]] == [1_000_000, 1_000_000, 9600]
 

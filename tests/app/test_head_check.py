@@ -123,13 +123,6 @@ def test_a_shipped_head_has_its_picture_and_provenance(head):
     assert all(joint in text for joint in load_head(head).joints)
 
 
-def test_a_servo_without_a_register_map_is_told(tmp_path):
-    text = (data_dir("configs") / "heads" / "op3_head" / "head.yaml").read_text()
-    (tmp_path / "head.yaml").write_text(text.replace("xm430-w350", "xm999"))
-    problems = check(str(tmp_path))["problems"]
-    assert problems and all("model = 'xm999' has no firmware map" in problem for problem in problems)
-
-
 def test_an_overlay_of_another_head_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     overlay = tmp_path / "sfms-robot" / "heads" / "op3_head.yaml"

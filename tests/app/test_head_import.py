@@ -15,6 +15,7 @@ LEROBOT = {
     "base_pitch": {"id": 2, "drive_mode": 0, "homing_offset": 1390, "range_min": 960, "range_max": 3040},
     "jaw": {"id": 3, "drive_mode": 1, "homing_offset": 212, "range_min": 1980, "range_max": 2410},
 }
+STRAIGHT = {"orientation": "direct", "offset": 0.0}
 PYPOT = {
     "controllers": {
         "upper": {"sync_read": True, "attached_motors": ["head", "r_elbow_y", "lamp"], "port": "/dev/ttyACM0"},
@@ -26,14 +27,7 @@ PYPOT = {
         "head_y": {"id": 37, "type": "AX-12", "orientation": "indirect", "offset": 20.0, "angle_limit": [-45, 6]},
         "r_elbow_y": {"id": 54, "type": "MX-28", "orientation": "direct", "offset": 0.0, "angle_limit": [-1, 148]},
         "lamp": {"id": 55, "type": "SR-99", "orientation": "direct", "offset": 0.0, "angle_limit": [-1, 1]},
-        "knee": {
-            "id": 7,
-            "type": "MX-64",
-            "orientation": "direct",
-            "offset": 0.0,
-            "angle_limit": [-1, 1],
-            "broken": True,
-        },
+        "knee": {"id": 7, "type": "MX-64", "broken": True, "angle_limit": [-1, 1]} | STRAIGHT,
     },
 }
 MOTOR = {"return_delay_time": 0, "shutdown_error": 52, "pid": [400, 0, 0]}

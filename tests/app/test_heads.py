@@ -1,6 +1,5 @@
 """A head's file -> its buses: what the file may say about safety, and what is refused before a port is opened."""
 
-import numpy as np
 import pytest
 
 from sfms_robot.app.open_head import build_bus
@@ -46,43 +45,6 @@ def test_joint_says_what_is_different_from_its_head():
 def test_register_that_cannot_be_written_is_refused_before_a_port_is_opened(safety, message):
     with pytest.raises(ConfigError, match=message):
         build_bus(head_of(safety=safety), {"face": "/dev/null", "neck": "/dev/null"}, RealClock())
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"safety": {"on_fault": "explode"}}, "safety.on_fault = 'explode'"),
-        ({"safety": {"pinch": {"current_mA": -1, "for_s": 1}}}, "safety.pinch.current_mA = -1"),
-        ({"faults": {"thresholds": {"shock": {"max": 1}}}}, r"thresholds.*'shock': .*\(input voltage\|overheating\)"),
-        ({"faults": {"masks": ["overload"]}}, "'masks' is not a known key"),
-    ],
-)
-def test_mistake_in_the_file_is_named(more, message):
-    with pytest.raises(ConfigError, match=message):
-        head_of(**more)
-
-
-@pytest.mark.parametrize("virtual", [True, False])
-def test_two_buses_drive_one_head(virtual):
-    head = head_of(safety={"current_limit_mA": 400})
-    servos = emulated(head)
-    with launch(servos["face"], virtual) as face, launch(servos["neck"], virtual) as neck:
-        clock = VirtualClock() if virtual else RealClock()
-        bus = build_bus(head, {"face": face, "neck": neck}, clock)
-        bus.connect()
-        held = bus.enable(["jaw", "yaw"])
-        for k in range(1, 41):
-            clock.wait_until(0.01 * k)
-            bus.write(held * (1 - k / 40), clock.now_s())
-            bus.poll(clock.now_s())
-        clock.wait_until(1.0)
-        bus.stop("hold")
-        counts = bus.statistics()["buses"]
-        positions = [reading.position_rad for reading in bus.poll(clock.now_s()).values()]
-        bus.stop("release")
-        bus.close()
-    assert positions == pytest.approx(np.zeros(2), abs=0.02)
-    assert counts["face"]["writes"] == 40 if virtual else counts["neck"]["writes"] < counts["face"]["writes"] <= 40
 
 
 def test_current_limit_that_cannot_be_kept_is_refused():

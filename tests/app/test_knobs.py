@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from loop_rig import Watcher, driven
 
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.knobs import turned
@@ -12,10 +13,7 @@ from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.lab.bench.lead import Waves
-from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.log import RunLog
-from sfms_robot.runtime.loop import Parts, drive
 
 HEAD = load_head("face28")
 RETARGETER = build_motion(HEAD, 100.0).retargeter
@@ -66,32 +64,18 @@ def test_all_regions_are_turned_together_and_none_leaves_its_range():
     assert angles == pytest.approx(build_motion(HEAD, 100.0).rest_rad, abs=0.02)
 
 
-class Goals(Observer):
-    """Keeps what was sent."""
-
-    def __init__(self) -> None:
-        self.sent_rad: list[np.ndarray] = []
-
-    def tick(self, seen) -> None:
-        self.sent_rad.append(seen.goals_rad)
-
-
 def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
-    head, clock, goals = load_head("op3_head"), VirtualClock(), Goals()
-    motion = build_motion(head, 100.0)
+    head, clock, watcher = load_head("op3_head"), VirtualClock(), Watcher()
     off, on = turned(head, ["neck=0"]).now, turned(head).now
-    log = RunLog(joints=motion.retargeter.joints, period_s=0.01, audit=motion.audit)
     with launch(emulated(head)["main"], virtual=True) as chain:
         bus = build_bus(head, {"main": chain}, clock)
         bus.connect()
-        parts = Parts(
-            source=NobodyThere(), feed=Waves(), timeline=motion.timeline, retargeter=motion.retargeter,
-            limiter=motion.limiter, bus=bus, observers=[goals], leads_s=motion.leads_s, rest_rad=motion.rest_rad,
-            knobs=lambda: off if len(goals.sent_rad) >= 200 else on,
+        _, log = driven(
+            head, bus, clock, rate_hz=100.0, duration_s=4.0, observer=watcher, source=NobodyThere(), feed=Waves(),
+            knobs=lambda: off if len(watcher.ticks) >= 200 else on,
         )  # fmt: skip
-        drive(parts, clock, log, rate_hz=100.0, duration_s=4.0, interrupted=lambda: False)
         bus.close()
-    sent = np.array(goals.sent_rad)
+    sent = watcher.goals()
     assert np.ptp(sent[100:200], axis=0).min() > 0.01
-    assert np.abs(sent[320:] - motion.rest_rad).max() < 1e-6
+    assert np.abs(sent[320:] - build_motion(head, 100.0).rest_rad).max() < 1e-6
     assert log.audited.violations == 0

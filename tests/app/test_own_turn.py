@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from loop_rig import Posed
 
 from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
-from sfms_robot.frames import FRAME_S, MOTION_DIM, Plan
+from sfms_robot.frames import FRAME_S
 from sfms_robot.runtime.clock import InlineFeed
 from sfms_robot.runtime.states import TURN_GAP_S
 from sfms_robot.signals.audio import AudioFile
@@ -15,22 +16,6 @@ from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import shipped_speaker
 
 TALKS_S = 6.0
-
-
-class Still:
-    """A listener whose face rests."""
-
-    hop, horizon = 4, 8
-
-    def start(self, seed):
-        return 0
-
-    def step(self, speaker, memory):
-        memory += 1
-        if memory % self.hop:
-            return None, memory
-        times_s = speaker.time_s + FRAME_S * np.arange(1.0, self.horizon + 1)
-        return Plan(speaker.time_s, times_s, np.zeros((self.horizon, MOTION_DIM), np.float32)), memory
 
 
 class Told:
@@ -56,7 +41,7 @@ def spoken(*sayings, person=True):
     voice = RecordedVoice(AudioFile(shipped_speaker("katie").audio)) if person else None
     source = PairedSource(voice, None, speech, TALKS_S)
     options = RunOptions(head="interbotix_wxxms", duration_s=TALKS_S, fast=True)
-    report = run(options, source=source, feed=InlineFeed(Still(), 0, 0.01), signals=False)
+    report = run(options, source=source, feed=InlineFeed(Posed(), 0, 0.01), signals=False)
     assert report["exit"] == "done"
     return told
 

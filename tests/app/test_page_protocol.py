@@ -27,13 +27,8 @@ from sfms_robot.viewer.page_server import COMMAND_S, MOST_MALFORMED, OUTBOX, PER
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
 PAGE = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
 TOLD, ASKED = PAGE.partition("### From the robot to the page\n")[2].split("### What a page asks for\n")
-OF_VISITORS = {
-    "controls",
-    "needs_token",
-    "over",
-    "record",
-    "torque_unconfirmed",
-}  # of a hello: they differ between visitors, or change
+# Of a hello: they differ between visitors, or change.
+OF_VISITORS = {"controls", "needs_token", "over", "record", "torque_unconfirmed"}
 
 
 def rows(part: str) -> dict[str, set[str]]:

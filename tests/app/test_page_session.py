@@ -16,7 +16,7 @@ from sfms_robot.app.replay.run_file import read_recording
 from sfms_robot.app.session import RunControls
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.errors import RobotError
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.runtime.safety import Interrupt
 
@@ -118,22 +118,6 @@ def test_a_run_leaves_a_mesh_out_that_may_not_be_served_and_names_it_once(tmp_pa
     assert line.startswith(f"picture of the head: {head}/robot.urdf: link ")
     assert line.endswith("got '/etc/passwd': not drawn")
     assert "/etc/passwd" not in capfd.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["--fast", "--view"], "--view auto: a page shows what takes real time"),
-        (["--dry-run", "--view", "9000"], "--view 9000: nothing moves in a --dry-run"),
-        (["--view", "nowhere"], "--view nowhere: not a TCP port"),
-        (["--view-cert", "a.pem"], "no page is served"),
-        (["--view", "--view-cert", "a.pem"], "https needs both"),
-        (["--fast", "--audio", "browser"], "a page shows what takes real time"),
-    ],
-)
-def test_a_page_that_cannot_be_is_refused_in_one_line(command_line, words, problem):
-    ended = command_line("run", "--duration", 1, *words)
-    assert ended.code == ConfigError.exit_code and problem in ended.err
 
 
 class Run:

@@ -31,13 +31,6 @@ def test_a_plot_is_1600_by_1200(tmp_path, seconds, voice):
     assert size_of(tmp_path / "a.png") == (1200, 1600)
 
 
-def test_the_sheet_of_a_run_is_drawn(tmp_path):
-    pytest.importorskip("vtkmodules")
-    run = read_recording(record(tmp_path, 0.3))
-    assert len(sheet(run, tmp_path / "a.png")) == 12
-    assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
 def run_with_events():
     times_s = np.arange(500) / 25
     frames = np.zeros((500, 58), dtype=np.float32)

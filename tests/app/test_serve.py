@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,41 +11,31 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from ended import PROGRAM
+from ros2_graph import free_endpoint
 
 pytestmark = pytest.mark.realtime
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytest.importorskip("prometheus_client", reason="needs the extra [remote]")
 
-START = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 240
 LONG = ["--duration", "1200"]  # a busy machine takes a minute to load a listener
 
 
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
-
-
 def started(*words, **more):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
     return subprocess.Popen(
-        [*START, *map(str, words)], env=environment, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        [*PROGRAM, *map(str, words)], env=environment, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, **more,
     )  # fmt: skip
-
-
-def ended(process):
-    out, err = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, err
-    return json.loads(out.splitlines()[-1])
 
 
 @pytest.fixture
 def zenoh_files(tmp_path):
     """Configurations of a server and of a robot, at a port of their own."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     queue = {"link": {"tx": {"queue": {"size": {"real_time": 16}}}}}
     quiet = {"scouting": {"multicast": {"enabled": False}}, "transport": queue}
     retry = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1}
@@ -130,30 +119,6 @@ def test_two_heads_and_one_server_each_in_a_process_of_its_own(zenoh_files):
 
 
 @pytest.mark.slow
-def test_a_server_that_is_killed_leaves_a_head_that_lives_and_one_that_comes_back_is_joined(zenoh_files):
-    server, robot = zenoh_files
-    options = ["--head", "interbotix_wxxms", "--listener", "zenoh/sfms-small", "--zenoh", robot, *LONG, "--fleet", "a"]
-    with serving(server) as (first, _):
-        run = started("run", *options, "--json")
-        try:
-            heads(robot, lambda tiles: tiles.get("a", {}).get("state") in ("listening", "idle", "speaking"))
-            first.kill()
-            first.wait()
-            with serving(server):
-                heads(robot, lambda tiles: tiles.get("a", {}).get("state") in ("listening", "idle"))
-                run.send_signal(signal.SIGTERM)
-                out, err = run.communicate(timeout=LIMIT_S)
-        finally:
-            if run.poll() is None:
-                run.kill()
-                run.communicate()
-    report = json.loads(out.splitlines()[-1])
-    assert report["listener_state"]["restarts"] == 1
-    assert "degraded" in [each["state"] for each in report["states"]["changes"]]
-    assert "was started again: joining again" in err
-
-
-@pytest.mark.slow
 def test_a_fleet_without_a_router_is_told_in_one_line(zenoh_files):
     _, robot = zenoh_files
     with started("fleet", "--zenoh", robot) as process:
@@ -161,19 +126,3 @@ def test_a_fleet_without_a_router_is_told_in_one_line(zenoh_files):
     assert process.returncode == 3
     (line,) = err.strip().splitlines()
     assert "no answer at" in line and "sfms-robot serve" in line
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["run", "--listener", "zenoh/a b"], "expected a name of letters"),
-        (["run", "--listener", "zenoh/x", "--fast"], "another machine takes real time"),
-        (["run", "--fleet", "listen", "--duration", "1"], "that name is taken"),
-        (["run", "--listener", "zenoh/x", "--zenoh", "nowhere.json5"], "nowhere.json5: no such file"),
-        (["serve", "--listener", "psychic"], "listener 'psychic'"),
-        (["serve", "--metrics", "high"], "--metrics high: not a TCP port"),
-    ],
-)
-def test_bad_input_is_one_line(command_line, words, said):
-    ended = command_line(*words)
-    assert ended.code == 2 and said in ended.complaint

@@ -1,7 +1,7 @@
 """`servo move`: slowly there, and the servo left as it was found; `servo release`: torque off, whatever its state."""
 
 import pytest
-from test_single_servo import put, wire_on
+from test_single_servo import new, put, wire_on
 
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.servo.move import BEHIND_DEG, SILENT, SPEED_DEG_S, move, release, release_chain
@@ -39,14 +39,10 @@ class Watched:
         return max(speeds, default=0.0) * 360.0 / table.ticks_per_revolution
 
 
-def at(model, **more):
-    return EmulatedServo(1, model, start_ticks=load_firmware_map(model).center_ticks, **more)
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("by", [90, -90, 3])
 def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
-    with wire_on(at(model), family=MODELS[model]) as (wire, chain):
+    with wire_on(new(1, model), family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)
         table = seen.registers()
         speed, torque = table.role("moving_speed"), seen.named("torque_enable")
@@ -59,7 +55,7 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
 
 
 def test_degrees_are_those_of_the_shaft_and_a_servo_that_held_goes_on_holding():
-    with wire_on(at("xl330-m288")) as (wire, _):
+    with wire_on(new(1, "xl330-m288")) as (wire, _):
         put(wire, 1, "torque_enable", 1)
         assert move(wire.find(1), None, "-9deg")["to"] == 2048 - 102
         assert wire.find(1).read(wire.find(1).named("torque_enable")) == 1
@@ -77,7 +73,7 @@ def test_degrees_are_those_of_the_shaft_and_a_servo_that_held_goes_on_holding():
     ],
 )
 def test_what_is_no_goal_is_refused_with_nothing_moved(to, by, stored, problem):
-    with wire_on(at("xl330-m288", registers=stored)) as (wire, chain):
+    with wire_on(new(1, "xl330-m288", **stored)) as (wire, chain):
         with pytest.raises((ConfigError, ServoError), match=problem):
             move(wire.find(1), to, by)
         assert not chain.state(1)["torque"]
@@ -139,14 +135,12 @@ def test_one_that_does_not_come_in_has_no_torque_before_its_usual_profile_is_bac
 
 
 def test_something_in_the_way_ends_it_without_torque():
-    with wire_on(at("xl330-m288")) as (wire, chain):
+    with wire_on(new(1, "xl330-m288")) as (wire, chain):
 
         class Blocked(Watched):
-            """A hand that keeps the shaft where it is."""
-
             def wait_until(self, time_s):
                 super().wait_until(time_s)
-                self.chain.turn(1, 2048)
+                self.chain.turn(1, 2048)  # a hand that keeps the shaft where it is
 
         wire.clock = Blocked(wire, chain)
         with pytest.raises(ServoError, match="something is in the way"):
@@ -192,7 +186,7 @@ def cable_out(wire, chain):
 
 @pytest.mark.parametrize(("more", "ends"), [(again, KeyboardInterrupt), (cable_out, TorqueError)])
 def test_after_an_interrupt_torque_is_off_or_named(more, ends):
-    with wire_on(at("ax-12a"), family="dynamixel1") as (wire, chain):
+    with wire_on(new(1, "ax-12a"), family="dynamixel1") as (wire, chain):
         seen = wire.find(1)
         wire.clock = Interrupted(wire, chain, more)
         with pytest.raises(ends) as ended:
@@ -276,7 +270,7 @@ def test_a_servo_in_an_error_is_released_and_a_silent_one_is_named(family, fault
 @pytest.mark.parametrize("named", ["xl330-m288", "xl-320"])
 @pytest.mark.parametrize("model", ["xl330-m288", "xl-320"])
 def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, named):
-    with wire_on(at(model), EmulatedServo(2, model), baud=1_000_000) as (wire, chain):
+    with wire_on(new(1, model), EmulatedServo(2, model), baud=1_000_000) as (wire, chain):
         for servo in (1, 2):
             put(wire, servo, "torque_enable", 1)
         if model == "xl330-m288":  # a host that died: its watchdog trips and refuses goals

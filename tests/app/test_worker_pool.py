@@ -16,7 +16,6 @@ from sfms_robot.listeners.registry import at_hop, load_listener
 from sfms_robot.listeners.remote_messages import (
     Join,
     Notice,
-    Refusal,
     SentFrame,
     Welcome,
     frame_message,
@@ -84,13 +83,6 @@ def test_a_process_that_dies_is_replaced_and_its_robots_are_told_to_join_again()
         pool.receive(stream, b"anything")
         assert came.get(timeout=LIMIT_S) == (stream, words_message(Notice("unknown")))
         assert joined(pool, "a") != stream
-
-
-def test_what_is_no_question_for_a_stream_is_refused():
-    with closing(WorkerPool(SERVED, lambda *_: None, processes=1)) as pool:
-        answers = queue.SimpleQueue()
-        pool.join(b"{", answers.put)
-        assert isinstance(parse_words(answers.get(timeout=LIMIT_S)), Refusal)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 from functools import partial
@@ -17,6 +18,13 @@ from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 
 FULL = "/dev/full"
 HEAVY = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
+STARTS = """
+import sys; from sfms_robot.cli.main import main
+try: main(["run", *{words!r}])
+except SystemExit as ended: code = ended.code
+loaded = {heavy!r} & set(sys.modules)
+sys.exit(f"loaded {{loaded}}" if loaded else code)
+"""
 RUN = ("run", "--fast", "--head", "interbotix_wxxms", "--duration", "0.1")
 
 
@@ -172,17 +180,13 @@ def test_a_run_that_cannot_start_prints_an_object(tmp_path, files, more, code, e
         (["--listener", "nope"], 2),
         (["--audio", "nope.wav"], 2),
         (["--face", "nope.csv"], 2),
+        (["--status", "TAKEN"], 3),
     ],
 )
-def test_a_typing_error_is_found_before_anything_is_loaded(words, code):
-    program = (
-        "import sys; from sfms_robot.cli.main import main\n"
-        f"try: main(['run', *{words!r}])\n"
-        "except SystemExit as ended: code = ended.code\n"
-        f"loaded = {HEAVY!r} & set(sys.modules)\n"
-        "sys.exit(f'loaded {loaded}' if loaded else code)"
-    )
-    done = completed(program=[sys.executable, "-c", program])
+def test_a_typing_error_or_a_port_in_use_is_found_before_anything_is_loaded(words, code):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        words = [word.replace("TAKEN", str(taken.getsockname()[1])) for word in words]
+        done = completed(program=[sys.executable, "-c", STARTS.format(words=words, heavy=HEAVY)])
     assert done.returncode == code and words[1] in done.stderr, done.stderr
 
 

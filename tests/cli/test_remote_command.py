@@ -2,7 +2,6 @@
 
 import json
 import signal
-import socket
 import subprocess
 from contextlib import closing
 from urllib.request import urlopen
@@ -19,22 +18,9 @@ from sfms_robot.runtime.safety import Interrupt
 ALONE = {"scouting": {"multicast": {"enabled": False}}}
 
 
-@pytest.fixture
-def zenoh(tmp_path):
-    """Return the configuration file of a client, and keep the router running that it names."""
-    pytest.importorskip("zenoh", reason="needs the extra [remote]")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    file = tmp_path / "robot.json5"
-    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}, **ALONE}))
-    router = serve_session(session_config("serve", endpoint=endpoint))
-    yield file
-    close_session(router)
-
-
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
-def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(zenoh, ending):
-    words = ["fleet", "page", "--port", "0", "--zenoh", str(zenoh), "--json"]
+def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(router, ending):
+    words = ["fleet", "page", "--port", "0", "--zenoh", str(router.file), "--json"]
     with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         told = json.loads(process.stdout.readline())
@@ -45,35 +31,35 @@ def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(zen
     assert (process.returncode, rest, error) == (0, "", "")
 
 
-def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(zenoh, tmp_path, command_line, caplog):
+def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(router, tmp_path, command_line, caplog):
     mine, other = tmp_path / "mine.key", tmp_path / "other.key"
     latch, interrupt = HaltLatch(), Interrupt()
     controls = FleetControls(latch, interrupt, None, None)
-    head = FleetHead("hall", lambda: {"state": "halted"}, controls, Router(zenoh), fleet_key(mine))
-    with closing(head), Fleet(zenoh) as fleet:
+    head = FleetHead("hall", lambda: {"state": "halted"}, controls, router, fleet_key(mine))
+    with closing(head), Fleet(router.file) as fleet:
         while not fleet.states():
             pass  # until it is connected
-        halted = command_line("fleet", "halt", "--zenoh", zenoh, "--json").told
+        halted = command_line("fleet", "halt", "--zenoh", router.file, "--json").told
         assert halted["answers"] == [{"name": "hall", "done": "halt"}] and latch.by is not None
         for words in (["--fleet-key", other], []):  # that of another fleet, and one that is made on first use
-            ended = command_line("fleet", "resume", "hall", "--zenoh", zenoh, *words)
+            ended = command_line("fleet", "resume", "hall", "--zenoh", router.file, *words)
             assert "resume: proof: expected the fleet's key (--fleet-key)" in ended.out and latch.by is not None
         for command in ("resume", "end"):
             (answer,) = fleet.command(["hall"], {"command": command})
             assert "--fleet-key" in answer["error"] and not interrupt()
         (document,) = fleet.states()
         assert document["malformed"] == 4 and [each.levelname for each in caplog.records] == ["WARNING"]
-        resumed = command_line("fleet", "resume", "--zenoh", zenoh, "--fleet-key", mine, "--json").told
+        resumed = command_line("fleet", "resume", "--zenoh", router.file, "--fleet-key", mine, "--json").told
         assert resumed["answers"] == [{"name": "hall", "done": "resume"}]
         assert latch.by is None
 
 
-def test_documents_that_are_none_are_counted_and_the_first_is_logged(zenoh, command_line, caplog):
-    session = serve_session(session_config("call", Router(zenoh)))
+def test_documents_that_are_none_are_counted_and_the_first_is_logged(router, command_line, caplog):
+    session = serve_session(session_config("call", router))
     for number, document in enumerate([b"\xff", b"[1]", b"1" * 5000, b'{"person": "loud"}', b'{"name": "hall"}']):
         key = f"sfms/{number}/state"
         session.declare_queryable(key, lambda query, key=key, document=document: query.reply(key, document))
-    ended = command_line("fleet", "--zenoh", zenoh, "--json")
+    ended = command_line("fleet", "--zenoh", router.file, "--json")
     close_session(session)
     assert [each["name"] for each in ended.told["heads"]] == ["hall"] and ended.told["malformed"] == 4
     (line,) = [each.getMessage() for each in caplog.records]

@@ -152,33 +152,10 @@ def test_ctrl_c_saves_says_how_to_continue_and_exits_130(arguments, tmp_path):
     assert not (tmp_path / "out" / "tokenizer.safetensors").exists()
 
 
-OUTSIDE = {  # key: values that its range or type excludes
-    "tokenizer.steps": [0, "many"],
-    "tokenizer.batch": [1.5],
-    "tokenizer.learning_rate": [-1, float("nan")],
-    "tokenizer.score_learning_rate": [0],
-    "tokenizer.weight_decay": [-0.1],
-    "tokenizer.warm_up_steps": [-1],
-    "tokenizer.clip_norm": [0],
-    "tokenizer.precision": ["fp16"],
-    "tokenizer.evaluate_every": [-1],
-    "tokenizer.patience": [0],
-    "tokenizer.checkpoint_every": [0],
-    "tokenizer.checkpoint_minutes": [0],
-    "tokenizer.mask_loss": [-1],
-    "tokenizer.velocity_loss": [-1],
-    "predictor.transition_weight": [0],
-    "predictor.neutral_prefix": [1.1],
-    "predictor.drop_audio": [-1],
-    "predictor.drop_face": [2],
-    "predictor.history_noise": [2],
-    "predictor.gain_db": [-6],
-    "predictor.calibration_rounds": [-1],
-    "seed": [-1],
-    "listener.kind": ["other"],
-}
 WRONG = [
-    *((key, value, f"{key} = {value!r}") for key, values in OUTSIDE.items() for value in values),
+    ("tokenizer.steps", 0, "tokenizer.steps = 0"),
+    ("tokenizer.learning_rate", float("nan"), "tokenizer.learning_rate = nan"),
+    ("listener.kind", "other", "listener.kind = 'other'"),
     ("tokenizer.temperature", [2.0], "tokenizer.temperature"),
     ("tokenizer.temperature", [2.0, 0.0], "tokenizer.temperature.1 = 0.0"),
     ("tokenizer.stpes", 5, "'stpes' is not a known key (steps, batch,"),

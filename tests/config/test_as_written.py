@@ -16,16 +16,8 @@ from sfms_robot.listeners import checkpoint
 TRAINING = data_dir("configs") / "training"
 # Of a listener or its training, what is its size, not its method: the same in both files.
 SIZES = {
-    "description",
-    "batch",
-    "evaluate_every",
-    "heads",
-    "learning_rate",
-    "precision",
-    "seed",
-    "steps",
-    "window_frames",
-}
+    "description", "batch", "evaluate_every", "heads", "learning_rate", "precision", "seed", "steps", "window_frames",
+}  # fmt: skip
 
 
 def trained(name: str) -> Any:

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 import re
 import sys
 import tempfile
@@ -105,6 +106,7 @@ def test_every_shipped_file_names_its_schema_in_the_first_line(pattern):
         assert named != line and (file.parent / named).is_file(), file
 
 
+OPENS = {"id": 9, "min_deg": -10, "max_deg": 20}
 WRONG = {
     "curve": (
         {"joints": {"beak": {"id": 3, "drive": {"channel": "jawOpen", "curve": [[0, 0], [0.5, 1], [0.5, 2]]}}}},
@@ -136,6 +138,19 @@ WRONG = {
         {"joints": {"x": {"id": 9, "mirror_of": "beak", "drive": "yaw"}}},
         "joints.x: has a drive and is mirror_of 'beak': one of them",
     ),
+    "rest outside": ({"joints": {"x": {**OPENS, "rest_deg": 25}}}, "joints.x: rest_deg 25 is outside -10..20"),
+    "not a number": ({"joints": {"x": {**OPENS, "max_deg": math.nan}}}, "joints.x.max_deg = nan: Input should be"),
+    "infinite": ({"joints": {"x": {**OPENS, "max_deg": math.inf}}}, "joints.x.max_deg = inf: Input should be"),
+    "infinite gain": (
+        {"joints": {"x": {**OPENS, "drive": {"channel": "jawOpen", "gain": math.inf}}}},
+        "joints.x.drive.gain = inf: Input should be a finite",
+    ),
+    "two kinds": ({"joints": {"x": {**OPENS, "drive": {"sum": ["yaw"], "max": ["yaw"]}}}}, "sum, max"),
+    "empty sum": ({"joints": {"x": {**OPENS, "drive": {"sum": []}}}}, "drive.sum: Tuple should have at least 1"),
+    "clamp reversed": (
+        {"joints": {"x": {**OPENS, "drive": {"channel": "jawOpen", "clamp": [1, 0]}}}},
+        "joints.x.drive: clamp [1.0, 0.0] is reversed",
+    ),
     "fold": (
         {"folds": [{"channel": "yaw", "into": "chin", "gain": 1}]},
         "folds.0.into = 'chin' is not a joint of this head (neck_yaw,",
@@ -156,6 +171,10 @@ WRONG = {
         {"couplings": [{"keep": {"beak": 1, "lid_left": 1}, "at_least": 0, "moving": ["beak"]},
                        {"keep": {"beak": -1, "lid_right": 1}, "at_least": 0, "moving": ["lid_right"]}]},
         "couplings.0.moving: 'beak' is also in couplings.1, one would undo the other",
+    ),
+    "threshold of a fault that has no reading": (
+        {"faults": {"thresholds": {"shock": {"max": 1}}}},
+        "faults.thresholds.shock",
     ),
     "two regions": (
         {"regions": {"a": {"joints": ["beak"]}, "b": {"joints": ["beak"]}}},
@@ -220,7 +239,9 @@ def test_the_check_lists_all_wrong_values_then_all_contradictions(tmp_path):
         assert len(found) == len(told) and all(line.startswith(f"{file}: ") for line in found)
 
 
-@pytest.mark.parametrize("raw", [[], {}, "head", {"joints": []}, {"joints": {"a": 3}}, {"expressions": {1: "yaw"}}])
+@pytest.mark.parametrize(
+    "raw", [[], {}, "head", {"joints": []}, {"joints": {}}, {"joints": {"a": 3}}, {"expressions": {1: "yaw"}}]
+)
 def test_a_file_of_the_wrong_shape_is_told_and_never_raised(raw, tmp_path):
     written(tmp_path, raw)
     assert check_head(str(tmp_path))

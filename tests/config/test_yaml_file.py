@@ -43,9 +43,11 @@ def test_a_number_that_is_too_long_is_refused_with_its_line(tmp_path, number):
         of(tmp_path, f"name: a\nid: {number}\n")
 
 
-@pytest.mark.parametrize("text", ["[" * 5000 + "]" * 5000, "[" * 30_000, "- " * 5000, "{a: " * 5000])
-def test_what_is_nested_too_deeply_is_one_line(tmp_path, text):
-    with pytest.raises(ConfigError, match=f"head.yaml:1: (nested more than {DEEPEST} levels deep|.*)") as caught:
+@pytest.mark.parametrize(
+    "text", ["joints: [", "a: \0", "[" * 5000 + "]" * 5000, "[" * 30_000, "- " * 5000, "{a: " * 5000]
+)
+def test_what_cannot_be_read_or_is_nested_too_deeply_is_one_line(tmp_path, text):
+    with pytest.raises(ConfigError, match=rf"head.yaml(:\d)?: (nested more than {DEEPEST} levels deep|.*)") as caught:
         of(tmp_path, text)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 

@@ -9,29 +9,6 @@ from drill_rig import HEAD, PAN, Command, command, more_said, torque
 from sfms_robot.emulator.launch import EmulatedServo, launch
 
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["run", "--head", "nobody"], 2),
-        (["run", "--head", HEAD, "--port", "/dev/nowhere"], 3),
-        (["run", "--head", HEAD, "--listener", "nobody"], 2),
-        (["head", "check", "nobody"], 2),
-        (["head", "pose", "--head", "nobody"], 2),
-        (["doctor", "--head", HEAD, "--port", "/dev/nowhere"], 3),
-        (["servo", "scan", "--port", "/dev/nowhere"], 3),
-        (["servo", "read", "1", "all", "--port", "/dev/nowhere"], 3),
-        (["replay", "/nowhere"], 2),
-        (["emulate", "--head", "nobody"], 2),
-    ],
-    ids=lambda each: " ".join(each) if isinstance(each, list) else None,
-)
-def test_what_is_not_there_is_named_in_an_object(words, code):
-    ended, out, err = command(*words, "--json")
-    told = json.loads(out.splitlines()[-1])
-    assert (ended, "Traceback" in err) == (code, False), err
-    assert told["exit_code"] == code and (told.get("error") or told["findings"])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["run", "--audio", "none", "--duration", "1"], ["run", "--dry-run"], ["doctor"]], ids=" ".join
@@ -69,23 +46,18 @@ def twice(running):
 RUN = ["run", "--audio", "none", "--head", HEAD]
 
 
-@pytest.mark.parametrize(
-    ("words", "press", "named"),
-    [
-        pytest.param([*RUN, "--duration", "1"], nothing, "pan", id="run"),
-        pytest.param([*RUN, "--duration", "600"], once, "pan", id="once", marks=pytest.mark.slow),
-        pytest.param([*RUN, "--duration", "600"], twice, "pan", id="twice", marks=pytest.mark.slow),
-        pytest.param(["replay", "RECORDING"], nothing, "pan", id="replay", marks=pytest.mark.slow),
-        pytest.param(["head", "pose", HEAD, "nod"], nothing, "pan", id="pose", marks=pytest.mark.slow),
-        pytest.param(
-            ["servo", "move", PAN, "--by", "600", "--baud", "1000000"],
-            nothing,
-            "id 1",
-            id="move",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
+ENDED = [
+    (RUN + ["--duration", "1"], nothing, "pan"),
+    (RUN + ["--duration", "600"], once, "pan"),
+    (RUN + ["--duration", "600"], twice, "pan"),
+    (["replay", "RECORDING"], nothing, "pan"),
+    (["head", "pose", HEAD, "nod"], nothing, "pan"),
+    (["servo", "move", PAN, "--by", "600", "--baud", "1000000"], nothing, "id 1"),
+]
+SLOW = [pytest.param(*each, marks=pytest.mark.slow) for each in ENDED[1:]]
+
+
+@pytest.mark.parametrize(("words", "press", "named"), [ENDED[0], *SLOW])
 def test_torque_that_is_not_confirmed_off_is_exit_4_and_in_the_object(words, press, named, device, chain, request):
     words = [request.getfixturevalue("recording") if word == "RECORDING" else word for word in words]
     with Command(*words, "--port", device, "--json") as running:

@@ -66,17 +66,6 @@ def test_a_file_halts_a_run_until_a_signal_lets_it_go_on(log, tmp_path):
     assert report["limits"]["violations"] == 0
 
 
-def test_a_signal_halts_a_run_and_another_lets_it_go_on(log):
-    with Watched(log) as running:
-        running.until_state("listening")
-        running.signal(signal.SIGUSR1)
-        running.until_state("halted")
-        assert running.document()["why"] == ["signal"]
-        running.signal(signal.SIGUSR2)
-        running.until_state("listening")
-        running.report()
-
-
 def test_a_listener_that_is_killed_is_missed_and_comes_back(log):
     with Watched(log) as running:
         running.until_state("listening")

@@ -1,11 +1,8 @@
 """A run that is short of descriptors, by its clients or by anything else, goes on and prints its report."""
 
-import json
 import os
 import signal
 import socket
-from contextlib import ExitStack, suppress
-from urllib.request import urlopen
 
 import pytest
 from drill_rig import HEAD, listening, more_said, run
@@ -16,44 +13,15 @@ LIMIT_S = 10.0
 WORDS = ("--audio", "none", "--status", "0")
 
 
-def status_of(running, log):
-    """Where the status of a run is, once it says so in its log."""
-    running.until(lambda: "status: http" in log.read_text())
-    return log.read_text().partition("status: ")[2].split()[0]
-
-
-def limited(running, descriptors):
-    resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (descriptors, descriptors))
-
-
-@pytest.mark.slow
-def test_beside_400_slow_clients_of_its_status_a_run_goes_on(device, chain, tmp_path):
-    log = tmp_path / "log"
-    with log.open("w") as stderr, run(HEAD, device, *WORDS, "--json", stderr=stderr) as running, ExitStack() as stack:
-        listening(running, chain)
-        url = status_of(running, log)
-        limited(running, 100)
-        for index in range(400):
-            client = stack.enter_context(socket.create_connection(("127.0.0.1", int(url.split(":")[2][:-1])), LIMIT_S))
-            with suppress(ConnectionError):  # it had to make room already
-                client.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"[: index % 30])
-        with urlopen(url, timeout=LIMIT_S) as answer:
-            assert json.load(answer)["state"] in ("idle", "listening")
-        more_said(running, chain)
-        running.signal(signal.SIGTERM)
-        code, out, _ = running.ended()
-    report = json.loads(out.splitlines()[-1])
-    assert (code, report["exit"], report["error"]) == (130, "interrupted", None)
-    assert "Traceback" not in log.read_text()
-
-
 def test_at_the_limit_of_descriptors_a_run_goes_on_and_prints_its_report(device, chain, tmp_path):
     log = tmp_path / "log"
     with log.open("w") as stderr, run(HEAD, device, *WORDS, stderr=stderr) as running:
         listening(running, chain)
-        url = status_of(running, log)
+        running.until(lambda: "status: http" in log.read_text())
+        url = log.read_text().partition("status: ")[2].split()[0]
         taken = {int(name) for name in os.listdir(f"/proc/{running.pid}/fd")}
-        limited(running, min(set(range(len(taken) + 1)) - taken))
+        least = min(set(range(len(taken) + 1)) - taken)
+        resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (least, least))
         with socket.create_connection(("127.0.0.1", int(url.split(":")[2][:-1])), LIMIT_S) as client:
             client.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")  # there is no descriptor for its answer
             more_said(running, chain)

@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from loop_rig import driven
+from loop_rig import Watcher, driven
 
 from sfms_robot.app.head.pose import NobodyThere, held_face, parse_face
 from sfms_robot.app.open_head import build_bus, build_motion
@@ -12,7 +12,6 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError
-from sfms_robot.ports import Observer
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.log import RunLog
 
@@ -24,20 +23,6 @@ HEAD = WHOLE.model_copy(
 RATE_HZ = max(bus.rate_hz for bus in HEAD.buses.values())
 
 
-class Unplugger(Observer):
-    """An observer that pulls one adapter after two seconds, and keeps the goals up to the way to rest."""
-
-    def __init__(self, chain):
-        self._chain, self.goals, self._pulled = chain, [], False
-
-    def tick(self, seen):
-        if seen.state != "stopping":
-            self.goals.append((seen.time_s, seen.goals_rad))
-        if seen.time_s > 2.0 and not self._pulled:
-            self._pulled = True
-            self._chain.hang_up()
-
-
 @pytest.mark.parametrize(("dead", "alive"), [("antennas", "neck"), ("neck", "antennas")])
 def test_the_bus_that_works_comes_to_rest(dead, alive):
     clock = VirtualClock()
@@ -47,7 +32,7 @@ def test_the_bus_that_works_comes_to_rest(dead, alive):
         bus.connect()
         stack.callback(bus.close)
         log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=build_motion(HEAD, RATE_HZ).audit)
-        watcher = Unplugger(chains[dead])
+        watcher = Watcher({round(2.0 * RATE_HZ) + 1: chains[dead].hang_up})
         with pytest.raises(BusError, match=dead):
             driven(
                 HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=60.0, observer=watcher, log=log, source=NobodyThere(),
@@ -55,10 +40,10 @@ def test_the_bus_that_works_comes_to_rest(dead, alive):
             )  # fmt: skip
         mine = [(j.id, j.zero_ticks) for j in HEAD.joints.values() if j.bus == alive]
         states = {servo: chains[alive].state(servo) for servo, _ in mine}
-    ended_s, last_rad = watcher.goals[-1]
-    assert 2.0 + GIVES_UP_S <= ended_s < 2.0 + GIVES_UP_S + 1.0
+    last = [tick for tick in watcher.ticks if tick.state != "stopping"][-1]
+    assert 2.0 + GIVES_UP_S <= last.time_s < 2.0 + GIVES_UP_S + 1.0
     rest_rad = np.array([joint.rest_rad for joint in HEAD.joints.values()])
-    assert np.abs(last_rad - rest_rad).max() > 0.05  # the face was somewhere else
+    assert np.abs(last.goals_rad - rest_rad).max() > 0.05  # the face was somewhere else
     assert log.eased >= RATE_HZ and log.audited.violations == 0
     if alive == "neck":
         assert all(states[servo]["torque"] == 0 for servo, _ in mine)

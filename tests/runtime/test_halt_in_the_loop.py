@@ -1,24 +1,23 @@
 """Emergency stop on emulated servos in virtual time: braked under the limits, held or released, latched, resumed."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from loop_rig import Posed, driven
+from loop_rig import Posed, Ran, Watcher, run_listener
 
-from sfms_robot.app.open_head import build_bus, build_motion
+from sfms_robot.app.open_head import build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, FaceFrame, SpeakerFrame
-from sfms_robot.ports import Bus, Observer, Source, Tick
-from sfms_robot.runtime.clock import InlineFeed, VirtualClock
+from sfms_robot.ports import Bus, Source
+from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.safety import EASE_S
 
 RATE_HZ = 100.0
@@ -56,30 +55,6 @@ class Somebody(Source):
         return frames
 
 
-@dataclass
-class Watcher(Observer):
-    """Keeps every tick, and does at a tick what the test asks for."""
-
-    does: dict[int, Callable[[], None]] = field(default_factory=dict)
-    ticks: list[Tick] = field(default_factory=list)
-
-    def tick(self, seen: Tick) -> None:
-        self.does.get(len(self.ticks), lambda: None)()
-        self.ticks.append(seen)
-
-    def states(self) -> list[str]:
-        names = [tick.state for tick in self.ticks]
-        return [name for before, name in zip(["", *names], names, strict=False) if name != before]
-
-
-@dataclass
-class Ran:
-    outcome: str
-    log: RunLog
-    ticks: list[Tick]
-    states: list[str]
-
-
 @pytest.fixture
 def chain() -> Iterator[Chain]:
     with launch(emulated(HEAD)["main"], virtual=True) as running:
@@ -90,29 +65,19 @@ def run(
     chain: Chain,
     does: Callable[[HaltLatch], dict[int, Callable[[], None]]] = lambda latch: {},
     seconds: float = 4.0,
-    source: Source | None = None,
-    without: tuple[str, ...] = (),
     latch: HaltLatch | None = None,
-    opened: Callable[[Bus], object] = lambda bus: None,
-    interrupted: Callable[[], bool] = lambda: False,
+    without: tuple[str, ...] = (),
+    **how: Any,
 ) -> Ran:
     clock, latch, motion = VirtualClock(), latch or HaltLatch(), build_motion(HEAD, RATE_HZ)
     clock.wait_until(chain_time(chain))
-    watcher = Watcher(does(latch))
-    bus = build_bus(HEAD, {"main": chain}, clock, without=without)
-    opened(bus)
-    bus.connect()
-    try:
-        outcome, log = driven(
-            HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=seconds, observer=watcher, source=source or Somebody(),
-            interrupted=interrupted,
-            feed=InlineFeed(NODDER, 0, 0.01), answers=True, halt=latch, holds=motion.holds, heat=motion.heat,
-            ignored=frozenset(without),
-        )  # fmt: skip
-        TIMES[id(chain)] = clock.now_s()
-    finally:
-        bus.close()
-    return Ran(outcome, log, watcher.ticks, watcher.states())
+    ran = run_listener(
+        HEAD, chain, NODDER, Watcher(does(latch)), clock=clock, rate_hz=RATE_HZ, duration_s=seconds, without=without,
+        answers=True, halt=latch, holds=motion.holds, heat=motion.heat, ignored=frozenset(without),
+        **{"source": Somebody()} | how,
+    )  # fmt: skip
+    TIMES[id(chain)] = clock.now_s()
+    return ran
 
 
 TIMES: dict[int, float] = {}
@@ -145,7 +110,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     before = "starting" if halted < EASE_S * RATE_HZ else "listening"
     assert [ran.ticks[halted].state, ran.ticks[halted + 1].state] == [before, "halted"]
     assert ran.ticks[halted + 1].why == ("key",)
-    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    goals = ran.watcher.goals()
     stop = halted + round(STOPS_S * RATE_HZ)
     assert np.array_equal(goals[stop], goals[late])  # stands, for as long as it is halted
     assert seen == {joint: joint in NECK for joint in JOINTS}
@@ -160,15 +125,14 @@ def test_a_head_that_is_halted_at_the_end_moves_no_more(chain):
     assert not any(torque(chain, joint) for joint in JOINTS)
 
 
-def test_a_halt_that_is_released_at_once_is_ended_when_the_head_stands(chain):
-    ran = run(chain, lambda latch: {150: lambda: latch.close("key"), 151: lambda: latch.resume("device")}, seconds=4.0)
-    assert ran.states == ["starting", "listening", "halted", "starting", "listening", "stopping"]
-    assert ran.log.audited.violations == 0
-
-
-def test_a_halt_while_joints_ease_in_and_one_before_the_first_tick(chain):
-    ran = run(chain, lambda latch: {20: lambda: latch.close("key"), 120: lambda: latch.resume("device")}, seconds=4.0)
-    assert ran.states == ["starting", "halted", "starting", "listening", "stopping"]
+@pytest.mark.parametrize(
+    ("halted", "resumed", "before"), [(150, 151, ["starting", "listening"]), (20, 120, ["starting"])]
+)
+def test_a_halt_that_is_released_at_once_or_comes_while_joints_ease_in_ends_when_the_head_stands(
+    chain, halted, resumed, before
+):
+    ran = run(chain, lambda latch: {halted: lambda: latch.close("key"), resumed: lambda: latch.resume("device")})
+    assert ran.states == [*before, "halted", "starting", "listening", "stopping"]
     assert ran.log.audited.violations == 0
 
 
@@ -200,7 +164,7 @@ def test_joints_come_back_a_few_per_tick_while_those_that_hold_go_on(chain):
     assert set(back) == set(JOINTS) - set(NECK) - {"jaw"}
     per_tick = [list(back.values()).count(k) for k in range(resumed, max(back.values()) + 1)]
     assert max(per_tick) <= 3 and sum(map(bool, per_tick)) > 5 and len(per_tick) < RATE_HZ
-    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    goals = ran.watcher.goals()
     for joint, k in back.items():  # no goal moves before its joint is back
         assert np.ptp(goals[resumed : k + 1, JOINTS.index(joint)]) == 0.0
         assert goals[k + 1, JOINTS.index(joint)] == pytest.approx(ran.ticks[k].readings[joint].position_rad, abs=2e-3)
@@ -266,7 +230,7 @@ def test_a_head_that_lost_its_torque_because_the_loop_stood_still_comes_back_who
     ran = run(chain, does, seconds=6.0, latch=Late(), opened=buses.append)
     assert ran.outcome == "done" and ran.log.audited.violations == 0
     assert set(came_back(ran)) == set(JOINTS) and ran.states[-2:] == ["listening", "stopping"]
-    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    goals = ran.watcher.goals()
     assert np.ptp(goals[-100:, JOINTS.index(NECK[1])]) > 0.05
 
 
@@ -290,7 +254,7 @@ def test_a_hot_servo_moves_less_and_then_rests(chain):
 def test_the_source_is_told_how_fast_joints_move_and_that_they_stand_while_they_are_halted(chain):
     somebody = Somebody()
     ran = run(chain, lambda latch: {150: lambda: latch.close("key")}, seconds=3.0, source=somebody)
-    goals = np.array([tick.goals_rad for tick in ran.ticks])
+    goals = ran.watcher.goals()
     speeds = np.abs(np.diff(goals, axis=0)).sum(axis=1) * RATE_HZ
     assert np.allclose(somebody.told_rad_s[1:], speeds)
     assert max(speeds[100:150]) > 0.1 and set(somebody.told_rad_s[-50:]) == {0.0}

@@ -1,25 +1,20 @@
 """The loop on emulated servos in virtual time, under a hand-written listener: whatever happens, it comes to rest."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from loop_rig import Posed, driven
+from loop_rig import Posed, Ran, Watcher, run_listener
 
-from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated, sagged_rad
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import RobotError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Plan, SpeakerFrame
-from sfms_robot.ports import Observer, Source, Tick
-from sfms_robot.runtime.clock import InlineFeed, VirtualClock
-from sfms_robot.runtime.log import RunLog
+from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, SpeakerFrame
+from sfms_robot.ports import Source
+from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.runtime.loop import turned_by_hand
-from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
-from sfms_robot.servo.port import VirtualTimePort
 from sfms_robot.sources.paired import PairedSource
 
 RATE_HZ = 100.0
@@ -31,98 +26,35 @@ def nodder(**broken) -> Posed:
     return Posed(pitch=lambda times_s: 0.1 * np.sin(2 * np.pi * times_s), **broken)
 
 
-class Watcher(Observer):
-    """Keeps every tick."""
-
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-        self.frames = self.plans = 0
-
-    def tick(self, seen: Tick) -> None:
-        self.ticks.append(seen)
-
-    def heard(self, frame: SpeakerFrame) -> None:
-        self.frames += 1
-
-    def planned(self, plan: Plan) -> None:
-        self.plans += 1
-
-
 @pytest.fixture
 def chain() -> Iterator[Chain]:
     with launch(emulated(HEAD)["main"], virtual=True) as running:
         yield running
 
 
-@dataclass(frozen=True)
-class Ran:
-    """What became of a run: how it ended, what was seen, and what the servos themselves say afterwards."""
-
-    outcome: str
-    log: RunLog
-    watcher: Watcher
-    statistics: Mapping[str, Any]
-    servos: dict[int, dict[str, int]]
-
-
-def run(
-    chain: Chain,
-    listener: Posed,
-    interrupt_at: int | None = None,
-    watcher: Watcher | None = None,
-    seconds: float = 2.0,
-    source: Source | None = None,
-) -> Ran:
-    clock, watcher = VirtualClock(), watcher or Watcher()
+def run(chain: Chain, listener: Posed, watcher: Watcher | None = None, seconds: float = 2.0, **how: Any) -> Ran:
+    clock = VirtualClock()
     clock.origin_s = ORIGIN_S
-    bus = build_bus(HEAD, {"main": chain}, clock)
-    log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=build_motion(HEAD, RATE_HZ).audit)
-
-    def interrupted() -> bool:
-        return interrupt_at is not None and len(watcher.ticks) >= interrupt_at
-
-    bus.connect()
-    try:
-        outcome, _ = driven(
-            HEAD, bus, clock, rate_hz=RATE_HZ, duration_s=seconds, observer=watcher, interrupted=interrupted, log=log,
-            source=source or PairedSource(duration_s=seconds), feed=InlineFeed(listener, 0, 0.01),
-        )  # fmt: skip
-    except RobotError as error:
-        outcome = str(error)
-    finally:
-        statistics = bus.statistics()
-        bus.close()
-    return Ran(outcome, log, watcher, statistics, chain_state(chain, clock))
+    how = {"source": PairedSource(duration_s=seconds)} | how
+    return run_listener(
+        HEAD, chain, listener, watcher or Watcher(), clock=clock, rate_hz=RATE_HZ, duration_s=seconds, **how
+    )
 
 
-def chain_state(chain: Chain, clock: VirtualClock) -> dict[int, dict[str, int]]:
-    """Torque and position of every servo, read by the vendor-independent codec over a second port."""
-    link = Dynamixel2Link(VirtualTimePort(chain.device, chain.control, 4_000_000, clock), 4_000_000, 0.05)
-    try:
-        ids = [joint.id for joint in HEAD.joints.values()]
-        torque = link.read_many(64, 1, ids)
-        present = link.read_many(132, 4, ids)
-    finally:
-        link.port.close()
-    return {
-        i: {"torque": torque[i].data[0], "ticks": int.from_bytes(present[i].data, "little", signed=True)}
-        for i in present
-    }
-
-
-def assert_at_rest(servos: dict[int, dict[str, int]]) -> None:
+def assert_at_rest(chain: Chain) -> None:
     for name, joint in HEAD.joints.items():
-        assert servos[joint.id]["torque"] == 0, f"{name} still has torque"
-        assert abs(servos[joint.id]["ticks"] - joint.zero_ticks) <= 3, f"{name} is not at rest"
+        servo = chain.state(joint.id)
+        assert servo["torque"] == 0, f"{name} still has torque"
+        assert abs(servo["position"] - joint.zero_ticks) <= 3, f"{name} is not at rest"
 
 
 def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain) -> None:
     ran = run(chain, nodder())
     assert ran.outcome == "done"
     assert (ran.log.frames, ran.watcher.frames, ran.watcher.plans) == (50, 50, 13)
-    assert [tick.state for tick in ran.watcher.ticks].index("stopping") == 201
+    assert [tick.state for tick in ran.ticks].index("stopping") == 201
     assert ran.log.audited.violations == 0
-    assert_at_rest(ran.servos)
+    assert_at_rest(chain)
 
 
 def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> None:
@@ -140,12 +72,12 @@ def test_a_joint_outside_its_limits_comes_in_from_where_it_stands(chain: Chain) 
     chain.turn(joint.id, outside)
     ran = run(chain, nodder())
     row = list(HEAD.joints).index("neck_pitch")
-    pitches = np.array([tick.goals_rad[row] for tick in ran.watcher.ticks])
+    pitches = ran.watcher.goals()[:, row]
     assert pitches[0] == pytest.approx(-700 * 2 * np.pi / 4096, abs=2e-3)
     assert np.abs(np.diff(pitches)).max() <= np.radians(150) / RATE_HZ * (1 + 1e-6)
     assert pitches[-1] > joint.min_rad
     assert ran.log.audited.violations == 0
-    assert_at_rest(ran.servos)
+    assert_at_rest(chain)
 
 
 def test_the_head_follows_the_listener(chain: Chain) -> None:
@@ -155,42 +87,24 @@ def test_the_head_follows_the_listener(chain: Chain) -> None:
 
 
 def test_an_interruption_still_comes_to_rest(chain: Chain) -> None:
-    ran = run(chain, nodder(), interrupt_at=130)
+    watcher = Watcher()
+    ran = run(chain, nodder(), watcher, interrupted=lambda: len(watcher.ticks) >= 130)
     assert ran.outcome == "interrupted"
-    assert [tick.state for tick in ran.watcher.ticks].index("stopping") == 130
-    assert_at_rest(ran.servos)
-
-
-def test_an_exception_still_comes_to_rest_and_is_passed_on(chain: Chain) -> None:
-    ran = run(chain, nodder(raises_from=30))
-    assert ran.outcome == "the listener broke"
-    assert_at_rest(ran.servos)
+    assert [tick.state for tick in ran.ticks].index("stopping") == 130
+    assert_at_rest(chain)
 
 
 def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
     ran = run(chain, nodder(nan_from=20))
     assert ran.outcome == "done" and ran.log.refused_plans > 0
-    assert all(np.isfinite(tick.goals_rad).all() for tick in ran.watcher.ticks)
+    assert all(np.isfinite(tick.goals_rad).all() for tick in ran.ticks)
     assert ran.log.audited.violations == 0
-    assert_at_rest(ran.servos)
-
-
-class Killer(Watcher):
-    """Pulls the plug of one servo after half a second."""
-
-    def __init__(self, chain: Chain, servo: int) -> None:
-        super().__init__()
-        self._chain, self._servo = chain, servo
-
-    def tick(self, seen: Tick) -> None:
-        super().tick(seen)
-        if len(self.ticks) == 50:
-            self._chain.kill(self._servo)
+    assert_at_rest(chain)
 
 
 def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> None:
-    ran = run(chain, nodder(), watcher=Killer(chain, 4))
-    last = ran.watcher.ticks[-1].readings
+    ran = run(chain, nodder(), Watcher({50: lambda: chain.kill(4)}))
+    last = ran.ticks[-1].readings
     assert ran.outcome == "done" and ran.statistics["silent"] == [4]
     assert last["eye_tilt_right"].age_s > 1.0
     assert last["neck_pitch"].age_s == 0.0
@@ -198,10 +112,11 @@ def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> Non
 
 def test_a_servo_that_refuses_torque_leaves_none_of_them_with_torque(chain: Chain) -> None:
     chain.fault(5, 0x20)  # overload, latched until reboot
-    ran = run(chain, nodder())
-    assert "lid_left (id 5)" in ran.outcome
-    assert ran.watcher.ticks == []
-    assert all(servo["torque"] == 0 for servo in ran.servos.values())
+    watcher = Watcher()
+    with pytest.raises(RobotError, match=r"lid_left \(id 5\)"):
+        run(chain, nodder(), watcher)
+    assert watcher.ticks == []
+    assert not any(chain.state(joint.id)["torque"] for joint in HEAD.joints.values())
 
 
 class Started(Source):
@@ -223,7 +138,7 @@ def test_a_source_starts_once_at_the_first_tick_after_torque_came_on(chain: Chai
     ran = run(chain, nodder(), seconds=0.5, source=source)
     (_, origin_s), *read = source.told
     assert origin_s == ORIGIN_S and read[0] == ("read", 0.0) and {what for what, _ in read} == {"read"}
-    assert ran.outcome == "done" and ran.watcher.ticks[0].time_s == 0.0
+    assert ran.outcome == "done" and ran.ticks[0].time_s == 0.0
 
 
 def test_only_what_turns_head_or_eyes_is_by_hand():

@@ -115,16 +115,6 @@ def test_states_are_kept_when_they_change_and_servos_once_a_second(tmp_path):
     ]
 
 
-def test_what_a_plan_holds_is_kept_as_an_event(tmp_path):
-    recorder = Recorder(tmp_path, JOINTS)
-    frames = np.zeros((50, 58), np.float32)
-    frames[20:26, CHANNELS.index("eyeBlinkLeft")] = frames[20:26, CHANNELS.index("eyeBlinkRight")] = 1.0
-    recorder.planned(Plan(0.0, 0.04 * np.arange(1, 51), frames))
-    recorder.close()
-    (_, _, _, _), (topic, _, event, _) = messages(tmp_path)
-    assert topic == "/event" and event["kind"] == "blink" and 0.7 < event["start_s"] and event["duration_s"] < 0.4
-
-
 def test_in_virtual_time_nothing_is_dropped(tmp_path):
     recorder = Recorder(tmp_path, JOINTS, when_full="wait", queue_length=1)
     for n in range(200):

@@ -123,6 +123,13 @@ class Page:
         shot = Image.open(io.BytesIO(self.screen())).convert("RGB")
         return np.asarray(shot.crop((int(x), int(y), int(x + width), int(y + height)))).astype(float)
 
+    def press(self, words: str) -> None:
+        """Press the button among the controls that begins with these words, once it is there."""
+        buttons = "[...document.querySelectorAll('#controls button')]"
+        button = f"{buttons}.find((each) => each.textContent.startsWith(arguments[0]))"
+        self.until(button, words)
+        self.driver.execute_script(f"{button}.click()", words)
+
     def screen(self) -> bytes:
         """PNG of the window, while the page stands still."""
         self.ask("globalThis.page && (page.still = true)")

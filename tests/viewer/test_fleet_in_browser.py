@@ -1,14 +1,11 @@
 """The fleet's page in a real browser: a tile per head over real zenoh, and a button that halts all of them."""
 
-import json
-import socket
 from contextlib import closing
 
 import pytest
 from chromium import Page, missing
 
 from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key, fleet_page
-from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
@@ -26,10 +23,10 @@ NAMES = ("hall", "kitchen")
 class Head:
     """A run as a fleet knows it: what it tells, and what may be done to it."""
 
-    def __init__(self, name, file):
+    def __init__(self, name, router):
         self.halt = HaltLatch()
         controls = FleetControls(self.halt, Interrupt(), None, None)
-        self.head = FleetHead(name, self.document, controls, Router(file), fleet_key(None))
+        self.head = FleetHead(name, self.document, controls, router, fleet_key(None))
 
     def document(self):
         by = self.halt.by
@@ -40,17 +37,11 @@ class Head:
 
 
 @pytest.fixture
-def fleet(tmp_path):
+def fleet(router, tmp_path):
     """Two heads, their page, and the browser that looks at it."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    quiet = {"scouting": {"multicast": {"enabled": False}}}
-    file = tmp_path / "robot.json5"
-    file.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint], "timeout_ms": -1}, **quiet}))
-    router = serve_session(session_config("serve", endpoint=endpoint))
-    heads = {name: Head(name, file) for name in NAMES}
+    heads = {name: Head(name, router) for name in NAMES}
     try:
-        with Fleet(file) as asked, closing(fleet_page(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
+        with Fleet(router.file) as asked, closing(fleet_page(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
             browser.driver.get(page.url)
             browser.ask("(said.textContent = nobody)")  # as of a page that was there before the heads
             browser.until(f"{TILES}.length == {len(NAMES)}")
@@ -58,7 +49,6 @@ def fleet(tmp_path):
     finally:
         for each in heads.values():
             each.head.close()
-        close_session(router)
 
 
 def test_a_tile_says_what_a_head_does_and_one_button_halts_all(fleet):

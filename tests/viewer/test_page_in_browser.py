@@ -82,12 +82,13 @@ def slide(page, channel, value):
     )
 
 
-def press(page, words):
-    page.driver.execute_script(
-        "[...document.querySelectorAll('#controls button')]"
-        ".find((each) => each.textContent.startsWith(arguments[0])).click()",
-        words,
-    )
+def open_all(page):
+    page.driver.execute_script("for (const each of document.querySelectorAll('details')) each.open = true")
+
+
+def comes(page, kind, detail):
+    """As if this message came to the page; `detail` in JavaScript, in which `page.hello` is what the run said."""
+    page.driver.execute_script(f"page.connection.dispatchEvent(new CustomEvent('{kind}', {{detail: {detail}}}))")
 
 
 def test_loads_without_a_complaint_and_asks_nobody_but_this_machine(page):
@@ -159,7 +160,7 @@ def test_a_slider_moves_its_joint_and_the_other_stays(page):
     page.until(f"Math.abs({asked}[{pan}] - {before[pan]}) > 0.45")
     after = page.ask(asked)
     assert abs(after[tilt] - before[tilt]) < 0.2 * abs(after[pan] - before[pan])
-    press(page, "Let go of the sliders")
+    page.press("Let go of the sliders")
 
 
 def test_where_it_looks_is_a_slider_of_the_keyboard_and_a_pad(page):
@@ -176,7 +177,7 @@ def test_where_it_looks_is_a_slider_of_the_keyboard_and_a_pad(page):
     ActionChains(page.driver).move_to_element_with_offset(pad, -pad.size["width"] // 2 + 5, 0).click().perform()
     assert float(aside.get_attribute("value")) < -40
     page.until(f"page.newest.j[{pan}] < -0.3")
-    press(page, "Let it look where it likes")
+    page.press("Let it look where it likes")
     assert float(aside.get_attribute("value")) == 0
     page.until(f"Math.abs(page.newest.j[{pan}]) < 0.2")
 
@@ -207,7 +208,7 @@ def test_it_comes_back_by_itself_and_after_a_reload(own_page, run):
 
 def test_replay_goes_where_the_scrubber_is_put(page):
     page.until("page.timeline.frames.length > 60")
-    press(page, "Replay")
+    page.press("Replay")
     page.until("page.replay && !document.getElementById('replay').hidden")
     at_s = page.ask(
         "(() => { const s = document.getElementById('scrub'); s.value = (+s.min + +s.max) / 2;"
@@ -260,7 +261,7 @@ def test_beyond_loopback_a_wrong_token_is_refused_in_words_and_the_right_one_doe
         assert served.token and address in served.url
         page.open(served.url)
         page.until(f"{form}?.checkVisibility()")
-        press(page, "Neutral")
+        page.press("Neutral")
         page.until(f"{notice}.includes('the token is needed')")
         box = page.driver.find_element("css selector", "#controls form input")
         box.send_keys("wrong\n")
@@ -269,7 +270,7 @@ def test_beyond_loopback_a_wrong_token_is_refused_in_words_and_the_right_one_doe
         box.clear()
         box.send_keys(served.token + "\n")
         page.until(f"!{form}.checkVisibility()")
-        press(page, "Neutral")
+        page.press("Neutral")
         page.until("page.connection.held === 'you'")
         page.open(served.url)  # it remembers
         page.until(f"page.connection.allowed && {form} && !{form}.checkVisibility()")
@@ -284,9 +285,7 @@ def test_what_is_wrong_with_the_run_is_said(own_page, run):
         ("urdf: 'robot/none.urdf'", "robot/none.urdf: 404"),
         ("urdf_joints: ['chin'], head: 'other'", 'no joint "chin"'),
     ):
-        page.driver.execute_script(
-            f"page.connection.dispatchEvent(new CustomEvent('hello', {{detail: {{...whole, {change}}}}}))"
-        )
+        comes(page, "hello", f"{{...whole, {change}}}")
         page.until("document.getElementById('notice').textContent.includes(arguments[0])", notice)
 
 
@@ -295,10 +294,7 @@ def test_rates_stand_where_people_are_and_nowhere_for_a_listener_that_decides_no
     stands = "document.querySelector('.rate input[aria-label=\"blinks\"]').value"
     page.until("document.querySelector('.rate')")
     assert float(page.ask(stands)) == pytest.approx(page.ask("page.hello.people_per_minute.blink"), abs=0.051)
-    page.driver.execute_script("globalThis.whole = page.hello")
-    page.driver.execute_script(
-        "page.connection.dispatchEvent(new CustomEvent('hello', {detail: {...whole, people_per_minute: {}}}))"
-    )
+    comes(page, "hello", "{...page.hello, people_per_minute: {}}")
     page.until("!document.querySelector('.rate')")
 
 
@@ -326,7 +322,7 @@ def test_no_name_and_no_value_of_a_slider_is_cut_off(own_page, run, size):
     own_page.look(size)
     page = own_page.open(run.url)
     page.until("document.querySelector('[data-channel=mouthUpperUpRight]')")
-    page.driver.execute_script("for (const each of document.querySelectorAll('details')) each.open = true")
+    open_all(page)
     cut = "[...document.querySelectorAll('.slider :is(span, output)')].filter((e) => e.scrollWidth > e.clientWidth)"
     assert page.ask(f"{cut}.map((e) => e.textContent)") == []
     heights = page.ask("[...document.querySelectorAll('.rate output')].map((e) => e.clientHeight)")
@@ -334,7 +330,7 @@ def test_no_name_and_no_value_of_a_slider_is_cut_off(own_page, run, size):
 
 
 def test_the_panel_of_the_curves_ends_below_them_however_long_the_controls_are(page):
-    page.driver.execute_script("for (const each of document.querySelectorAll('details')) each.open = true")
+    open_all(page)
     below = "document.querySelector('#happens').getBoundingClientRect().bottom"
     feet = "document.querySelector('.timeline-feet').getBoundingClientRect().bottom"
     assert 0 < page.ask(f"{below} - {feet}") < 20
@@ -387,24 +383,22 @@ def test_there_is_something_to_download_once_it_was_recorded(own_page, run):
     download = "document.querySelector('[data-name=recording] a')"
     page.until(download)
     assert page.ask(f"{download}.hidden")
-    press(page, "Record")
+    page.press("Record")
     page.until(
         "[...document.querySelectorAll('#controls button')].some((each) => each.textContent === 'Stop recording')"
     )
     assert page.ask(f"{download}.hidden")
-    press(page, "Stop recording")
+    page.press("Stop recording")
     page.until(f"!{download}.hidden")
 
 
 @pytest.mark.parametrize("late", [False, True])
 def test_torque_that_the_end_of_a_run_could_not_confirm_off_is_named(own_page, run, late):
     page = own_page.open(run.url)
-    over = "over: true, torque_unconfirmed: ['head_pan']" if late else "over: false"
-    page.driver.execute_script(
-        f"const told = (type, detail) => page.connection.dispatchEvent(new CustomEvent(type, {{detail}}));"
-        f"page.still = true; told('hello', {{...page.hello, {over}}});"
-        + ("" if late else "told('over', {report: {torque_unconfirmed: ['head_pan']}});")
-    )
+    page.driver.execute_script("page.still = true")
+    comes(page, "hello", "{...page.hello, over: %s}" % ("true, torque_unconfirmed: ['head_pan']" if late else "false"))
+    if not late:
+        comes(page, "over", "{report: {torque_unconfirmed: ['head_pan']}}")
     page.until("document.getElementById('notice').textContent.startsWith('Torque is NOT confirmed off: head_pan.')")
     page.until("document.getElementById('faults').textContent === 'head_pan: not confirmed off'")
 

@@ -9,11 +9,11 @@ import urllib.request
 import numpy as np
 import pytest
 import soundfile
-import uvicorn
 from chromium import Page, missing
 
 from sfms_robot.lab.evaluation.people_study import Study, clip_name, read_answers
 from sfms_robot.viewer.study_server import study_app
+from sfms_robot.viewer.web_server import web_server
 
 LIMIT_S = 60.0
 QUIET = ("--autoplay-policy=no-user-gesture-required", "--mute-audio")
@@ -38,7 +38,7 @@ class Served:
     def __init__(self, app):
         listening = socket.create_server(("127.0.0.1", 0))
         self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/"
-        self.server = uvicorn.Server(uvicorn.Config(app, log_level="error", lifespan="off", ws="none"))
+        self.server = web_server(app, ws="none")
         self.thread = threading.Thread(target=self.server.run, kwargs={"sockets": [listening]})
 
     def __enter__(self):

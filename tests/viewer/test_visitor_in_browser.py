@@ -19,12 +19,6 @@ VOICE = data_dir("sim") / "speakers" / "katie" / "speech.flac"
 FRAMES = 50
 
 
-def press(page, words):
-    buttons = "[...document.querySelectorAll('#controls button')]"
-    page.until(f"{buttons}.some((each) => each.textContent === arguments[0])", words)
-    page.driver.execute_script(f"{buttons}.find((each) => each.textContent === arguments[0]).click()", words)
-
-
 @pytest.fixture(scope="module")
 def film(tmp_path_factory):
     """A person who opens and shuts the mouth, as Chromium's fake camera plays it: raw pictures, 4:2:0."""
@@ -63,7 +57,7 @@ def page(tmp_path_factory, film):
 
 
 def test_the_face_moves_while_the_microphone_hears_a_voice(page):
-    press(page, "Use my microphone")
+    page.press("Use my microphone")
     page.until("page.visitor.sent.voice > 50000")
     assert "Sent now" in page.ask("document.querySelector('.sent').textContent")
     page.until("page.newest.db !== null && page.timeline.frames.some(({talk}) => talk)")
@@ -76,7 +70,7 @@ def test_the_face_moves_while_the_microphone_hears_a_voice(page):
         "page.stage.human.posed.positions.reduce((most, at, i) => Math.max(most, Math.abs(at - before.points[i])), 0)"
     )
     page.until(f"{moved_m} > 0.001")
-    press(page, "Stop the microphone")
+    page.press("Stop the microphone")
     page.until("!page.visitor.talking")
     sent = page.ask("page.visitor.sent.voice")
     page.drawn()
@@ -85,11 +79,11 @@ def test_the_face_moves_while_the_microphone_hears_a_voice(page):
 
 def test_the_camera_becomes_58_numbers_and_asks_nobody_but_this_machine(page):
     page.ask("page.visitor.addEventListener('face', ({detail}) => { page.face = detail && [...detail]; }) || 1")
-    press(page, "Use my camera")
+    page.press("Use my camera")
     jaw = CHANNEL_INDEX["jawOpen"]
     page.until(f"page.face && page.face[{jaw}] > 0.2")
     page.until(f"page.face && page.face[{jaw}] < 0.1")
     assert page.ask("page.face.length") == MOTION_DIM
     page.until("page.visitor.sent.face > 2000")
     assert page.addresses() <= {"127.0.0.1", "data", "blob", "about"}
-    press(page, "Stop the camera")
+    page.press("Stop the camera")

@@ -12,8 +12,7 @@ import pytest
 
 from sfms_robot.app.fleet import fleet_page
 from sfms_robot.app.serve.service import metrics_server
-from sfms_robot.cli.main import main
-from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.errors import ConfigError
 from sfms_robot.viewer.web_server import AUTO, CONNECTION_S, MOST_CONNECTIONS, BriefConnection, status_server
 
 LIMIT_S = 30.0  # for what is bound to come
@@ -104,23 +103,11 @@ def test_a_client_that_does_not_wait_for_the_answer_holds_nothing_up(capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_a_port_that_is_in_use_is_refused_in_one_line_before_a_listener_is_loaded(capsys, monkeypatch):
-    def load(*_):
-        raise AssertionError("a listener was loaded")
-
-    monkeypatch.setattr("sfms_robot.app.options.begin_listening", load)
-    with closing(status_server("0")) as server, pytest.raises(SystemExit) as ended:
-        main(["run", "--duration", "1", "--status", str(server.port)])
-    assert ended.value.code == PortError.exit_code
-    said = f"--status: TCP port {server.port} on 127.0.0.1: is used by another program"
-    assert said in capsys.readouterr().err
-    with closing(status_server(str(server.port))) as again:
-        assert again.port == server.port
-
-
 def test_without_a_port_the_next_that_is_free_is_taken():
     with closing(status_server(AUTO)) as first, closing(status_server(AUTO)) as second:
         assert second.port != first.port and second.note == " (8775 is taken)"
+    with closing(status_server(str(first.port))) as again:
+        assert again.port == first.port
 
 
 @pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", "١"])
