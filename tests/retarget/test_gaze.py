@@ -152,15 +152,6 @@ def test_there_and_back(mount, place_m, pose):
     assert from_base(mount, camera.to_base(place_m, pose), pose) == pytest.approx(np.array(place_m), abs=1e-9)
 
 
-@given(MOUNTS, METRES, POSES, POSES)
-def test_a_moving_neck_moves_no_person(mount, place_m, one, other):
-    camera = Camera(mount)
-    places = [camera.to_base(from_base(mount, place_m, pose), pose) for pose in (one, other)]
-    assert places[0] == pytest.approx(places[1], abs=1e-9)
-    if mount.on == "base":
-        assert from_base(mount, place_m, one) == pytest.approx(from_base(mount, place_m, other))
-
-
 def test_a_head_that_has_turned_left_sees_who_was_ahead_on_its_right():
     mount = CameraMount(on="head")
     camera = Camera(mount)
