@@ -2,13 +2,13 @@
 
 import csv
 import gzip
-import socket
 import struct
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,13 +76,6 @@ def test_the_head_of_a_packet_of_an_iphone():
     assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)
 
 
-def test_names_of_any_script():
-    assert parse_packet(packet(subject="電話".encode())).subject == "電話"
-    wide = struct.pack(">i", -2) + "電話".encode("utf-16-be")
-    plain = packet(subject=b"")
-    assert parse_packet(plain[:7] + wide + plain[11:]).subject == "電話"
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
@@ -135,17 +128,26 @@ def test_what_a_face_does_not_need_refuses_no_packet(data, rate_hz):
 def test_a_names_length_may_be_in_characters(name, code):
     data, plain = name.encode(code), packet(subject=b"")
     length = len(name) if code == "utf-8" else -len(name)
+    assert parse_packet(packet(subject=name.encode())).subject == name
     parsed = parse_packet(plain[:7] + struct.pack(">i", length) + data + plain[11:])
     assert (parsed.subject, parsed.number, parsed.values[0]) == (name, 100, 0.25)
 
 
-@given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
-def test_a_damaged_packet_is_refused_or_finite(which, damage):
+def damaged(which, damage, kept):
+    """A recorded packet with other bytes at some places, cut off after so many."""
     data = bytearray(PACKETS[which])
     for place, value in damage:
         data[place] = value
+    return bytes(data[:kept])
+
+
+DAMAGE = st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20)
+
+
+@given(st.binary(max_size=600) | st.builds(damaged, st.integers(0, 179), DAMAGE, st.just(320) | st.integers(0, 320)))
+def test_any_bytes_are_refused_or_finite(data):
     try:
-        values = parse_packet(bytes(data)).values
+        values = parse_packet(data).values
     except PacketError:
         return
     assert values is None or (np.isfinite(values).all() and np.isfinite(motion_of(values)).all())
@@ -220,16 +222,10 @@ def test_what_is_not_used_of_a_sender_is_named():
 
 @pytest.fixture
 def sight():
-    opened = open_live_link("127.0.0.1:" + str(free_port()))
+    opened = open_live_link("127.0.0.1:" + str(free_udp_port()))
     opened.start(0.0)
     yield opened
     opened.close()
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_an_emulated_phone_is_seen(sight):
@@ -262,7 +258,7 @@ def test_pose_channels_are_flipped_on_request():
     values = np.zeros(61, np.float32)
     poses = {}
     for flip in ("", ",flip=yaw+roll"):
-        opened = open_live_link(f"127.0.0.1:{free_port()}{flip}")
+        opened = open_live_link(f"127.0.0.1:{free_udp_port()}{flip}")
         opened.feed(Datagram(packet(1, values), ("192.0.2.1", 1), 0.0))
         opened.feed(Datagram(packet(61, values), ("192.0.2.1", 1), 1.0))  # straight ahead
         assert opened.at(1.0).face.pose[:3] == pytest.approx([0, 0, 0])
@@ -273,32 +269,9 @@ def test_pose_channels_are_flipped_on_request():
     assert poses[",flip=yaw+roll"] == pytest.approx([-0.1, 0.2, -0.3], abs=0.02)
 
 
-@pytest.mark.slow
-def test_a_million_packets_of_noise_never_raise(sight):
-    """Through a real socket: whole, damaged, cut, random; what is left of them are counts."""
-    random = np.random.default_rng(0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        for number in range(1_000_000):
-            data = bytearray(renumbered(PACKETS[number % 180], number & 0x7FFFFFFF))
-            kind = number % 4
-            if kind == 1:
-                data[random.integers(len(data))] = random.integers(256)
-            elif kind == 2:
-                del data[random.integers(len(data)) :]
-            elif kind == 3:
-                data = bytearray(random.bytes(int(random.integers(600))))
-            out.sendto(data, sight.address)
-            while number % 16 == 15 and sight.statistics()["packets"] <= number:
-                sight.at(1e9)
-    counts = sight.statistics()
-    assert counts["packets"] == 1_000_000
-    assert 450_000 < counts["malformed"] < 750_000
-    assert np.isfinite(sight.at(1e9).face.motion).all()
-
-
 def test_the_log_says_what_to_type_in_the_app(caplog):
     caplog.set_level(NOTE)
-    port = free_port()
+    port = free_udp_port()
     opened = open_live_link(str(port))
     assert opened.address == ("127.0.0.1", port)
     opened.close()

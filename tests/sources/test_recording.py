@@ -114,8 +114,6 @@ def test_files_are_opened_by_path(tmp_path):
         ("browser", "auto", "none", "--audio browser: there is no page .sfms-robot run --view"),
         ("none", "browser:8000", "none", "--face browser:8000: takes nothing behind the colon"),
         ("nobody.wav", "auto", "none", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
-        ("none", "nobody.csv", "none", "--face nobody.csv: no such file"),
-        ("none", "none", "gone.wav", "--agent-audio gone.wav: no such file"),
         ("none", "none", "browser:x", "--agent-audio browser:x: no such file"),
     ],
 )
