@@ -28,12 +28,6 @@ def test_any_rate_becomes_the_same_tone_at_16_khz(tmp_path, rate_hz, suffix):
     np.testing.assert_allclose(samples[500:7500], tone(16000)[500:7500], atol=0.005)
 
 
-def test_stereo_is_the_mean_of_its_channels(tmp_path):
-    left, right = tone(16000), tone(16000, frequency_hz=300)
-    soundfile.write(tmp_path / "a.wav", np.stack([left, right], axis=1), 16000, subtype="FLOAT")
-    np.testing.assert_allclose(read_audio(tmp_path / "a.wav"), (left + right) / 2, atol=1e-6)
-
-
 def test_level_is_in_decibels_of_full_scale():
     assert energy_db(np.ones(100, dtype=np.float32)) == pytest.approx(0.0)
     assert energy_db(np.full(100, 0.1, dtype=np.float32)) == pytest.approx(-20.0, abs=1e-4)
