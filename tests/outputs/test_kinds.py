@@ -7,6 +7,7 @@ import socket
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
@@ -104,10 +105,7 @@ def test_packets_arrive_at_the_address(kind):
 
 @pytest.mark.parametrize("kind", ["vmc", "live-link"])
 def test_a_receiver_that_is_away_is_reported_on_this_machine(kind):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        port = receiver.getsockname()[1]
-    output = open_output(f"{kind}:{port}")
+    output = open_output(f"{kind}:{free_udp_port()}")
     output.open()
     with pytest.raises(OutputError, match="nothing listens there: start "):
         for _ in range(10):
@@ -188,8 +186,6 @@ def test_connections_that_stay_half_open_make_room(stream):
 
 
 def test_a_client_that_does_not_read_misses_frames_and_nothing_waits(stream):
-    host, _, port = stream.peer.partition(":")
-
     async def slow():
         from websockets.asyncio.client import connect as connect_async
 

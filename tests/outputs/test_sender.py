@@ -80,15 +80,6 @@ def test_an_avatar_goes_neutral_in_a_halt_and_comes_back_after_it():
     assert yaw[0] == 0.0 and yaw[-1] == pytest.approx(0.4)
 
 
-def test_a_machine_passes_the_limits_of_its_channels_for_a_step():
-    sender = OutputSender(Peer(True, LIMITS))
-    played(sender, looking(0.0), 0.0, 2.0)
-    yaw = played(sender, looking(3.0), 2.0, 2.0).astype(float)
-    assert yaw[-1] == pytest.approx(0.5, abs=1e-3) and yaw.max() <= 0.5 + 1e-6
-    assert np.abs(np.diff(yaw)).max() * HZ <= 1.0 + 1e-4
-    assert np.abs(np.diff(yaw, 2)).max() * HZ**2 <= 10.0 + 1e-2
-
-
 def test_a_machine_brakes_in_a_halt_holds_its_pose_and_is_not_moved_at_the_end():
     sender = OutputSender(Peer(True, LIMITS))
     played(sender, looking(0.4), 0.0, 0.5)  # on its way

@@ -12,6 +12,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from free_ports import free_tcp_port
 from websockets.exceptions import ConnectionClosed
 from websockets.server import ServerProtocol
 from websockets.sync.server import serve
@@ -411,10 +412,8 @@ def test_another_program_is_one_line(reply, line):
 
 
 def test_no_program_and_no_host_are_one_line(monkeypatch):
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
     with pytest.raises(OutputError, match="^connection refused: name the robot's host"):
-        Furhat(f":{port}").open()
+        Furhat(f":{free_tcp_port()}").open()
     with pytest.raises(OutputError, match="no host of the network has the name nowhere.invalid"):
         Furhat("nowhere.invalid").open()
     monkeypatch.setattr(websocket_peer, "CONNECT_S", 0.05)
