@@ -1,13 +1,14 @@
 """Motion on its way to an output: eased, limited, over losses; every time is an argument."""
 
 import logging
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 
 from sfms_robot.errors import ConfigError, OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, ListenerEvent
-from sfms_robot.outputs.registry import open_output, open_outputs, parse_address
+from sfms_robot.outputs.registry import open_output, parse_address
 from sfms_robot.outputs.sender import EASE_S, Outputs, OutputSender, OutputThread
 from sfms_robot.ports import ChannelLimit, Output, OutputFrame, Tick
 
@@ -201,18 +202,6 @@ def test_an_unknown_kind_names_the_kinds():
         open_output("vcm")
 
 
-def entry(name, value):
-    from importlib.metadata import EntryPoint
-
-    return EntryPoint(name, value, "sfms_robot.outputs")
-
-
-def test_two_of_one_kind_and_address_are_refused():
-    kept = entry("kept", f"{__name__}:Peer")
-    with pytest.raises(ConfigError, match=r"--output kept: here gets kept already"):
-        open_outputs(["kept", "kept"], [kept])
-
-
 def test_a_plug_in_that_gives_no_output_is_refused():
     with pytest.raises(ConfigError, match="gave a list, not an output"):
-        open_output("odd", [entry("odd", "builtins:list")])
+        open_output("odd", [EntryPoint("odd", "builtins:list", "sfms_robot.outputs")])

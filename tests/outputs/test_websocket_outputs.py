@@ -181,9 +181,16 @@ def test_vtube_studio_gets_degrees_and_shares_that_are_0_for_a_neutral_face_in_t
     assert (moved["EyeOpenLeft"], moved["EyeOpenRight"], moved["MouthSmile"]) == (0.0, 1.0, 1.0)
 
 
-@pytest.mark.parametrize("kind", ["reachy-mini-overlay", "vtube-studio-add", "vmc-single"])
-def test_one_program_gets_one_output(kind):
-    plain = kind.rpartition("-")[0]
+@pytest.mark.parametrize(
+    ("plain", "kind"),
+    [
+        ("reachy-mini", "reachy-mini-overlay"),
+        ("vtube-studio", "vtube-studio-add"),
+        ("vmc", "vmc-single"),
+        ("vmc", "vmc"),
+    ],
+)
+def test_one_program_gets_one_output(plain, kind):
     with pytest.raises(ConfigError, match=f"--output {kind}: 127.0.0.1:.* gets {plain} already"):
         open_outputs([plain, kind])
 

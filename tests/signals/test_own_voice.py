@@ -78,14 +78,6 @@ def test_frames_do_not_depend_on_how_the_stream_was_cut(sizes):
         assert one.voice == other.voice
 
 
-def test_no_frame_knows_what_comes_after_it():
-    n = 26 * 640
-    later = np.concatenate([HEARD[:n], noise(len(HEARD) - n, -20)])
-    for one, other in zip(OwnVoiceGate().push(HEARD, SAID)[: n // 640], OwnVoiceGate().push(later, SAID), strict=False):
-        np.testing.assert_array_equal(one.audio, other.audio)
-        assert one.voice == other.voice
-
-
 def test_echo_is_taken_away():
     said = own_speech(8.0)
     heard = echo_of(said) + noise(len(said), -75)
