@@ -24,7 +24,7 @@ from sfms_robot.outputs import websocket_peer
 from sfms_robot.outputs.furhat import Furhat, params_of
 from sfms_robot.outputs.reachy_mini import ReachyMini, ReachyMiniOverlay, antennas, body_yaw, following, in_reach
 from sfms_robot.outputs.registry import open_outputs
-from sfms_robot.outputs.sender import MotionShaper, OutputSender
+from sfms_robot.outputs.sender import MotionShaper
 from sfms_robot.outputs.vtube_studio import VtubeStudio, VtubeStudioAdd, inputs_of
 from sfms_robot.ports import OutputFrame
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
@@ -475,16 +475,3 @@ def test_a_daemon_that_says_nothing_any_more_is_lost():
         output.open()
         assert answered(output, frame_of(), output.link.heard_s, step_s=0.02) == "has sent nothing for 2 s"
         output.close()
-
-
-def test_a_lost_peer_is_connected_again_and_named_meanwhile():
-    fake = daemon()
-    sender = OutputSender(ReachyMiniOverlay(fake.address))
-    with fake:
-        sender.step(frame_of(pitch=0.1), 0.0)
-        assert not sender.lost
-    sender.step(frame_of(), 0.02)
-    sender.step(frame_of(), 0.04)
-    assert sender.lost and sender.statistics()["problem"] == "has closed the connection (1001)"
-    sender.step(frame_of(), 1.5)
-    assert sender.statistics()["problem"].startswith("connection refused: start reachy-mini-daemon")

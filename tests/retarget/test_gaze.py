@@ -61,12 +61,6 @@ def test_a_jump_takes_as_long_as_a_human_saccade_and_stays_where_it_lands(size_d
     assert path[0] == 0 and path[-1] == pytest.approx(size_deg) and np.all(np.diff(path) >= 0)
 
 
-def test_a_held_gaze_stays_still():
-    shown = lived(lambda t: looking(8.0, -3.0), 2.0)
-    assert np.ptp(shown, axis=(0, 1)).max() == 0
-    assert eyes_deg(shown[0, 0]) == pytest.approx([8.0, -3.0], abs=1e-4)
-
-
 def test_noise_inside_the_dead_zone_moves_no_eye():
     rng = np.random.default_rng(0)
     noise = rng.uniform(-0.4, 0.4, (400, 2))
