@@ -57,14 +57,6 @@ def test_every_recorded_packet_says_what_another_program_read_in_it_and_is_motio
         assert motion[:6] == pytest.approx([*angles, 0.0, 0.0, 0.0], abs=1e-6)  # radians, as they are
 
 
-def test_what_the_recording_itself_has_lost_is_counted():
-    decoder = LiveLinkDecoder()
-    for number, data in enumerate(PACKETS):
-        assert decoder.decode(data, number / 60) is not None
-    counted = {name: count for name, count in decoder.statistics().items() if count and name != "subject"}
-    assert counted == {"lost": 7}
-
-
 def test_the_head_of_a_packet_of_an_iphone():
     parsed = parse_packet(REAL_HEAD + bytes(61 * 4))
     assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)

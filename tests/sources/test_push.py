@@ -172,7 +172,6 @@ def test_a_face_by_names_is_seen_and_one_in_other_units_is_refused():
     for wrong, told in (
         ({"jawOpne": 1.0}, "'jawOpne' is not a channel; did you mean 'jawOpen'"),
         ({"yaw": 20.0}, r"yaw: expected radians \(in degrees\?\), got 20"),
-        (FaceFrame.of(0.0, np.r_[np.zeros(6), np.full(52, 80.0)]), r"browDownLeft: expected 0 to 1 \(in percent\?\)"),
         (np.full(58, np.nan), "roll is not finite"),
     ):
         with pytest.raises(ConfigError, match=told):

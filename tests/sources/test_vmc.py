@@ -70,14 +70,6 @@ def test_every_arkit_name_in_any_case_and_spelling(written):
     assert motion[SHAPES] == pytest.approx(values)
 
 
-def test_a_frame_may_come_in_many_packets_and_without_bundles():
-    decoder = VmcDecoder()
-    assert decoder.decode(blend("jawOpen", 0.5).dgram, 0.0) is None
-    assert decoder.decode(blend("eyeBlinkLeft", 1.0).dgram, 0.0) is None
-    motion = decoder.decode(APPLY.dgram, 0.0)
-    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == {"jawOpen", "eyeBlinkLeft"}
-
-
 @pytest.mark.parametrize(
     ("preset", "moves"),
     [
