@@ -218,6 +218,12 @@ def test_a_head_in_small_degrees_is_read_as_degrees_over_the_whole_file(tmp_path
     assert len(caplog.records) == 1 and "angles are taken as degrees" in caplog.text
 
 
+def test_percent_is_read_as_percent(tmp_path, caplog):
+    track = read_track(written(tmp_path / "a.csv", FACE, *([n / 25, 40, 0.5] for n in range(5))))
+    assert track.motion[0, JAW] == pytest.approx(0.4) and track.motion[0, BLINK] == pytest.approx(0.005)
+    assert "blendshapes are taken as percent" in caplog.text
+
+
 def test_declared_units_are_believed_beside_undeclared_ones(tmp_path):
     header = ["t_s", "yaw", "pitch_rad", "roll_deg"]
     motion = read_track(written(tmp_path / "a.csv", header, *([n / 25, 20, 0.3, 3] for n in range(9)))).motion

@@ -146,6 +146,19 @@ def test_a_program_that_falls_behind_is_named_once(caplog):
     assert person.source.statistics()["voice"]["pace"] == pytest.approx(0.87, abs=0.001)
 
 
+def test_bursts_are_named_and_then_heard_whole(caplog):
+    person, frames = Person(), []
+    for burst in range(30):
+        frames += person.read(burst * 0.4)
+        for piece in range(20):
+            person.voice.hear((burst * 6400 + piece * 320 + np.arange(320)) / 250_000, 16000)
+    sound = heard(frames[125:])
+    assert len(sound) == 640 * len(frames[125:])
+    assert np.diff(sound) == pytest.approx(1 / 250_000, abs=1e-5)
+    (said,) = caplog.records
+    assert said.getMessage().startswith("hear(): sound comes in bursts, up to 400 ms apart")
+
+
 def test_a_face_holds_for_a_quarter_of_a_second_and_can_be_lost():
     person = Person()
     person.sight.see(FaceFrame(123.0, np.ones(6, dtype=np.float32), np.full(52, 0.5, dtype=np.float32)))
