@@ -78,10 +78,6 @@ def test_no_two_classes_share_a_name(trees):
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_every_layer_has_a_rule(trees):
-    assert {layer_of(path) for path in trees} - {"__init__"} <= set(ALLOWED)
-
-
 def test_no_two_modules_import_one_another(trees):
     names = {path: tuple(path.removesuffix(".py").split("/")) for path in trees}
     parts = {name[:-1] if name[-1] == "__init__" else name: trees[path] for path, name in names.items()}

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from ended import PROGRAM
+from free_ports import free_tcp_port
 from tiny_sfms_training import configuration, write_dyads
 
 ROOT = Path(__file__).parents[1]
@@ -112,11 +112,8 @@ def test_commands_that_look_something_up_address_nobody(watched, words):
 
 @pytest.mark.slow
 def test_commands_that_listen_and_move_stay_here(watched):
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        port = found.getsockname()[1]
-    watched.run(
-        "run", "--head", HEAD, "--duration", "2", "--record", "kept", "--status", "0", "--agent-audio", f"tcp:{port}"
-    )
+    agent = f"tcp:{free_tcp_port()}"
+    watched.run("run", "--head", HEAD, "--duration", "2", "--record", "kept", "--status", "0", "--agent-audio", agent)
     watched.run("run", "--head", HEAD, "--duration", "2", "--view", "0")
     watched.run(
         "run", "--head", HEAD, "--fast", "--duration", "1", "--listener", "arig-small", "--agent-audio", "katie"

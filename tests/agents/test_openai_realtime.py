@@ -179,15 +179,3 @@ def test_events_come_in_the_event_loop_until_it_is_left():
 
     assert asyncio.run(first()) == NOD
     robot.decide(NOD)  # the loop has ended: nothing happens
-
-
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_a_running_head_speaks_an_answer_and_hushes(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    with sr.Robot("reachy_mini") as robot:
-        head = RealtimeHead(robot)
-        for event, speaks in ((delta(bytes([0, 40, 0, 200]) * 120_000), True), (STARTED, False)):
-            head.received(event)
-            assert any((robot.state == "speaking") is speaks or robot.wait(0.02) for _ in range(500))
-    assert robot.report()["limits"]["violations"] == 0

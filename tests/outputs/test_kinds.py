@@ -7,17 +7,18 @@ import socket
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
 from sfms_robot.errors import ConfigError, OutputError, PortError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, MOTION_DIM, SHAPES, ListenerEvent
-from sfms_robot.outputs.avatars import LARGEST_PACKET, LiveLinkOutput, VmcOutput, VmcSingleOutput, unity_quaternion
+from sfms_robot.outputs.avatars import LARGEST_PACKET, LiveLinkOutput, VmcOutput, VmcSingleOutput
 from sfms_robot.outputs.json_stream import MOST_CLIENTS, MOST_RECEIVED, JsonStream, json_of
 from sfms_robot.outputs.registry import KINDS, open_output
 from sfms_robot.ports import OutputFrame
 from sfms_robot.sources.live_link import LiveLinkDecoder, parse_packet
-from sfms_robot.sources.vmc import VmcDecoder, turn_of_unity
+from sfms_robot.sources.vmc import VmcDecoder
 
 
 def face(seed=0, turned=0.6):
@@ -49,22 +50,6 @@ def test_python_osc_reads_every_message_of_vmc():
     assert list(values) == list(BLENDSHAPES)
     assert list(values.values()) == pytest.approx(face().motion[SHAPES].tolist())
     assert messages[-1].address == "/VMC/Ext/Blend/Apply" and len(messages) == 59
-
-
-@pytest.mark.parametrize(
-    ("angles", "axis"),
-    # A nod turns about Unity's x, to the right; a turn to the left is one against its y, up.
-    [((0, 0.5, 0), (1, 0, 0)), ((0, 0, 0.5), (0, -1, 0)), ((0.5, 0, 0), (0, 0, -1))],
-)
-def test_turns_in_unitys_axes(angles, axis):
-    *vector, w = unity_quaternion(*angles)
-    assert vector == pytest.approx([math.sin(0.25) * each for each in axis]) and w == pytest.approx(math.cos(0.25))
-
-
-@pytest.mark.parametrize("share", [0.5, 0.3])
-def test_shares_of_a_turn_make_the_whole(share):
-    parts = [turn_of_unity(unity_quaternion(0.4, -0.9, 1.2, each)) for each in (share, 1 - share)]
-    assert parts[0] @ parts[1] == pytest.approx(turn_of_unity(unity_quaternion(0.4, -0.9, 1.2)))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -104,10 +89,7 @@ def test_packets_arrive_at_the_address(kind):
 
 @pytest.mark.parametrize("kind", ["vmc", "live-link"])
 def test_a_receiver_that_is_away_is_reported_on_this_machine(kind):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        port = receiver.getsockname()[1]
-    output = open_output(f"{kind}:{port}")
+    output = open_output(f"{kind}:{free_udp_port()}")
     output.open()
     with pytest.raises(OutputError, match="nothing listens there: start "):
         for _ in range(10):
@@ -188,8 +170,6 @@ def test_connections_that_stay_half_open_make_room(stream):
 
 
 def test_a_client_that_does_not_read_misses_frames_and_nothing_waits(stream):
-    host, _, port = stream.peer.partition(":")
-
     async def slow():
         from websockets.asyncio.client import connect as connect_async
 

@@ -5,9 +5,7 @@ once, so that what it reports can be compared with what was sent.
 """
 
 import json
-import logging
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -17,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from free_ports import free_tcp_port
 from websockets.sync.client import connect
 
 from sfms_robot.errors import OutputError
@@ -38,8 +37,7 @@ class Daemon:
     """The daemon on a port of its own. Its folder holds an app that only waits."""
 
     def __init__(self, folder):
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_tcp_port()
         self.address, self._folder, self._process = f"127.0.0.1:{self.port}", folder, None
         (folder / "radio.py").write_text("import signal\nsignal.pause()\n")
         about = folder / "radio-1.0.dist-info"
@@ -178,17 +176,3 @@ def test_an_app_that_drives_the_robot_stays_in_charge_and_an_overlay_is_added(da
         finish(sender)
         assert daemon.reported()[0] == pytest.approx(by_app, abs=2e-3)
     daemon.page("/api/apps/stop-current-app", "POST")
-
-
-def test_a_daemon_that_is_killed_is_named_once_and_found_again(daemon, caplog):
-    caplog.set_level(logging.INFO)
-    sender = OutputSender(ReachyMiniOverlay(daemon.address))
-    drive(sender, 1.0, lambda t: face_of(pitch=0.1))
-    daemon.kill()
-    drive(sender, 3.0, lambda t: face_of(pitch=0.1))
-    assert sender.lost and "start reachy-mini-daemon" in sender.statistics()["problem"]
-    daemon.start()
-    drive(sender, 9.0, lambda t: face_of(pitch=0.1))
-    assert not sender.lost and sender.statistics()["losses"] == 1
-    assert [record.levelname for record in caplog.records if "output" in record.message] == ["WARNING", "INFO"]
-    finish(sender)

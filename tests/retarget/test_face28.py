@@ -57,12 +57,6 @@ def test_every_region_can_be_turned_to_rest():
     assert moved.size == 0
 
 
-def test_channels_that_this_head_cannot_show_are_listed():
-    assert MAPPING.blind_channels == (
-        "x", "y", "z", "cheekPuff", "jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight",
-    )  # fmt: skip
-
-
 def test_every_joint_but_the_sideways_tongue_is_driven_to_a_good_part_of_its_range():
     rng = np.random.default_rng(0)
     motion = rng.choice([0.0, 1.0], (400, MOTION_DIM)).astype(np.float32)

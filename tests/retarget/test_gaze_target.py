@@ -5,38 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from life_rig import FULL_RAD, TICK_S, gaze_deg, head_deg, lived, still
 
 from sfms_robot.config import CameraMount, Gaze, Life, Person
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S
 from sfms_robot.ports import Watched
-from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.gaze import HeadTurn
-from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
+from sfms_robot.signals.gaze_kinematics import direction_to, turn
 from sfms_robot.signals.rotations import rotation
 
-TICK_S, LEADS_S = 0.01, np.array([0.0, 0.05, 0.08])
-FULL_RAD = np.radians([30.0, 20.0])
-HEAD = [CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]]
 BASE = CameraMount(on="base")
 HERE = (1.2, 0.0, 0.0)
 STEADY = Person(look_away=0)
 EYES = Gaze()
 
 
-def still(t):
-    return np.zeros(MOTION_DIM, np.float32)
-
-
-def lived(watched, seconds, person=STEADY, gaze=EYES, camera=BASE, seed=0, listener=still) -> np.ndarray:
-    """What is shown, (T, N, 58), of `watched(t, shown so far)`; N instants with leads a tick."""
-    alive = spontaneous.HeadLife(Life(gaze=gaze, person=person), seed, camera)
-    state, shown = spontaneous.LifeState(), []
-    for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
-        times_s = now_s + LEADS_S
-        asked = np.stack([listener(t) for t in times_s])
-        motion, state = alive.step(asked, times_s, now_s, state, watched=watched(now_s, shown))
-        shown.append(motion)
-    return np.array(shown)
+def aimed(watched, seconds, person=STEADY, gaze=EYES, camera=BASE, seed=0, listener=still) -> np.ndarray:
+    return lived(Life(gaze=gaze, person=person), seconds, listener, watched, seed, camera)
 
 
 def at(place_m):
@@ -50,21 +35,12 @@ def at(place_m):
     return watched
 
 
-def head_deg(shown) -> np.ndarray:
-    return np.degrees(shown[..., HEAD])
-
-
-def gaze_deg(shown) -> np.ndarray:
-    """Of head and eyes together, in space."""
-    return head_deg(shown) + np.degrees(directions(shown, FULL_RAD).mean(axis=-2))
-
-
 def beside(yaw_deg, metres=1.2):
     return (metres * math.cos(math.radians(yaw_deg)), metres * math.sin(math.radians(yaw_deg)), 0.0)
 
 
 def test_eyes_go_to_the_person_first_and_the_head_follows():
-    shown = lived(at(lambda t: HERE if t < 1 else beside(30)), 4.0)[:, 0]
+    shown = aimed(at(lambda t: HERE if t < 1 else beside(30)), 4.0)[:, 0]
     gaze, head = gaze_deg(shown)[:, 0], head_deg(shown)[:, 0]
     eyes_there, head_half = np.argmax(gaze > 29) * TICK_S, np.argmax(head > 9) * TICK_S
     assert 1.15 < eyes_there < 1.5  # as long as people take
@@ -78,7 +54,7 @@ def test_eyes_go_to_the_person_first_and_the_head_follows():
 def test_noise_of_a_tracker_moves_nothing():
     rng = np.random.default_rng(0)
     noise_m = rng.normal(0, 0.02, (3000, 3))
-    shown = lived(at(lambda t: beside(20) + noise_m[round(t / FRAME_S)]), 90.0)[300:]
+    shown = aimed(at(lambda t: beside(20) + noise_m[round(t / FRAME_S)]), 90.0)[300:]
     assert np.ptp(gaze_deg(shown), axis=(0, 1)).max() < 1e-3
     assert np.ptp(head_deg(shown[200:]), axis=(0, 1)).max() < 1e-3
 
@@ -89,13 +65,13 @@ def test_a_nod_of_the_listener_stays_a_nod():
         row[CHANNEL_INDEX["pitch"]] = math.radians(6) * math.sin(2 * math.pi * 1.5 * t)
         return row
 
-    shown = lived(at(beside(25)), 6.0, listener=nod)[300:]
+    shown = aimed(at(beside(25)), 6.0, listener=nod)[300:]
     assert np.ptp(head_deg(shown)[:, 0, 1]) == pytest.approx(12, abs=0.05)
     assert np.ptp(gaze_deg(shown), axis=(0, 1)).max() < 0.01  # at the person all the while
 
 
 def test_who_walks_is_followed():
-    shown = lived(at(lambda t: beside(min(10 * t, 40))), 6.0)[:, 0]
+    shown = aimed(at(lambda t: beside(min(10 * t, 40))), 6.0)[:, 0]
     t = TICK_S * np.arange(len(shown))
     behind = np.minimum(10 * t, 40) - gaze_deg(shown)[:, 0]
     assert np.abs(behind[100:]).max() < 7 and abs(behind[-1]) < 3
@@ -104,7 +80,7 @@ def test_who_walks_is_followed():
 def test_no_joint_jumps_whatever_its_lead():
     rng = np.random.default_rng(2)
     yaws = rng.uniform(-40, 40, 40)
-    shown = lived(at(lambda t: beside(yaws[int(t / 0.7)])), 20.0, person=Person(look_away=2))
+    shown = aimed(at(lambda t: beside(yaws[int(t / 0.7)])), 20.0, person=Person(look_away=2))
     assert np.abs(np.diff(gaze_deg(shown), axis=0)).max() / TICK_S < 1000  # a saccade of 80 degrees
     head = head_deg(shown)
     assert np.abs(np.diff(head, axis=0)).max() / TICK_S < 200
@@ -115,7 +91,7 @@ def test_the_head_goes_back_slowly_when_the_person_has_gone_looks_around_and_fin
     def watched(t, shown):
         return at(beside(30))(min(t, 3.0) if t < 30 else t, shown)
 
-    shown = lived(watched, 34.0)[:, 0]
+    shown = aimed(watched, 34.0)[:, 0]
     gaze, head = gaze_deg(shown)[:, 0], head_deg(shown)[:, 0]
     assert gaze[400] == pytest.approx(30, abs=0.1)  # a second without a face is nothing
     assert abs(head[700]) < 12
@@ -123,14 +99,14 @@ def test_the_head_goes_back_slowly_when_the_person_has_gone_looks_around_and_fin
 
 
 def test_nobody_left_is_looked_for():
-    shown = lived(lambda t, shown: Watched(seen_s=min(t, 1.0)), 60.0, person=Person())[:, 0]
+    shown = aimed(lambda t, shown: Watched(seen_s=min(t, 1.0)), 60.0, person=Person())[:, 0]
     assert np.ptp(gaze_deg(shown[:300])[:, 0]) < 1
     assert np.ptp(head_deg(shown[400:])[:, 0]) > 10
 
 
 def test_without_a_face_ever_or_a_camera_the_person_is_straight_ahead():
     for watched, camera in ((lambda t, shown: Watched(), BASE), (at(beside(30)), None)):
-        assert not lived(watched, 5.0, camera=camera).any()
+        assert not aimed(watched, 5.0, camera=camera).any()
 
 
 def test_a_camera_on_the_head_sees_one_person_while_the_neck_turns():
@@ -144,7 +120,7 @@ def test_a_camera_on_the_head_sees_one_person_while_the_neck_turns():
         pose = shown[round(seen_s / TICK_S)][0, :6].astype(float)
         return Watched(seen_s=seen_s, place_m=(person_m - pose[3:]) @ rotation(pose[:3]) - mount.at_m)
 
-    gaze = gaze_deg(lived(watched, 4.0, camera=mount)[:, 0])
+    gaze = gaze_deg(aimed(watched, 4.0, camera=mount)[:, 0])
     assert gaze[-1] == pytest.approx(np.degrees(direction_to(person_m)), abs=0.1)
     moving = np.abs(np.diff(gaze[:, 0])) > 0.01
     assert np.count_nonzero(moving[1:] & ~moving[:-1]) == 1  # one jump
@@ -159,23 +135,23 @@ def test_what_is_asked_by_hand_is_not_moved_aside():
     def watched(t, shown):
         return replace(at(beside(30))(t, shown), by_hand=t > 2)
 
-    shown = lived(watched, 5.0, person=Person(look_away=2), listener=lambda t: point(t) if t > 2 else still(t))
+    shown = aimed(watched, 5.0, person=Person(look_away=2), listener=lambda t: point(t) if t > 2 else still(t))
     assert gaze_deg(shown)[-100:] == pytest.approx(np.full((100, 3, 2), [-10.0, 0.0]), abs=0.05)
 
 
 def test_a_head_without_eyes_turns_all_the_way_and_one_without_a_neck_not_at_all():
-    assert head_deg(lived(at(beside(30)), 4.0, gaze=None))[-1, 0, 0] == pytest.approx(30, abs=0.1)
-    shown = lived(at(beside(20)), 4.0, gaze=Gaze(neck_gain=0))
+    assert head_deg(aimed(at(beside(30)), 4.0, gaze=None))[-1, 0, 0] == pytest.approx(30, abs=0.1)
+    shown = aimed(at(beside(20)), 4.0, gaze=Gaze(neck_gain=0))
     assert not head_deg(shown).any() and gaze_deg(shown)[-1, 0, 0] == pytest.approx(20, abs=0.1)
 
 
 def test_nothing_is_aimed_at_where_the_section_is_left_out():
-    assert not lived(at(beside(30)), 2.0, person=None).any()
+    assert not aimed(at(beside(30)), 2.0, person=None).any()
 
 
 def test_one_seed_is_one_life():
     talking = lambda t, shown: Watched(said_s=t)  # noqa: E731
-    one, same, other = (lived(talking, 20.0, person=Person(), seed=seed) for seed in (3, 3, 4))
+    one, same, other = (aimed(talking, 20.0, person=Person(), seed=seed) for seed in (3, 3, 4))
     assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
@@ -204,7 +180,7 @@ def looks(gaze: np.ndarray) -> tuple[float, float, float]:
 @pytest.mark.parametrize(("said", "share", "shifts"), [(False, (0.92, 0.98), (4, 11)), (True, (0.5, 0.7), (38, 58))])
 def test_ten_minutes_of_looking_away_are_those_of_people(said, share, shifts):
     """Medians of 14 people: 95 % and 60 % within 5 degrees, 7 and 49 shifts a minute."""
-    gaze = gaze_deg(lived(lambda t, shown: Watched(said_s=t if said else -1.0), 600.0, person=Person())[:, 0])
+    gaze = gaze_deg(aimed(lambda t, shown: Watched(said_s=t if said else -1.0), 600.0, person=Person())[:, 0])
     at_person, shifts_per_minute, away_s = looks(gaze)
     assert share[0] < at_person < share[1]
     assert shifts[0] < shifts_per_minute < shifts[1]
@@ -218,6 +194,6 @@ def test_a_listener_that_looks_aside_often_enough_is_left_alone():
         turn(row, np.radians([[10.0 if t % 10 < 0.8 else 0.0, 0.0]] * 2), FULL_RAD)
         return row
 
-    person = lived(lambda t, shown: Watched(), 120.0, person=Person(), listener=aside)
-    nobody = lived(lambda t, shown: Watched(), 120.0, person=STEADY, listener=aside)
+    person = aimed(lambda t, shown: Watched(), 120.0, person=Person(), listener=aside)
+    nobody = aimed(lambda t, shown: Watched(), 120.0, person=STEADY, listener=aside)
     assert np.array_equal(person, nobody)

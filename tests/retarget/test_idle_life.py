@@ -4,29 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from life_rig import LEADS_S, PITCH, YAW, lived, still
 
 from sfms_robot.config import Idle, Life
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.retarget import spontaneous
 from sfms_robot.retarget.spontaneous import CLOSED_S, CLOSING_S, OPENING_S
 
-TICK_S, LEADS_S = 0.02, np.array([0.0, 0.03, 0.06])
-BLINK, YAW, PITCH = CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]
+TICK_S = 0.02
+BLINK = CHANNEL_INDEX["eyeBlinkLeft"]
 
 
-def lived(listener, seconds: float, seed: int = 0, **idle) -> np.ndarray:
-    """What is shown, (T, N, 58), of a listener given as a function of time."""
-    alive = spontaneous.HeadLife(Life(idle=Idle(**idle)), seed)
-    state, shown = spontaneous.LifeState(), []
-    for now_s in TICK_S * np.arange(round(seconds / TICK_S)):
-        times_s = now_s + LEADS_S
-        motion, state = alive.step(np.stack([listener(t) for t in times_s]), times_s, now_s, state)
-        shown.append(motion)
-    return np.array(shown)
-
-
-def still(t: float) -> np.ndarray:
-    return np.zeros(MOTION_DIM, np.float32)
+def idled(listener, seconds: float, seed: int = 0, **idle) -> np.ndarray:
+    return lived(Life(idle=Idle(**idle)), seconds, listener, seed=seed, tick_s=TICK_S)
 
 
 def blinking(every_s: float):
@@ -51,7 +41,7 @@ def test_with_everything_left_out_the_face_is_untouched():
 
 def test_with_every_kind_at_zero_the_face_is_the_same():
     motion = np.random.default_rng(0).uniform(0, 1, MOTION_DIM).astype(np.float32)
-    shown = lived(lambda t: motion, 10.0, blinks_per_minute=0, head_deg=0, glance_deg=0)
+    shown = idled(lambda t: motion, 10.0, blinks_per_minute=0, head_deg=0, glance_deg=0)
     others = [i for i in range(MOTION_DIM) if not 16 <= i < 24]  # eye channels that pull both ways are evened out
     assert np.array_equal(shown[..., others], np.broadcast_to(motion[others], shown[..., others].shape))
 
@@ -68,13 +58,13 @@ def test_the_input_is_not_changed():
 @pytest.mark.parametrize("every_s", [1.0, 2.5, 60 / 14])
 def test_a_listener_that_blinks_enough_gets_no_blink_added(every_s):
     listener = blinking(every_s)
-    shown = lived(listener, 60.0, head_deg=0, glance_deg=0)
+    shown = idled(listener, 60.0, head_deg=0, glance_deg=0)
     wanted = np.array([[listener(k * TICK_S + lead) for lead in LEADS_S] for k in range(len(shown))])
     assert np.array_equal(shown[..., BLINK], wanted[..., BLINK])
 
 
 def test_a_listener_that_never_blinks_gets_the_wanted_rate():
-    per_minute = np.mean([blinks(lived(still, 210.0, seed)[1500:]) / 3.0 for seed in range(2)])
+    per_minute = np.mean([blinks(idled(still, 210.0, seed)[1500:]) / 3.0 for seed in range(2)])
     assert 10 < per_minute < 18
 
 
@@ -82,13 +72,13 @@ def test_own_blinks_fade_out_when_the_listener_begins_to_blink():
     def late(t: float) -> np.ndarray:
         return blinking(3.0)(t) if t > 60 else still(t)
 
-    shown = lived(late, 120.0)
+    shown = idled(late, 120.0)
     assert blinks(shown[: round(60 / TICK_S)]) > 5
     assert blinks(shown[round(75 / TICK_S) :]) == pytest.approx(45 / 3, abs=1)
 
 
 def test_a_blink_closes_in_the_time_it_takes_people_and_never_jumps():
-    shown = lived(still, 60.0, head_deg=0, glance_deg=0)[..., BLINK]
+    shown = idled(still, 60.0, head_deg=0, glance_deg=0)[..., BLINK]
     assert shown.max() == 1.0 and np.abs(np.diff(shown, axis=0)).max() < 1.9 * TICK_S / CLOSING_S
     first = np.argmax(shown[:, 0] > 0)
     length = np.argmax(shown[first:, 0] == 0) * TICK_S
@@ -101,7 +91,7 @@ def test_the_head_sways_while_the_listener_is_still_and_stops_when_it_moves():
         row[PITCH] = 0.1 * math.sin(2 * math.pi * t) if t > 20 else 0.0
         return row
 
-    shown = np.degrees(lived(nods_from_20_s, 30.0, head_deg=1.2)[:, 0, : YAW + 1])
+    shown = np.degrees(idled(nods_from_20_s, 30.0, head_deg=1.2)[:, 0, : YAW + 1])
     before, after = shown[: round(20 / TICK_S)], shown[round(22 / TICK_S) :]
     assert 0.3 < np.abs(before[:, YAW]).max() <= 1.2 and np.abs(before[:, PITCH]).max() <= 0.8
     assert np.abs(after[:, YAW]).max() < 1e-3
@@ -116,12 +106,12 @@ def test_eyes_glance_about_only_when_the_listener_gives_no_gaze():
         row[CHANNEL_INDEX["eyeLookOutLeft"]] = row[CHANNEL_INDEX["eyeLookInRight"]] = 0.5 + 0.4 * math.sin(3 * t)
         return row
 
-    assert 0 < lived(still, 20.0)[..., eyes].max() <= 3.0 / 20 + 1e-6
-    shown = lived(wandering, 20.0, fade_s=4.0)
+    assert 0 < idled(still, 20.0)[..., eyes].max() <= 3.0 / 20 + 1e-6
+    shown = idled(wandering, 20.0, fade_s=4.0)
     wanted = np.array([[wandering(k * TICK_S + lead) for lead in LEADS_S] for k in range(len(shown))])
     assert shown[..., eyes] == pytest.approx(wanted[..., eyes], abs=0.01)
 
 
 def test_one_seed_gives_one_life_and_another_seed_another():
-    once, again, other = (lived(still, 30.0, seed) for seed in (7, 7, 8))
+    once, again, other = (idled(still, 30.0, seed) for seed in (7, 7, 8))
     assert np.array_equal(once, again) and not np.array_equal(once, other)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sfms_robot.frames import POSE_CHANNELS
 from sfms_robot.signals import rotations
 
 turns = st.floats(-3.0, 3.0)
@@ -17,13 +16,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 def any_rotations(seed: int, count: int = 50) -> np.ndarray:
     return Rotation.from_rotvec(np.random.default_rng(seed).normal(size=(count, 3)) * 1.5).as_matrix()
-
-
-def test_pose_columns_are_those_of_the_frames_and_rotate_as_the_frames_say():
-    roll, pitch, yaw = 0.3, -0.2, 0.9
-    by_hand = rotations.about(2, yaw) @ rotations.about(1, pitch) @ rotations.about(0, roll)
-    assert POSE_CHANNELS == ("roll", "pitch", "yaw", "x", "y", "z")
-    assert rotations.rotation(np.array([roll, pitch, yaw])) == pytest.approx(by_hand, abs=1e-15)
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-1.57, 1.57), st.floats(-np.pi, np.pi))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from life_rig import FULL_RAD
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.config.head import held_back
@@ -14,7 +15,6 @@ from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.signals.gaze_kinematics import directions
 from sfms_robot.signals.rotations import rotation
 
-FULL_RAD = np.radians([30.0, 20.0])
 HEADS = {name: load_head(name) for name in head_names()}
 HEADS |= {f"{name}, cautious": held_back(head) for name, head in list(HEADS.items())}
 RECENTRE_DEG = 400.0  # they never jump back to where the face has them

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -207,14 +208,8 @@ class Bytes(Decoder):
         return out
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def opened(place=None, decoder=None):
-    return UdpSight("test", str(place or free_port()), 1, decoder or Bytes(), lambda *_: "call 42")
+    return UdpSight("test", str(place or free_udp_port()), 1, decoder or Bytes(), lambda *_: "call 42")
 
 
 @pytest.fixture

@@ -2,13 +2,13 @@
 
 import csv
 import gzip
-import socket
 import struct
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -42,45 +42,24 @@ def packet(number=100, values=(0.25,) * 61, version=6, device=b"id", subject=b"p
 # --- one packet -------------------------------------------------------------------------------------------------
 
 
-def test_every_recorded_packet_says_what_another_program_read_in_it():
+def test_every_recorded_packet_says_what_another_program_read_in_it_and_is_motion_by_name():
     rows = decoded()
     assert len(rows) == len(PACKETS) == 180
     for data, row in zip(PACKETS, rows, strict=True):
         parsed = parse_packet(data)
-        told = [float(value) for name, value in row.items() if name != "t_s"]
-        assert parsed.values == pytest.approx(told, abs=1e-6)
+        told = {name: float(value) for name, value in row.items() if name != "t_s"}
+        assert parsed.values == pytest.approx(list(told.values()), abs=1e-6)
         assert (parsed.subject, parsed.rate_hz) == ("LLV Default Device", 60)
-
-
-def test_motion_of_every_recorded_packet_goes_by_name():
-    for data, row in zip(PACKETS, decoded(), strict=True):
-        motion = motion_of(parse_packet(data).values)
-        for name in ORDERS["apple"]:
-            expected = min(max(float(row[name[0].upper() + name[1:]]), 0), 1)
-            assert motion[CHANNEL_INDEX[name]] == pytest.approx(expected, abs=1e-6)
-        angles = [float(row[name]) for name in ("HeadRoll", "HeadPitch", "HeadYaw")]
-        assert motion[:3] == pytest.approx(angles, abs=1e-6)  # radians, as they are
-        assert not motion[3:6].any()
-
-
-def test_what_the_recording_itself_has_lost_is_counted():
-    decoder = LiveLinkDecoder()
-    for number, data in enumerate(PACKETS):
-        assert decoder.decode(data, number / 60) is not None
-    counted = {name: count for name, count in decoder.statistics().items() if count and name != "subject"}
-    assert counted == {"lost": 7}
+        motion = motion_of(parsed.values)
+        shapes = [min(max(told[name[0].upper() + name[1:]], 0), 1) for name in ORDERS["apple"]]
+        assert motion[[CHANNEL_INDEX[name] for name in ORDERS["apple"]]] == pytest.approx(shapes, abs=1e-6)
+        angles = [told[name] for name in ("HeadRoll", "HeadPitch", "HeadYaw")]
+        assert motion[:6] == pytest.approx([*angles, 0.0, 0.0, 0.0], abs=1e-6)  # radians, as they are
 
 
 def test_the_head_of_a_packet_of_an_iphone():
     parsed = parse_packet(REAL_HEAD + bytes(61 * 4))
     assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)
-
-
-def test_names_of_any_script():
-    assert parse_packet(packet(subject="電話".encode())).subject == "電話"
-    wide = struct.pack(">i", -2) + "電話".encode("utf-16-be")
-    plain = packet(subject=b"")
-    assert parse_packet(plain[:7] + wide + plain[11:]).subject == "電話"
 
 
 @pytest.mark.parametrize(
@@ -91,7 +70,6 @@ def test_names_of_any_script():
         (packet()[:3], "cut off"),
         (packet(values=(0.0,) * 51), "51 values, of which the first 52 have to be blendshapes"),
         (packet(values=(float("nan"),) * 61), "not finite"),
-        (packet(values=(float("inf"),) * 61), "not finite"),
         (packet(version=5)[:-1], "version 5, not 6.*update"),
         (b"mouthSmile_R-42|jawOpen-12|=head#-21,-6,-6|", "iFacialMocap's own format"),
         (b"/VMC/Ext/OK\0,i\0\0\0\0\0\1", "--face vmc takes it"),
@@ -135,17 +113,26 @@ def test_what_a_face_does_not_need_refuses_no_packet(data, rate_hz):
 def test_a_names_length_may_be_in_characters(name, code):
     data, plain = name.encode(code), packet(subject=b"")
     length = len(name) if code == "utf-8" else -len(name)
+    assert parse_packet(packet(subject=name.encode())).subject == name
     parsed = parse_packet(plain[:7] + struct.pack(">i", length) + data + plain[11:])
     assert (parsed.subject, parsed.number, parsed.values[0]) == (name, 100, 0.25)
 
 
-@given(st.integers(0, 179), st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20))
-def test_a_damaged_packet_is_refused_or_finite(which, damage):
+def damaged(which, damage, kept):
+    """A recorded packet with other bytes at some places, cut off after so many."""
     data = bytearray(PACKETS[which])
     for place, value in damage:
         data[place] = value
+    return bytes(data[:kept])
+
+
+DAMAGE = st.lists(st.tuples(st.integers(0, 319), st.integers(0, 255)), max_size=20)
+
+
+@given(st.binary(max_size=600) | st.builds(damaged, st.integers(0, 179), DAMAGE, st.just(320) | st.integers(0, 320)))
+def test_any_bytes_are_refused_or_finite(data):
     try:
-        values = parse_packet(bytes(data)).values
+        values = parse_packet(data).values
     except PacketError:
         return
     assert values is None or (np.isfinite(values).all() and np.isfinite(motion_of(values)).all())
@@ -193,19 +180,15 @@ def test_faces_are_always_in_order_whatever_the_network_does(numbers):
     assert seen == sorted(seen) and seen[-1] == 11
 
 
-def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows_none():
+@pytest.mark.parametrize("values", [(0.1, 0.2, 0.3), (0.25,) * 30], ids=["moves", "is still"])
+def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows_none(values):
     decoder = LiveLinkDecoder()
-    for number, value in enumerate((0.1, 0.2, 0.3)):
+    for number, value in enumerate(values):
         assert decoder.decode(packet(0, (value,) * 61), number / 60) is not None
-    assert decoder.decode(packet(1, values=()), 0.1) is None
+    assert decoder.remark() is None
+    assert decoder.decode(packet(1, values=()), 1.0) is None
     counted = decoder.statistics()
     assert (counted["doubled"], counted["lost"], counted["no_face"]) == (0, 0, 1)
-
-
-def test_a_still_face_of_a_program_that_does_not_count_is_a_face_again_and_again():
-    decoder = LiveLinkDecoder()
-    assert all(decoder.decode(packet(0), number / 30) is not None for number in range(30))
-    assert decoder.remark() is None
 
 
 def test_what_is_not_used_of_a_sender_is_named():
@@ -220,16 +203,10 @@ def test_what_is_not_used_of_a_sender_is_named():
 
 @pytest.fixture
 def sight():
-    opened = open_live_link("127.0.0.1:" + str(free_port()))
+    opened = open_live_link("127.0.0.1:" + str(free_udp_port()))
     opened.start(0.0)
     yield opened
     opened.close()
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_an_emulated_phone_is_seen(sight):
@@ -262,7 +239,7 @@ def test_pose_channels_are_flipped_on_request():
     values = np.zeros(61, np.float32)
     poses = {}
     for flip in ("", ",flip=yaw+roll"):
-        opened = open_live_link(f"127.0.0.1:{free_port()}{flip}")
+        opened = open_live_link(f"127.0.0.1:{free_udp_port()}{flip}")
         opened.feed(Datagram(packet(1, values), ("192.0.2.1", 1), 0.0))
         opened.feed(Datagram(packet(61, values), ("192.0.2.1", 1), 1.0))  # straight ahead
         assert opened.at(1.0).face.pose[:3] == pytest.approx([0, 0, 0])
@@ -273,32 +250,9 @@ def test_pose_channels_are_flipped_on_request():
     assert poses[",flip=yaw+roll"] == pytest.approx([-0.1, 0.2, -0.3], abs=0.02)
 
 
-@pytest.mark.slow
-def test_a_million_packets_of_noise_never_raise(sight):
-    """Through a real socket: whole, damaged, cut, random; what is left of them are counts."""
-    random = np.random.default_rng(0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        for number in range(1_000_000):
-            data = bytearray(renumbered(PACKETS[number % 180], number & 0x7FFFFFFF))
-            kind = number % 4
-            if kind == 1:
-                data[random.integers(len(data))] = random.integers(256)
-            elif kind == 2:
-                del data[random.integers(len(data)) :]
-            elif kind == 3:
-                data = bytearray(random.bytes(int(random.integers(600))))
-            out.sendto(data, sight.address)
-            while number % 16 == 15 and sight.statistics()["packets"] <= number:
-                sight.at(1e9)
-    counts = sight.statistics()
-    assert counts["packets"] == 1_000_000
-    assert 450_000 < counts["malformed"] < 750_000
-    assert np.isfinite(sight.at(1e9).face.motion).all()
-
-
 def test_the_log_says_what_to_type_in_the_app(caplog):
     caplog.set_level(NOTE)
-    port = free_port()
+    port = free_udp_port()
     opened = open_live_link(str(port))
     assert opened.address == ("127.0.0.1", port)
     opened.close()

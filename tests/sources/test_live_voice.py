@@ -20,9 +20,9 @@ TONE_HZ = 10.0  # its phase tells the time within 50 ms either way
 class Card:
     """A sound card with a clock of its own, whose callbacks come late by up to `jitter_s`."""
 
-    def __init__(self, rate_hz, ppm=0.0, jitter_s=0.0, seed=0, tone_hz=TONE_HZ, channels=None):
+    def __init__(self, rate_hz, ppm=0.0, jitter_s=0.0, seed=0, tone_hz=TONE_HZ):
         self.rate_hz, self.true_hz = rate_hz, rate_hz * (1 + ppm * 1e-6)
-        self.jitter_s, self.tone_hz, self.channels = jitter_s, tone_hz, channels
+        self.jitter_s, self.tone_hz = jitter_s, tone_hz
         self.rng, self.count, self.away_s, self.called_s = np.random.default_rng(seed), 0, 0.0, 0.0
 
     def piece(self, n, late_s=0.0):
@@ -30,8 +30,7 @@ class Card:
         times_s = (self.count + 1 + np.arange(n)) / self.true_hz + self.away_s
         self.count += n
         self.called_s = max(self.called_s, times_s[-1] + late_s + self.rng.uniform(0, self.jitter_s))
-        sound = (0.5 * np.sin(2 * np.pi * self.tone_hz * times_s)).astype(np.float32)
-        return (sound if self.channels is None else np.tile(sound[:, None], self.channels)), self.called_s
+        return (0.5 * np.sin(2 * np.pi * self.tone_hz * times_s)).astype(np.float32), self.called_s
 
 
 def played(card, sizes, seconds, away=None, wait_s=LONGEST_WAIT_S):
@@ -182,12 +181,6 @@ def test_what_was_heard_before_the_start_is_dropped_and_has_taught_the_clock():
     frames = [voice.take(index) for index in range(40)]
     assert not any(frame is None for frame in frames)
     assert np.abs(offsets_s(frames, 1)).max() < 0.002
-
-
-@pytest.mark.parametrize("channels", [1, 2, 16])
-def test_channels_are_averaged(channels):
-    one, many = (played(Card(48000, channels=n), pieces(480), 1)[1] for n in (None, channels))
-    np.testing.assert_allclose(np.concatenate(many), np.concatenate(one), atol=1e-6)
 
 
 def test_another_rate_begins_anew():

@@ -78,7 +78,6 @@ def test_a_hello_says_what_it_feeds_and_wants():
         (HEADER.pack(FACE, 1, 0, 0, 0, 0) + bytes(4 * 57), "a face of 228 bytes, not of 58 or 59 float32"),
         (HEADER.pack(FACE, 1, 0, 0, 0, 0) + np.full(58, np.inf, "<f4").tobytes(), "not finite"),
         (face_message(0, 0, [20.0] * 58), r"a face left out: roll: expected radians \(in degrees\?\), got 20"),
-        (face_message(0, 0, [0.0] * 6 + [80.0] * 52), r"expected 0 to 1 \(in percent\?\), got 80"),
         (b'{"type": "hello"', "Invalid JSON: EOF"),
         (b'{"a":' * 700, "Invalid JSON: recursion limit"),
         (b"{" + b" " * 5000, "JSON of more than 4096 bytes"),
@@ -88,10 +87,7 @@ def test_a_hello_says_what_it_feeds_and_wants():
             b'{"type": "hello", "version": 1, "feeds": ["voices"]}',
             "hello.feeds.0 = 'voices': Input should be 'voice', 'face' or 'speech'",
         ),
-        (b'{"type": "hello", "version": 1, "feeds": "voice"}', "hello.feeds = 'voice': "),
-        (b'{"type": "hello", "version": 1, "wants": [[]]}', "hello.wants.0: Input should be 'microphone' or 'events'"),
         (b'{"type": "hello", "version": 1, "name": "a\\nb"}', "hello.name = .* printable"),
-        (b'{"type": "hello", "version": 1, "token": 5}', "hello.token = 5: Input should be a valid string"),
     ],
 )
 def test_what_is_no_message_is_one_line(data, told):

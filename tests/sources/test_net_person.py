@@ -247,7 +247,6 @@ def test_malformed_messages_are_counted_and_said_once_the_next_is_read_and_too_m
     looked_at(run, 5)
     assert run.told["malformed"] == 3
     assert len([record for record in caplog.records if "shorter than a header" in record.message]) == 1
-    assert run.speech.take(1).any()
     try:
         for _ in range(net_server.MOST_MALFORMED + 50):
             program.send(b"\x07 noise")
@@ -255,6 +254,7 @@ def test_malformed_messages_are_counted_and_said_once_the_next_is_read_and_too_m
         pass
     last_words(program)
     assert run.told["malformed"] == net_server.MOST_MALFORMED + 1
+    assert run.speech.take(1).any()
 
 
 @BOTH
@@ -365,15 +365,13 @@ def test_no_more_programs_than_there_is_room_for(run):
         assert last_words(Tcp(run, wants=["events"])) is None
 
 
-def test_sound_that_is_too_fast_and_old_sound_and_faces_are_left_out(run):
+def test_old_sound_and_faces_are_left_out(run):
     program = joined(Tcp(run, feeds=["voice", "face"]))
     program.send(sound_message(VOICE, 16000, 50.0, 50.0, SECOND[:640]))
     program.send(sound_message(VOICE, 16000, 50.0, 48.0, SECOND[:640]))
     program.send(face_message(50.0, 48.0, np.zeros(58)))
-    for _ in range(10):
-        program.send(sound_message(VOICE, 16000, 0, 0, SECOND))
     all_looked_at(program)
-    assert (run.told["old"], run.told["too_fast"]) == (2, 9)
+    assert run.told["old"] == 2
 
 
 def test_a_hush_ends_what_is_still_to_be_said(run):
@@ -542,8 +540,6 @@ def test_what_a_visitor_did_not_announce_is_refused():
 
 
 def test_a_visitor_who_has_gone_is_lost_until_another_comes():
-    with pytest.raises(ConfigError, match="there is no page"):
-        open_source("none", "browser")
     here = Here()
     assert open_source("browser", "browser", visitor=here.visitor).duration_s is None
     assert not here.voice.lost and not here.sight.lost  # no visitor yet: none is missed

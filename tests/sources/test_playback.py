@@ -35,10 +35,10 @@ class VirtualDevice:
     """A sound card with a clock of its own: what it is handed leaves sample by sample, `latency_s` later.
 
     Attributes:
-        left_s, left: when each sample left, in loop time, and what it was.
+        left_s, left: when each sample of the last run left, in loop time, and what it was.
     """
 
-    def __init__(self, rate_hz, ppm=0.0, latency_s=0.06, begins_s=-0.5, jitter=None, says=tone):
+    def __init__(self, rate_hz, ppm=0.0, latency_s=LATENCY_S, begins_s=-0.5, jitter=None, says=tone):
         self.playout, self._says = Playout(rate_hz), says
         self._true_hz = rate_hz * (1 + ppm * 1e-6)
         self._latency_s, self._jitter = latency_s, jitter or (lambda: 0.0)
@@ -52,22 +52,26 @@ class VirtualDevice:
         self._leaves_s += for_s
         self._dry = True
 
-    def play(self, until_s, ahead_s=0.4):
-        """Blocks until loop time `until_s`; the tone is told so far ahead of what leaves."""
-        said_s = [], []
+    def run(self, until_s, before=lambda now_s: None):
+        """Blocks until loop time `until_s`, `before(now)` each of them."""
+        left_s, left = [np.zeros(0)], [np.zeros(0, np.float32)]
         while self._leaves_s - self._latency_s < until_s:
-            now_s = self._leaves_s - self._latency_s
+            before(self._leaves_s - self._latency_s)
+            left.append(self.playout.block(self._n, ORIGIN_S + self._leaves_s + self._jitter(), self._dry))
+            left_s.append(self._leaves_s + np.arange(self._n) / self._true_hz)
+            self._leaves_s, self._dry = self._leaves_s + self._n / self._true_hz, False
+        self.left_s, self.left = np.concatenate(left_s), np.concatenate(left)
+
+    def play(self, until_s, ahead_s=0.4):
+        """Run until `until_s`; the tone is told so far ahead of what leaves."""
+
+        def tell(now_s):
             first = max(0, math.floor(now_s / FRAME_S))
             frames = max(1, round(ahead_s / FRAME_S))
             said = self._says(np.arange(first * FRAME_SAMPLES, (first + frames) * FRAME_SAMPLES))
             self.playout.tell(first, said.astype(np.float32))
-            stamp_s = ORIGIN_S + self._leaves_s + self._jitter()
-            block = self.playout.block(self._n, stamp_s, self._dry)
-            said_s[0].append(self._leaves_s + np.arange(self._n) / self._true_hz)
-            said_s[1].append(block)
-            self._leaves_s, self._dry = self._leaves_s + self._n / self._true_hz, False
-        self.left_s, self.left = np.concatenate(said_s[0]), np.concatenate(said_s[1])
-        return self
+
+        self.run(until_s, tell)
 
     def off_s(self, after_s):
         """How far what left is from what was due, as time, at worst, from loop time `after_s` on."""
@@ -181,24 +185,22 @@ class VirtualLoudspeaker:
     """
 
     def __init__(self):
-        self.now_s = self._origin_s = 50.0
-        self._playout = Playout(AUDIO_HZ)
+        self.now_s, self.lost = ORIGIN_S, False
+        self.device = VirtualDevice(AUDIO_HZ, begins_s=0.0)
         self._messages = [PlaybackOpened("virtual", AUDIO_HZ, LATENCY_S)]
-        self._leaves_s = self.now_s + LATENCY_S
-        self._dry = False
         self._told = None
-        self.lost = False
         self.left = np.zeros(20 * AUDIO_HZ, np.float32)
 
     def tell(self, value):
         if self._told is None:
-            self._playout.start(value.origin_s)
+            self.device.playout.start(value.origin_s)
         self._told = value
-        self._playout.tell(value.first, value.samples)
+        self.device.playout.tell(value.first, value.samples)
 
     def messages(self, now_s):
-        told, self._messages = [*self._messages, *self._playout.silences], []
-        self._playout.silences.clear()
+        silences = self.device.playout.silences
+        told, self._messages = [*self._messages, *silences], []
+        silences.clear()
         return told
 
     def statistics(self):
@@ -207,17 +209,10 @@ class VirtualLoudspeaker:
     def close(self):
         self.lost = True
 
-    def starve(self, for_s):
-        self._leaves_s += for_s
-        self._dry = True
-
     def tick(self):
         self.now_s += TICK_S
-        while self._leaves_s - LATENCY_S < self.now_s:
-            block = self._playout.block(160, self._leaves_s, self._dry)
-            at = round((self._leaves_s - self._origin_s) * AUDIO_HZ)
-            self.left[at : at + 160] = block
-            self._leaves_s, self._dry = self._leaves_s + 0.01, False
+        self.device.run(self.now_s - ORIGIN_S)
+        self.left[np.rint(self.device.left_s * AUDIO_HZ).astype(int)] = self.device.left
 
 
 class Desk:
@@ -239,7 +234,7 @@ class Desk:
 
     @property
     def loop_s(self):
-        return self.loudspeaker.now_s - 50.0
+        return self.loudspeaker.now_s - ORIGIN_S
 
     def until(self, loop_s):
         while self.loop_s < loop_s - 1e-9:
@@ -301,7 +296,7 @@ def test_a_sentence_in_pieces_is_one_sentence_and_leaves_at_its_time(at_s):
     spoken, desk = talk()
     said = noise(0.3)
     for at in range(0, len(said), 320):
-        spoken.say(said[at : at + 320], AUDIO_HZ, at_s and 50.0 + at_s + at / AUDIO_HZ)
+        spoken.say(said[at : at + 320], AUDIO_HZ, at_s and ORIGIN_S + at_s + at / AUDIO_HZ)
         desk.until(desk.loop_s + TICK_S)  # twice as fast as it is spoken
     desk.until(2.0)
     begins = round((at_s or FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
@@ -331,7 +326,7 @@ def test_a_hush_is_heard_as_soon_as_the_device_can_and_the_next_sentence_after_i
 def test_a_device_that_runs_dry_is_a_silence_that_is_told_and_counted(caplog):
     said = noise(3.0)
     desk = Desk(RecordedVoice(said)).until(1.0)
-    desk.loudspeaker.starve(0.2)
+    desk.loudspeaker.device.starve(0.2)
     desk.until(2.5)
     told = desk.voice.statistics()
     assert told["unsaid_ms"] == pytest.approx(200.0, abs=1.0)

@@ -97,10 +97,7 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
         (np.zeros((40, 480)), 16000, r"shape \(40, 480\): .* at most 32 channels"),
         (np.full(9, 8000.0), 16000, r"pcm: holds samples up to 8000, full scale is 1: .* by 32768"),
         (np.zeros(9), "16000", "rate_hz = '16000': expected a rate of speech"),
-        (np.zeros(9), None, "rate_hz = None"),
-        (np.zeros(9, np.uint8), 16000, "pcm is uint8"),
         (np.zeros(9, ">i2"), 16000, "pcm is >i2"),
-        (np.zeros(9, complex), 16000, "pcm is complex128"),
         ("UklGRg==", 16000, "pcm is <U8"),
         (None, 16000, "pcm is object"),
         ((0, 1), 16000, "pcm is int64"),
@@ -188,7 +185,6 @@ def test_a_face_by_names_is_seen_and_one_in_other_units_is_refused():
     for wrong, told in (
         ({"jawOpne": 1.0}, "'jawOpne' is not a channel; did you mean 'jawOpen'"),
         ({"yaw": 20.0}, r"yaw: expected radians \(in degrees\?\), got 20"),
-        (FaceFrame.of(0.0, np.r_[np.zeros(6), np.full(52, 80.0)]), r"browDownLeft: expected 0 to 1 \(in percent\?\)"),
         (np.full(58, np.nan), "roll is not finite"),
     ):
         with pytest.raises(ConfigError, match=told):

@@ -69,15 +69,6 @@ def test_without_loop_silence_follows_and_fills_the_last_frame():
     assert not any(frame.audio.any() for frame in frames[1:])
 
 
-def test_a_face_alone_and_nothing_at_all_are_normal():
-    only_face = recorded(None, face(1.0))
-    assert only_face.duration_s == 1.0 and len(only_face.read(1.0)[0].audio) == 0
-    nothing = recorded(None, None)
-    assert nothing.duration_s is None
-    assert all(frame.face is None and not len(frame.audio) for frame in nothing.read(3.0))
-    assert len(recorded(None, None, 2.0).read(9.0)) == 50
-
-
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_run_needs_a_length(duration_s):
     with pytest.raises(ConfigError, match="--duration"):
@@ -114,8 +105,6 @@ def test_files_are_opened_by_path(tmp_path):
         ("browser", "auto", "none", "--audio browser: there is no page .sfms-robot run --view"),
         ("none", "browser:8000", "none", "--face browser:8000: takes nothing behind the colon"),
         ("nobody.wav", "auto", "none", "--audio nobody.wav: no such file .*facegood_1114_3_16, katie"),
-        ("none", "nobody.csv", "none", "--face nobody.csv: no such file"),
-        ("none", "none", "gone.wav", "--agent-audio gone.wav: no such file"),
         ("none", "none", "browser:x", "--agent-audio browser:x: no such file"),
     ],
 )

@@ -15,6 +15,8 @@ from sfms_robot.sources.push import PushedSight, PushedVoice
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import KINDS, check_source, open_source, shipped_speaker, source_kinds
 
+FACE = str(shipped_speaker("facegood_1114_3_16").face)
+
 
 class Entry:
     """The part of importlib's EntryPoint that is used."""
@@ -50,7 +52,7 @@ def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
 
 
 @pytest.mark.parametrize("audio", ["push:0", "katie", "none", "ear"])
-@pytest.mark.parametrize("face", ["push:0", "none", str(shipped_speaker("facegood_1114_3_16").face), "eye"])
+@pytest.mark.parametrize("face", ["push:0", "none", FACE, "eye"])
 @pytest.mark.parametrize("agent_audio", ["katie", "none"])
 def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
@@ -68,6 +70,8 @@ def test_any_voice_goes_with_any_face(audio, face, agent_audio):
     [
         ("default", "push:0", "none", None),  # a face that is named goes without the default voice
         ("default", "none", "none", 47.68),
+        ("none", FACE, "none", 47.6),
+        ("none", "none", "none", None),
         ("katie", "push:0", "none", 18.36),  # a recording ends a run, also beside a live face
         ("push:0", "auto", "katie", None),
     ],

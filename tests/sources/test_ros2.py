@@ -132,31 +132,26 @@ def test_a_router_that_comes_late_goes_and_comes_back_is_found_again(tmp_path):
         assert sight.statistics() == {"sent": 0, "received": 2, "refused": 0}
 
 
+TOPIC = "expected a topic such as /audio (letters, digits, '_', '/'), got"
+
+
 @pytest.mark.parametrize(
-    ("audio", "face", "problem"),
+    ("kind", "argument", "named", "problem"),
     [
-        ("ros2", "auto", "--audio ros2: expected a topic such as /audio (letters, digits, '_', '/'), got ''"),
-        ("ros2:/a b", "auto", "--audio ros2: expected a topic such as /audio (letters, digits, '_', '/'), got '/a b'"),
-        (
-            "ros2:/mic,rate=fast",
-            "auto",
-            "--audio ros2:/mic,rate=fast: expected a whole number of up to 20 digits, got fast",
-        ),
-        (
-            "ros2:/mic,rate=100",
-            "auto",
-            "--audio ros2:/mic,rate=100: rate_hz = 100: expected a rate of speech (4000 to ",
-        ),
-        ("ros2:/mic,channels=0", "auto", "--audio ros2: channels: expected 1 to 8, got 0"),
-        ("ros2:/mic,flip=yaw", "auto", "--audio ros2: option 'flip' is not known (domain, rate, channels)"),
-        ("none", "ros2:a,domain=233", "--face ros2: domain: expected 0 to 232, got '233'"),
-        ("none", "ros2:a,flip=nose", "--face ros2: flip = 'nose': expected a pose channel"),
+        ("audio", "", "", f"{TOPIC} ''"),
+        ("audio", ":/a b", "", f"{TOPIC} '/a b'"),
+        ("audio", ":/mic,rate=fast", ":/mic,rate=fast", "expected a whole number of up to 20 digits, got fast"),
+        ("audio", ":/mic,rate=100", ":/mic,rate=100", "rate_hz = 100: expected a rate of speech (4000 to "),
+        ("audio", ":/mic,channels=0", "", "channels: expected 1 to 8, got 0"),
+        ("audio", ":/mic,flip=yaw", "", "option 'flip' is not known (domain, rate, channels)"),
+        ("face", ":a,domain=233", "", "domain: expected 0 to 232, got '233'"),
+        ("face", ":a,flip=nose", "", "flip = 'nose': expected a pose channel"),
     ],
 )
-def test_arguments_that_cannot_be_used_are_one_line(audio, face, problem):
+def test_arguments_that_cannot_be_used_are_one_line(kind, argument, named, problem):
     with pytest.raises(ConfigError) as error:
-        open_source(audio, face)
-    assert str(error.value).startswith(problem)
+        open_source(**{"audio": "none", kind: f"ros2{argument}"})
+    assert str(error.value).startswith(f"--{kind} ros2{named}: {problem}")
 
 
 def test_the_domain_is_that_of_ros_domain_id_unless_one_is_given(monkeypatch):

@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pytest
+from free_ports import free_udp_port
 from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
@@ -36,6 +37,10 @@ def bundle(*messages):
     return builder.build().dgram
 
 
+def wrapped(data):
+    return b"#bundle\0" + bytes(8) + struct.pack(">i", len(data)) + data
+
+
 def blend(name, value):
     return message("/VMC/Ext/Blend/Val", name, value)
 
@@ -54,21 +59,15 @@ def shown(*messages, decoder=None):
 # --- names ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("written", [str, str.upper, str.lower, lambda name: name[0].upper() + name[1:]])
-def test_every_arkit_name_in_any_case(written):
+@pytest.mark.parametrize(
+    "written", [str, str.upper, str.lower, lambda name: "BlendShape." + name.replace("Left", "_L")]
+)
+def test_every_arkit_name_in_any_case_and_spelling(written):
     values = np.linspace(0.1, 0.9, 52).astype(np.float32)
     motion = shown(
         *(blend(written(name), float(value)) for name, value in zip(BLENDSHAPES, values, strict=True)), APPLY
     )
     assert motion[SHAPES] == pytest.approx(values)
-
-
-def test_a_frame_may_come_in_many_packets_and_without_bundles():
-    decoder = VmcDecoder()
-    assert decoder.decode(blend("jawOpen", 0.5).dgram, 0.0) is None
-    assert decoder.decode(blend("eyeBlinkLeft", 1.0).dgram, 0.0) is None
-    motion = decoder.decode(APPLY.dgram, 0.0)
-    assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == {"jawOpen", "eyeBlinkLeft"}
 
 
 @pytest.mark.parametrize(
@@ -103,12 +102,6 @@ def test_names_that_say_nothing_are_counted():
     assert decoder.statistics()["unknown_names"] == 2
     assert shown(blend("Joy", 1.0), APPLY, decoder=decoder) is not None
     assert decoder.remark() == "4 of 52 channels used; not known: Ahoge, Tail"
-
-
-@pytest.mark.parametrize("written", ["mouthSmile_L", "BlendShape.mouthSmileLeft", "MOUTHSMILE_L", "mouth_smile_left"])
-def test_names_go_by_the_spellings_of_files(written):
-    motion = shown(blend(written, 0.5), blend("jawOpen", 0.25), APPLY)
-    assert motion[CHANNEL_INDEX["mouthSmileLeft"]] == 0.5 and motion[SHAPES].sum() == 0.75
 
 
 # --- faces that nothing completes -------------------------------------------------------------------------------
@@ -147,19 +140,6 @@ def test_a_sender_without_blendshapes_is_told_what_to_switch_on():
 
 
 # --- bones ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("axis", "pose"),
-    [
-        ((1, 0, 0), (0, 1, 0)),  # about the avatar's right, left-handed: nose down
-        ((0, 1, 0), (0, 0, -1)),  # about up, left-handed: to its own right
-        ((0, 0, 1), (-1, 0, 0)),  # about forward, left-handed: left ear down
-    ],
-)
-def test_a_turn_about_each_of_unitys_axes(axis, pose):
-    quaternion = (*(math.sin(0.15) * part for part in axis), math.cos(0.15))
-    assert shown(bone("Head", quaternion))[:3] == pytest.approx(np.array(pose) * 0.3, abs=1e-6)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -204,7 +184,6 @@ def test_numbers_of_other_types_are_read(value):
         message("/VMC/Ext/Blend/Val", "jawOpen", "wide"),
         message("/VMC/Ext/Blend/Val", "jawOpen", True),
         message("/VMC/Ext/Blend/Val", "jawOpen", math.nan),
-        message("/VMC/Ext/Blend/Val", "jawOpen", math.inf),
         message("/VMC/Ext/Blend/Val", "jawOpen", b"blob"),
         message("/VMC/Ext/Bone/Pos", "Head", 0.0, 0.0, 0.0),
         message("/VMC/Ext/Bone/Pos", "Head", "a", "b", "c", "d", "e", "f", "g"),
@@ -248,34 +227,30 @@ def test_what_is_no_packet_is_refused(data, reason):
 def test_bundles_in_bundles_end_somewhere():
     data = APPLY.dgram
     for depth in range(2000):
-        data = b"#bundle\0" + bytes(8) + struct.pack(">i", len(data)) + data
+        data = wrapped(data)
         if depth == 2:
             assert list(elements(data)) == [APPLY.dgram]
     with pytest.raises(PacketError, match="without end"):
         list(elements(data))
 
 
-@given(
-    st.binary(max_size=300),
-    st.sampled_from([b"", b"/VMC/Ext/Blend/Val\0\0", b"/VMC/Ext/Bone/Pos\0\0\0,sfffffff\0\0\0"]),
-)
-def test_any_bytes_are_taken_or_refused(data, head):
-    decoder = VmcDecoder()
-    for packet in (head + data, b"#bundle\0" + bytes(8) + struct.pack(">i", len(head + data)) + head + data):
-        try:
-            motion = decoder.decode(packet, 0.0)
-        except PacketError:
-            continue
-        assert motion is None or np.isfinite(motion).all()
-
-
-@given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=20))
-def test_a_damaged_frame_is_refused_or_finite(damage):
+def damaged(damage):
+    """A frame with other bytes at some places."""
     data = bytearray(bundle(*(blend(name, 0.5) for name in BLENDSHAPES), bone("Head", IDENTITY), APPLY))
     for place, value in damage:
         data[place % len(data)] = value
+    return bytes(data)
+
+
+DAMAGE = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=20)
+HEADS = st.sampled_from([b"", b"/VMC/Ext/Blend/Val\0\0", b"/VMC/Ext/Bone/Pos\0\0\0,sfffffff\0\0\0"])
+BYTES = st.builds(bytes.__add__, HEADS, st.binary(max_size=300))
+
+
+@given(BYTES | BYTES.map(wrapped) | st.builds(damaged, DAMAGE))
+def test_any_bytes_are_refused_or_finite(data):
     try:
-        motion = VmcDecoder().decode(bytes(data), 0.0)
+        motion = VmcDecoder().decode(data, 0.0)
     except PacketError:
         return
     assert motion is None or np.isfinite(motion).all()
@@ -284,15 +259,9 @@ def test_a_damaged_frame_is_refused_or_finite(damage):
 # --- over a socket ----------------------------------------------------------------------------------------------
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.bind(("127.0.0.1", 0))
-        return out.getsockname()[1]
-
-
 @pytest.fixture
 def sight():
-    opened = open_vmc(str(free_port()))
+    opened = open_vmc(str(free_udp_port()))
     opened.start(0.0)
     yield opened
     opened.close()
@@ -321,15 +290,12 @@ def test_percent_and_a_new_port_for_each_packet_are_taken_and_the_units_said_onc
     assert sum("blendshapes are taken as percent" in record.message for record in caplog.records) == 1
 
 
-def test_packets_without_a_face_are_a_loss_with_its_reason(sight, caplog):
+@pytest.mark.parametrize(("values", "lost"), [((1,), True), ((1, 3, 0, 0), False)], ids=["no face", "nobody there"])
+def test_packets_without_a_face_are_a_loss_with_its_reason_unless_the_sender_has_lost_its_person(
+    sight, caplog, values, lost
+):
     for number in range(90):
-        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", 1)), ("192.0.2.1", 1), number / 30))
+        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", *values)), ("192.0.2.1", 1), number / 30))
         sight.at(number / 30)
-    assert sight.lost and sum("neither blendshapes" in record.message for record in caplog.records) == 1
-
-
-def test_a_sender_that_lost_its_person_is_not_lost(sight):
-    for number in range(90):
-        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", 1, 3, 0, 0)), ("192.0.2.1", 1), number / 30))
-        sight.at(number / 30)
-        assert not sight.lost
+    assert sight.lost == lost
+    assert sum("neither blendshapes" in record.message for record in caplog.records) == lost
