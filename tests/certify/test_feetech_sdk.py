@@ -45,14 +45,3 @@ def test_scs_servos_send_the_high_byte_first(opened, again):
     again(lambda: handler.write1ByteTxRx(port, 1, 40, 1), lambda a: a == (0, 0))
     again(lambda: handler.write2ByteTxRx(port, 1, 42, 600), lambda a: a == (0, 0))
     again(lambda: handler.read2ByteTxRx(port, 1, 56), lambda a: a == (600, 0, 0))
-
-
-def test_sts_wheel_turns_and_a_registered_write_is_pending(opened, again):
-    port, handler = opened([EmulatedServo(1, "sts3215", start_ticks=2000)], LITTLE)
-    again(lambda: handler.regWriteTxRx(port, 1, 33, 1, [1]), lambda a: a == (0, 0))
-    again(lambda: handler.read1ByteTxRx(port, 1, 64), lambda a: a == (1, 0, 0))
-    assert handler.action(port, 254) == 0
-    again(lambda: handler.read1ByteTxRx(port, 1, 64), lambda a: a == (0, 0, 0))
-    again(lambda: handler.write1ByteTxRx(port, 1, 40, 1), lambda a: a == (0, 0))
-    again(lambda: handler.write2ByteTxRx(port, 1, 46, 0x8000 | 1500), lambda a: a == (0, 0))
-    again(lambda: handler.read2ByteTxRx(port, 1, 58), lambda a: a[1:] == (0, 0) and abs(a[0] - 0x8000 - 1500) < 20)

@@ -139,13 +139,6 @@ def test_no_instruction_whatever_its_parameters_breaks_the_chain(servo, instruct
 POSITIONS = words(132, 4)
 
 
-def test_chain_may_skip_a_silent_id():
-    host = Host(1, 2, 3, chain_break=False)
-    host.chain.servo(2).dead = True
-    answers = host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02\x03")
-    assert [packet.servo for packet in answers] == [1, 3]
-
-
 @pytest.mark.parametrize("dead", [None, 3, 2, 1])
 def test_fast_sync_read_is_one_packet_that_stops_short_at_a_silent_id(host, dead):
     if dead:

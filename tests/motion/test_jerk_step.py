@@ -53,15 +53,6 @@ def test_a_move_from_rest_to_rest_takes_hardly_longer_than_the_fastest(start, en
 
 
 @pytest.mark.parametrize("chase", [TimeOptimalChase, StopChase])
-@given(st.integers(0, 2**32 - 1), st.integers(1, 30))
-def test_no_reference_takes_it_over_a_limit(chase, seed, hold):
-    rng = np.random.default_rng(seed)
-    spread = np.array([[4.0], [6.0], [60.0]])
-    jumps = [rng.uniform(-1, 1, (3, 1)) * spread for _ in range(300 // hold + 1)]
-    assert_lawful(followed(chase, [jumps[k // hold] for k in range(300)], rng.uniform(-2, 2)))
-
-
-@pytest.mark.parametrize("chase", [TimeOptimalChase, StopChase])
 @pytest.mark.parametrize("hz", [0.3, 0.7])
 def test_a_moving_reference_is_met_again_after_a_jump(chase, hz):
     wave = 0.5 * np.sin(2 * np.pi * hz * DT_S * np.arange(402))[:, None]

@@ -100,14 +100,6 @@ def test_no_command_ever_exceeds_a_limit(adversary, ruckig_there, ticks):
     assert excess(sent) < 1e-6
 
 
-@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from(ADVERSARIES), min_size=1, max_size=4))
-def test_no_mixture_of_adversaries_exceeds_a_limit(seed, adversaries):
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(LIMITS.low, LIMITS.high)
-    sent, _ = followed([wanted for adversary in adversaries for wanted in adversary(rng, 50)], start)
-    assert excess(sent) < 1e-6
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_any_pose_is_a_fixed_point(seed):
     pose = np.random.default_rng(seed).uniform(LIMITS.low, LIMITS.high)

@@ -1,7 +1,7 @@
 """Buses of chains of servos that are emulated in this process, in virtual time."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +82,16 @@ class ServoRig:
     def torques(self) -> list[int]:
         return [self.register(servo.id, "torque_enable") for servo in self.device.servos]
 
+    def state(self, servo_id: int) -> dict[str, Any]:
+        return self.servo(servo_id).state(self.clock.t)
+
+    def fault(self, servo_id: int, bits: int) -> None:
+        self.servo(servo_id).fail(bits, self.clock.t)
+
+    def supply(self, volts: float) -> None:
+        for servo in self.device.servos:
+            servo.set_supply(volts, self.clock.t)
+
 
 @dataclass
 class BusRig(ServoRig):
@@ -94,6 +104,31 @@ class BusRig(ServoRig):
     def hold(self) -> np.ndarray:
         self.bus.connect()
         return self.bus.enable(self.bus.joints)
+
+    def ticks(self, goals_rad, n: int, period_s: float = 0.01):
+        """`n` ticks: write, then poll; the last readings."""
+        for _ in range(n):
+            self.clock.t += period_s
+            self.bus.write(np.asarray(goals_rad, dtype=float), self.clock.t)
+            readings = self.bus.poll(self.clock.t)
+        return readings
+
+    def until(self, goals_rad, done: Callable[[Any], bool], limit_s: float):
+        """Ticks until `done(readings)`; the seconds it took, and the readings."""
+        began_s = self.clock.t
+        while self.clock.t - began_s < limit_s:
+            readings = self.ticks(goals_rad, 1)
+            if done(readings):
+                return self.clock.t - began_s, readings
+        raise AssertionError(f"not within {limit_s} s")
+
+
+def plugged(servos, ids: Sequence[int] = (), maps: Sequence[FirmwareMap] = (), **more) -> BusRig:
+    """These servos and their bus, whose ports can be opened again. `ids` and `maps`: as the head names them."""
+    ids = ids or [servo.id for servo in servos]
+    port = EmulatedPort(device_of(*servos))
+    maps = maps or [load_firmware_map("xl330-m288")] * len(ids)
+    return BusRig(port, bus_of(maps, ids, lambda: replace(port, closed=False), **more))
 
 
 @dataclass

@@ -74,13 +74,6 @@ def test_packet_cut_off_does_not_swallow_the_next(data, cut):
     assert found == [Packet(4, dxl2.STATUS, b"\x01\x02")]
 
 
-@given(st.data())
-def test_wrong_byte_is_never_taken_for_a_packet_of_the_same_length(data):
-    wire = bytearray(encode_status(1, 0, b"\x10\x20\x30\x40"))
-    wire[data.draw(st.integers(7, len(wire) - 1))] ^= data.draw(st.integers(1, 255))
-    assert take(wire) is None
-
-
 @given(st.lists(st.binary(max_size=300), max_size=30))
 def test_buffer_stays_bounded(chunks):
     buffer = bytearray()

@@ -31,16 +31,6 @@ def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):
     assert tool.broadcast_ping() == {1: found, 2: found}
 
 
-@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
-def test_registers_are_read_and_written(model):
-    link, rig = link_of(model, [500])
-    position = rig.servo(1).table["present_position"]
-    assert link.read(1, position.address, 2) == Answer(0, b"\xf4\x01")
-    goal = rig.servo(1).table["goal_position"].address
-    assert link.write(1, goal, b"\x00\x02") == Answer(0, b"")
-    assert link.read(1, goal, 2) == Answer(0, b"\x00\x02")
-
-
 def test_refusal_is_an_answer():
     link, _ = link_of("ax-12a", [512])
     assert link.write(1, 36, b"\x00\x00") == Answer(0x08, b"")

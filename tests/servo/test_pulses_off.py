@@ -233,13 +233,3 @@ def test_one_joint_comes_on_within_a_second(model):
         start_s = bench.clock.t
         bench.bus.enable([joint])
         assert 0.3 < bench.clock.t - start_s <= 1.0
-
-
-def test_torque_off_before_connect_and_after_close_does_nothing(model):
-    bench = ConnectedBench(model)
-    bench.enable()
-    bench.bus.close()
-    sent = [list(port.sent) for port in bench.ports]
-    bench.bus.torque_off("release")
-    bench.bus.stop("release")
-    assert [list(port.sent) for port in bench.ports] == sent
