@@ -118,14 +118,6 @@ def test_reply_that_comes_just_after_the_flush_is_seen_among_the_next(virtual):
     assert host.ask(1) == [1, 2]
 
 
-def test_on_the_wire_what_is_not_through_by_the_deadline_is_not_there(virtual):
-    chain, host = virtual(*[EmulatedServo(i, baud=57_600) for i in (1, 2, 3)], timing="wire")
-    host.port.set_baud(57_600)
-    assert host.ask(1, 2, 3, patience_s=0.005) == []
-    host.clock.t = 1.0
-    assert host.ask(1, 2, 3, patience_s=0.05) == [1, 2, 3]
-
-
 def test_faults_come_and_go_at_run_time(virtual):
     chain, host = virtual()
     chain.inject("silent:2")

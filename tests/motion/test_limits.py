@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
-import ruckig
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.jerk_step import Bound, Stop, StopChase
+from sfms_robot.motion.jerk_step import StopChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 
@@ -46,14 +45,6 @@ def square_wave(rng, ticks):
     return [standing(np.where((k // half) % 2, LIMITS.low, LIMITS.high)) for k in range(ticks)]
 
 
-def jumps(rng, ticks):
-    """Anywhere, also outside the range, with any speed and acceleration."""
-    spread = np.stack([LIMITS.high - LIMITS.low, 2 * LIMITS.speed, 2 * LIMITS.acceleration])
-    hold = int(rng.integers(1, 8))
-    values = [rng.normal(size=(3, J)) * spread for _ in range(ticks // hold + 1)]
-    return [values[k // hold] for k in range(ticks)]
-
-
 def random_walk(rng, ticks):
     walk = np.cumsum(rng.normal(size=(ticks + 2, J)) * rng.uniform(1e-4, 0.1), axis=0)
     return [difference(*walk[k : k + 3], DT_S) for k in range(ticks)]
@@ -72,28 +63,8 @@ def bang_bang_jerk(rng, ticks):
     return out
 
 
-def into_the_edge(rng, ticks):
-    """Full speed at the very edge of the range."""
-    edge = np.where(rng.random(J) < 0.5, LIMITS.low, LIMITS.high)
-    way = np.sign(edge - (LIMITS.low + LIMITS.high) / 2)
-    return [np.stack([edge, way * LIMITS.speed, way * LIMITS.acceleration * rng.choice([-1, 0, 1])])] * ticks
-
-
-def broken(rng, ticks):
-    """NaN and infinities among jumps, and numbers that overflow when squared."""
-    out = []
-    for wanted in jumps(rng, ticks):
-        bad = wanted.copy()
-        bad[rng.random((3, J)) < 0.2] = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1e300])
-        out.append(bad)
-    return out
-
-
-ADVERSARIES = [square_wave, jumps, random_walk, bang_bang_jerk, into_the_edge, broken]
-
-
 @pytest.mark.parametrize(("ruckig_there", "ticks"), [(True, 1500), (False, 300)])
-@pytest.mark.parametrize("adversary", ADVERSARIES)
+@pytest.mark.parametrize("adversary", [square_wave, random_walk, bang_bang_jerk])
 def test_no_command_ever_exceeds_a_limit(adversary, ruckig_there, ticks):
     rng = np.random.default_rng(0)
     sent, _ = followed(adversary(rng, ticks), limiter=LIMITER if ruckig_there else WITHOUT_RUCKIG)
@@ -157,26 +128,6 @@ def test_a_step_leaves_its_state_alone():
     goals, after = LIMITER.step(standing(LIMITS.high), state)
     goals += 1.0
     assert not state.motion.any() and (after.motion[0] <= LIMITS.high).all()
-
-
-@given(st.floats(-3, 3), st.floats(-30, 30))
-def test_the_stop_is_the_one_that_ruckig_finds(speed, acceleration):
-    given_ = ruckig.InputParameter(1)
-    given_.control_interface = ruckig.ControlInterface.Velocity
-    given_.current_position, given_.current_velocity, given_.current_acceleration = [0.0], [speed], [acceleration]
-    given_.target_velocity, given_.target_acceleration = [0.0], [0.0]
-    given_.max_velocity, given_.max_acceleration, given_.max_jerk = [1000.0], [30.0], [1500.0]
-    path = ruckig.Trajectory(1)
-    ruckig.Ruckig(1).calculate(given_, path)
-    stop = Stop.of(speed, acceleration, Bound(1000.0, 30.0, 1500.0))
-    ways = []
-    for time_s in np.linspace(0, path.duration, 40):
-        theirs = np.array(path.at_time(time_s))[:, 0]
-        assert stop.after(time_s) == pytest.approx(theirs, abs=1e-6)
-        ways.append(theirs[0])
-    below, above = stop.extent()
-    assert below <= min(ways) + 1e-9 and above >= max(ways) - 1e-9
-    assert below == pytest.approx(min(ways), abs=2e-3) and above == pytest.approx(max(ways), abs=2e-3)
 
 
 def test_the_reference_of_a_parabola_is_exact():

@@ -1,12 +1,12 @@
 """Buses of chains of servos that are emulated in this process, in virtual time."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from emulated_devices import device_of, servos_of
-from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight, bus_servo
+from emulated_port import BAUD, EchoingPort, EmulatedPort, Straight, bus_servo
 
 from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmware_map
 from sfms_robot.servo.chain.bus import ChainBus
@@ -131,45 +131,11 @@ def plugged(servos, ids: Sequence[int] = (), maps: Sequence[FirmwareMap] = (), *
     return BusRig(port, bus_of(maps, ids, lambda: replace(port, closed=False), **more))
 
 
-@dataclass
-class Rig(BusRig):
-    port: FaultyPort
-    rejoined: set[str] = field(default_factory=set)
-    goals: np.ndarray | None = None
-
-    def ticks(self, goals_rad, n: int, each: Callable[[], None] = lambda: None):
-        """`n` ticks of 10 ms: write, then poll; the last readings. A joint that rejoins begins where it stands."""
-        wanted = np.asarray(goals_rad, dtype=float)
-        goals = wanted.copy() if self.goals is None else self.goals
-        for _ in range(n):
-            self.clock.t += 0.01
-            away = np.array([joint in self.rejoined for joint in self.bus.joints])
-            goals = np.where(away, goals + np.clip(wanted - goals, -0.01, 0.01), wanted)
-            self.bus.write(goals, self.clock.t)
-            readings = self.bus.poll(self.clock.t)
-            for i, (joint, reading) in enumerate(readings.items()):
-                if reading.rejoined:
-                    self.rejoined.add(joint)
-                    goals[i] = reading.position_rad
-            each()
-        self.goals = goals
-        return readings
-
-
-def rig_of(
-    model: str | Sequence[str],
-    starts: Sequence[int],
-    baud: int = BAUD,
-    servo_baud: int | None = None,
-    **more,
-) -> Rig:
-    """Servos 1, 2, ... that stand at `starts`. `more`: as for `bus_of`."""
+def rig_of(model: str | Sequence[str], starts: Sequence[int], baud: int = BAUD, **more) -> BusRig:
+    """Servos 1, 2, ... that stand at `starts`, on an adapter that may hear itself. `more`: as for `bus_of`."""
     models = [model] * len(starts) if isinstance(model, str) else list(model)
-    servos = [
-        each
-        for i, (model, ticks) in enumerate(zip(models, starts, strict=True), 1)
-        for each in servos_of(model, i, start_ticks=ticks, baud=servo_baud or baud)
-    ]
-    port = FaultyPort(device_of(*servos), baud, name="wire")
+    rows = enumerate(zip(models, starts, strict=True), 1)
+    servos = [each for i, (name, ticks) in rows for each in servos_of(name, i, start_ticks=ticks, baud=baud)]
+    port = EchoingPort(device_of(*servos), baud, name="wire")
     maps = [load_firmware_map(model) for model in models]
-    return Rig(port, bus_of(maps, [servo.id for servo in servos], lambda: port, baud=baud, **more))
+    return BusRig(port, bus_of(maps, [servo.id for servo in servos], lambda: port, baud=baud, **more))

@@ -11,12 +11,9 @@ from contextlib import contextmanager
 
 import pytest
 import serial
-from emulated_port import ScriptedPort
 from virtual_time import Time
 
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
-from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.port import (
     DEVICE_ERRORS,
     PolledIO,
@@ -162,27 +159,6 @@ def test_device_that_goes_away_is_a_failure_of_the_bus():
 def test_virtual_port_needs_an_emulator(tmp_path):
     with pytest.raises(PortError, match="no emulator answers there"):
         VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Time())
-
-
-def test_answers_are_taken_by_id_and_length():
-    four, late, foreign = (
-        dxl2.encode_status(1, 0, b"\x01\x02\x03\x04"),
-        dxl2.encode_status(1, 0, b"\x09"),
-        dxl2.encode_status(2, 0, b"\x05\x06\x07\x08"),
-    )
-    link = Dynamixel2Link(ScriptedPort(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
-    assert link.read(1, 132, 4).data == b"\x01\x02\x03\x04"
-
-
-def test_own_echo_is_not_an_answer():
-    echo = dxl2.encode_instruction(1, dxl2.PING)
-    link = Dynamixel2Link(ScriptedPort(echo), 1_000_000, 0.003)
-    assert link.ping(1) is None
-
-
-def test_refusal_without_data_is_an_answer():
-    link = Dynamixel2Link(ScriptedPort(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
-    assert link.read(1, 132, 4).error == dxl2.ACCESS_ERROR
 
 
 @contextmanager

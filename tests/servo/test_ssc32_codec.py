@@ -71,15 +71,6 @@ def test_pulse_that_the_board_cannot_make_is_refused(pulse_us):
         ssc32.group_move({4: Move(pulse_us)})
 
 
-@given(st.binary(max_size=300).map(lambda data: data * 9))
-def test_rubbish_neither_hangs_nor_piles_up(rubbish):
-    buffer = bytearray(rubbish)
-    for _ in range(len(rubbish) + 1):
-        if maybe_command(buffer) is None:
-            break
-    assert len(buffer) < ssc32.MAX_LINE
-
-
 def test_24_channels_at_9600_baud_take_a_fifth_of_a_second():
     line = ssc32.group_move({channel: Move(1500) for channel in range(24)}, 220)
     assert 0.15 < len(line) * 10 / 9600 < 0.225

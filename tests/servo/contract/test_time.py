@@ -342,16 +342,6 @@ def test_reduce_is_half_whatever_acknowledgements_are_lost(family):
     assert rig.register(2, strength) == full // 2
 
 
-def test_torque_that_is_lost_is_noticed_where_a_tick_has_no_time_for_everything_of_everybody():
-    rig = timed("dynamixel2", 28)
-    held = rig.hold()
-    rig.ticks(held, 60)
-    torque = rig.family.table.role("torque_enable")
-    rig.port.device.servo(28).write(torque.address, bytes(1), rig.clock.t)
-    rig.ticks(held, 40)
-    assert rig.bus.statistics()["faults"] == ["joint28: torque lost"]
-
-
 def test_watchdog_whose_first_write_is_lost_is_armed_all_the_same():
     rig = timed("dynamixel2", 4)
     held = rig.hold()
