@@ -7,7 +7,6 @@ from dynamixel_sdk import (
     GroupSyncRead,
     GroupSyncWrite,
     PortHandler,
-    Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
 
@@ -67,18 +66,3 @@ def test_registered_write_action_clear_reboot_and_factory_reset(bench, again):
     again(lambda: sdk.write1ByteTxRx(port, 1, 9, 7), lambda a: a == NO_ERROR)
     sdk.factoryReset(port, 1, 0x02)
     again(lambda: sdk.read1ByteTxRx(port, 1, 9), lambda a: a == (250, COMM_SUCCESS, 0))
-
-
-def test_two_protocols_on_one_cable(plugged_in, again):
-    """As in the SDK's example protocol_combined.py."""
-    chain = plugged_in([EmulatedServo(1), EmulatedServo(20, model="ax-12a", start_ticks=400, firmware=24)])
-    port = PortHandler(chain.device)
-    assert port.openPort() and port.setBaudRate(1_000_000)
-    old, new = Protocol1PacketHandler(), Protocol2PacketHandler()
-    again(lambda: new.ping(port, 1), lambda a: a == (1200, COMM_SUCCESS, 0))
-    again(lambda: old.ping(port, 20), lambda a: a == (12, COMM_SUCCESS, 0))
-    again(lambda: old.write1ByteTxRx(port, 20, 24, 1), lambda a: a == NO_ERROR)
-    again(lambda: old.write2ByteTxRx(port, 20, 30, 450), lambda a: a == NO_ERROR)
-    again(lambda: old.read2ByteTxRx(port, 20, 36), lambda a: a == (450, COMM_SUCCESS, 0))
-    again(lambda: new.read4ByteTxRx(port, 1, 132), lambda a: a == (2048, COMM_SUCCESS, 0))
-    port.closePort()

@@ -1,10 +1,16 @@
+"""The limiter keeps every limit, with ruckig and without, and arrives nearly as soon as ruckig does."""
+
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+import ruckig
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
-from sfms_robot.motion.jerk_step import StopChase
+from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 
@@ -31,11 +37,11 @@ def followed(references, start=None, limiter=None):
     return np.array(sent), state
 
 
-def excess(sent) -> float:
+def excess(sent, limits=LIMITS) -> float:
     """Largest share by which finite differences exceed a limit; inf when a position does at all."""
-    if not (np.isfinite(sent).all() and (sent >= LIMITS.low).all() and (sent <= LIMITS.high).all()):
+    if not (np.isfinite(sent).all() and (sent >= limits.low).all() and (sent <= limits.high).all()):
         return np.inf
-    bounds = (LIMITS.speed, LIMITS.acceleration, LIMITS.jerk)
+    bounds = (limits.speed, limits.acceleration, limits.jerk)
     return max(np.abs(np.diff(sent, n, axis=0) / DT_S**n / bound).max() - 1 for n, bound in enumerate(bounds, 1))
 
 
@@ -133,3 +139,44 @@ def test_a_step_leaves_its_state_alone():
 def test_the_reference_of_a_parabola_is_exact():
     t = np.array([[0.99], [1.0], [1.01]])
     assert difference(*(1 + 2 * t + 3 * t**2), 0.01)[:, 0] == pytest.approx([6, 8, 6])
+
+
+# --- with and without ruckig ------------------------------------------------------------------------------------
+
+RATES = (3.0, 30.0, 1500.0)  # speed, acceleration, jerk
+ONE = JointLimits(np.array([-2.0]), np.array([2.0]), *(np.array([rate]) for rate in RATES))
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2))
+def test_a_move_from_rest_to_rest_takes_hardly_longer_than_the_fastest(start, end):
+    plan = ruckig.InputParameter(1)
+    plan.current_position, plan.target_position = [start], [end]
+    plan.max_velocity, plan.max_acceleration, plan.max_jerk = ([rate] for rate in RATES)
+    path = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(plan, path)
+    still = np.array([[end], [0.0], [0.0]])
+    sent, _ = followed([still] * 400, np.array([start]), JerkLimiter(ONE, DT_S, StopChase))
+    assert excess(sent, ONE) < 1e-6
+    arrived = int(np.argmax(np.abs(sent - end) < 1e-4)) - 2
+    assert abs(sent[-1] - end) < 1e-9 and arrived * DT_S <= 1.05 * path.duration + 5 * DT_S
+    assert (sent >= min(start, end) - 1e-9).all() and (sent <= max(start, end) + 1e-9).all()  # no overshoot
+
+
+@pytest.mark.parametrize("chase", [TimeOptimalChase, StopChase])
+@pytest.mark.parametrize("hz", [0.3, 0.7])
+def test_a_moving_reference_is_met_again_after_a_jump(chase, hz):
+    wave = 0.5 * np.sin(2 * np.pi * hz * DT_S * np.arange(402))[:, None]
+    references = [difference(*wave[k : k + 3], DT_S) for k in range(400)]
+    sent, _ = followed(references, np.array([1.9]), JerkLimiter(ONE, DT_S, chase))
+    assert excess(sent, ONE) < 1e-6
+    assert sent[-100:] == pytest.approx(wave[301:401], abs=1e-12)
+
+
+def test_without_ruckig_the_limiter_chases_by_itself():
+    code = (
+        "import sys; sys.modules['ruckig'] = None\n"
+        "from sfms_robot.motion.jerk_step import FASTEST, StopChase\n"
+        "assert FASTEST is StopChase"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

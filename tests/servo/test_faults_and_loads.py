@@ -66,7 +66,6 @@ def test_masked_fault_does_not_hide_another():
     rig = three(faults=Faults(mask=("input voltage",)))
     held = rig.hold()
     rig.ticks(held, 5)
-    rig.fault(2, VOLTAGE & 0)  # nothing yet
     rig.fault(2, 1 << 4)
     readings = rig.ticks(held, 10)
     assert readings["joint2"].fault == "electrical shock"
