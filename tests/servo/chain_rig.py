@@ -12,6 +12,7 @@ from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmw
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.families import families
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
 LIMIT_RAD = 1.0
 
@@ -38,6 +39,12 @@ def bus_of(
     options = BusConfig(family=name, baud=baud, **config)
     more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
     return family.build("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
+
+
+def limits_of(table: Table) -> tuple[str, str]:
+    """Registers of the lower and the upper end."""
+    old = "cw_angle_limit" in table.fields
+    return ("cw_angle_limit", "ccw_angle_limit") if old else ("min_position_limit", "max_position_limit")
 
 
 @dataclass

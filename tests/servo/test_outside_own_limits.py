@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from chain_rig import ServoRig, plugged
+from chain_rig import ServoRig, limits_of, plugged
 from emulated_devices import device_of, servos_of
 from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_on
 from hypothesis import given
@@ -28,13 +28,10 @@ class Rig(ServoRig):
         firmware_map = load_firmware_map(model)
         self.table = table = Table.of(firmware_map)
         self.deg = 360.0 / table.ticks_per_revolution
-        self.names = ("cw_angle_limit", "ccw_angle_limit")
-        if "cw_angle_limit" not in table.fields:
-            self.names = ("min_position_limit", "max_position_limit")
         self.limits = tuple(round(table.center_ticks + end / self.deg) for end in (-LOW_DEG, LOW_DEG))
         end, sign = (self.limits[0], -1) if outside_deg < 0 else (self.limits[1], 1)
         self.start = end + sign * max(1, round(abs(outside_deg) / self.deg))
-        stored = dict(zip(self.names, self.limits, strict=True)) | (registers or {})
+        stored = dict(zip(limits_of(table), self.limits, strict=True)) | (registers or {})
         (there,) = servos_of(model, 1, start_ticks=self.start, registers=stored)
         self.port = LossyPort(device_of(there))
         self.leg = self.servo(1)

@@ -238,14 +238,10 @@ def test_a_driver_that_switches_by_itself_is_told_to():
 
 @pytest.mark.parametrize(("how", "problem"), [("kernel", "driver of this device does not"), ("rts", "no RTS line")])
 def test_a_device_without_a_direction_is_refused_and_left_closed(how, problem):
-    far, near = os.openpty()
-    tty.setraw(near)
-    device = os.ttyname(near)
-    with pytest.raises(PortError, match=f"{device}: rs485 = '{how}': .*{problem}"):
-        SerialPort(device, 57600, Time(), how)
-    SerialPort(device, 57600, Time()).close()  # somebody who still held it would be in the way
-    os.close(near)
-    os.close(far)
+    with terminal() as (_, device):
+        with pytest.raises(PortError, match=f"{device}: rs485 = '{how}': .*{problem}"):
+            SerialPort(device, 57600, Time(), how)
+        SerialPort(device, 57600, Time()).close()  # somebody who still held it would be in the way
 
 
 REFUSED = """

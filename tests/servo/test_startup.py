@@ -1,7 +1,7 @@
 """Startup: who is absent stops nobody, and what a unit has stored against its head's file keeps its torque off."""
 
 import pytest
-from chain_rig import ServoRig
+from chain_rig import ServoRig, limits_of
 from emulated_devices import device_of
 from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_on
 from hypothesis import given
@@ -46,11 +46,6 @@ class Rig(ServoRig):
 
     def found(self):
         return {each.register: each for each in contradictions(self.values(), self.table, self.needs[0])}
-
-
-def limits_of(table):
-    return ("cw_angle_limit", "ccw_angle_limit") if "cw_angle_limit" in table.fields else (
-        "min_position_limit", "max_position_limit")  # fmt: skip
 
 
 # --- who is there -----------------------------------------------------------------------------------------------
