@@ -3,14 +3,10 @@
 import pytest
 from dynamixel_sdk import (
     BROADCAST_ID,
-    COMM_RX_TIMEOUT,
     COMM_SUCCESS,
-    GroupBulkRead,
-    GroupBulkWrite,
     GroupSyncRead,
     GroupSyncWrite,
     PortHandler,
-    Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
 
@@ -58,20 +54,6 @@ def test_sync_write_and_all_sync_reads(bench, again):
     again(read.fastSyncRead, lambda result: result == COMM_SUCCESS and positions() == wanted)
 
 
-def test_bulk_write_and_all_bulk_reads(bench, again):
-    port, sdk, _ = bench
-    write, read = GroupBulkWrite(port, sdk), GroupBulkRead(port, sdk)
-    assert write.addParam(1, 65, 1, [1]) and write.addParam(2, 84, 2, [0xBC, 0x02])
-    assert read.addParam(1, 65, 1) and read.addParam(2, 84, 2) and read.addParam(3, 132, 4)
-    assert write.txPacket() == COMM_SUCCESS
-
-    def data():
-        return [read.getData(1, 65, 1), read.getData(2, 84, 2), read.getData(3, 132, 4)]
-
-    again(read.txRxPacket, lambda result: result == COMM_SUCCESS and data() == [1, 700, 2003])
-    again(read.fastBulkRead, lambda result: result == COMM_SUCCESS and data() == [1, 700, 2003])
-
-
 def test_registered_write_action_clear_reboot_and_factory_reset(bench, again):
     port, sdk, _ = bench
     again(lambda: sdk.regWriteTxRx(port, 1, 65, 1, [1]), lambda a: a == NO_ERROR)
@@ -84,56 +66,3 @@ def test_registered_write_action_clear_reboot_and_factory_reset(bench, again):
     again(lambda: sdk.write1ByteTxRx(port, 1, 9, 7), lambda a: a == NO_ERROR)
     sdk.factoryReset(port, 1, 0x02)
     again(lambda: sdk.read1ByteTxRx(port, 1, 9), lambda a: a == (250, COMM_SUCCESS, 0))
-
-
-def test_refusals_and_the_alert_come_through(bench, again):
-    port, sdk, chain = bench
-    again(lambda: sdk.write1ByteTxRx(port, 1, 64, 1), lambda a: a == NO_ERROR)
-    refused = again(lambda: sdk.write1ByteTxRx(port, 1, 9, 0), lambda a: a[0] == COMM_SUCCESS)
-    assert sdk.getRxPacketError(refused[1]) == "[RxPacketError] Writing or Reading is not available to target address!"
-    chain.fault(2, 1 << 5)
-    alert = again(lambda: sdk.ping(port, 2), lambda a: a[1] == COMM_SUCCESS)
-    assert alert[2] == 0x80
-
-
-@pytest.mark.parametrize("baud", [57_600, 2_000_000])
-def test_another_baud_is_silence_until_the_servo_has_it_too(plugged_in, again, baud):
-    chain = plugged_in([EmulatedServo(1)])
-    port, sdk = PortHandler(chain.device), Protocol2PacketHandler()
-    assert port.openPort() and port.setBaudRate(baud)
-    assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
-    assert port.setBaudRate(1_000_000)
-    again(lambda: sdk.write1ByteTxRx(port, 1, 8, {57_600: 1, 2_000_000: 4}[baud]), lambda a: a == NO_ERROR)
-    assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
-    assert port.setBaudRate(baud)
-    again(lambda: sdk.ping(port, 1), lambda a: a == (1200, COMM_SUCCESS, 0))
-    port.closePort()
-
-
-def test_two_protocols_on_one_cable(plugged_in, again):
-    """As in the SDK's example protocol_combined.py."""
-    chain = plugged_in([EmulatedServo(1), EmulatedServo(20, model="ax-12a", start_ticks=400, firmware=24)])
-    port = PortHandler(chain.device)
-    assert port.openPort() and port.setBaudRate(1_000_000)
-    old, new = Protocol1PacketHandler(), Protocol2PacketHandler()
-    again(lambda: new.ping(port, 1), lambda a: a == (1200, COMM_SUCCESS, 0))
-    again(lambda: old.ping(port, 20), lambda a: a == (12, COMM_SUCCESS, 0))
-    again(lambda: old.write1ByteTxRx(port, 20, 24, 1), lambda a: a == NO_ERROR)
-    again(lambda: old.write2ByteTxRx(port, 20, 30, 450), lambda a: a == NO_ERROR)
-    again(lambda: old.read2ByteTxRx(port, 20, 36), lambda a: a == (450, COMM_SUCCESS, 0))
-    again(lambda: new.read4ByteTxRx(port, 1, 132), lambda a: a == (2048, COMM_SUCCESS, 0))
-    port.closePort()
-
-
-def test_ax_wheel_turns_and_a_registered_write_is_pending(plugged_in, again):
-    chain = plugged_in([EmulatedServo(1, model="ax-12a", start_ticks=400, firmware=24)])
-    port, sdk = PortHandler(chain.device), Protocol1PacketHandler()
-    assert port.openPort() and port.setBaudRate(1_000_000)
-    again(lambda: sdk.write4ByteTxRx(port, 1, 6, 0), lambda a: a == NO_ERROR)  # both angle limits
-    again(lambda: sdk.write1ByteTxRx(port, 1, 24, 1), lambda a: a == NO_ERROR)
-    again(lambda: sdk.regWriteTxRx(port, 1, 32, 2, [0, 6]), lambda a: a == NO_ERROR)  # 1024 + 512
-    again(lambda: sdk.read1ByteTxRx(port, 1, 44), lambda a: a == (1, COMM_SUCCESS, 0))
-    assert sdk.action(port, 254) == COMM_SUCCESS
-    again(lambda: sdk.read1ByteTxRx(port, 1, 44), lambda a: a == (0, COMM_SUCCESS, 0))
-    again(lambda: sdk.read2ByteTxRx(port, 1, 38), lambda a: a[1:] == NO_ERROR and a[0] > 1024 + 200)
-    port.closePort()

@@ -45,17 +45,6 @@ def test_controller_moves_all_nine_joints(robot, again):
     assert not host.is_torque_enabled()
 
 
-def test_platform_can_be_limp_by_current(robot):
-    host = controller.ReachyMiniMotorController(robot.device)
-    host.set_stewart_platform_operating_mode(0)
-    assert list(host.read_stewart_platform_operating_mode()) == [0] * 6
-    host.enable_torque()
-    host.set_stewart_platform_goal_current([0] * 6)
-    host.disable_torque()
-    host.set_stewart_platform_operating_mode(3)
-    assert list(host.read_stewart_platform_operating_mode()) == [3] * 6
-
-
 def test_control_loop_starts_runs_and_stops(robot, again):
     loop = controller.ReachyMiniPyControlLoop(robot.device, datetime.timedelta(milliseconds=20), allowed_retries=20)
     try:

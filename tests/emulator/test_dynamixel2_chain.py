@@ -102,18 +102,6 @@ def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
 
 
-def test_hardware_error_is_latched_until_reboot(host):
-    host.write(2, "torque_enable", 1)
-    host.chain.servo(2).fail(1 << 5, 0.0)
-    [status] = host.ask(2, dxl2.READ, words(64, 1))
-    assert (status.error, status.params) == (dxl2.ALERT, b"\x00")
-    assert host.read(2, "hardware_error_status") == 1 << 5
-    assert host.write(2, "torque_enable", 1) == dxl2.ALERT | dxl2.ACCESS_ERROR
-    host.ask(2, dxl2.REBOOT)
-    host.t = 0.5
-    assert host.read(2, "hardware_error_status") == 0 and host.write(2, "torque_enable", 1) == 0
-
-
 def test_watchdog_is_fed_by_any_instruction(host):
     host.write(1, "torque_enable", 1)
     host.write(1, "bus_watchdog", 5)
@@ -137,13 +125,6 @@ def test_no_instruction_whatever_its_parameters_breaks_the_chain(servo, instruct
 
 
 POSITIONS = words(132, 4)
-
-
-def test_chain_may_skip_a_silent_id():
-    host = Host(1, 2, 3, chain_break=False)
-    host.chain.servo(2).dead = True
-    answers = host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02\x03")
-    assert [packet.servo for packet in answers] == [1, 3]
 
 
 @pytest.mark.parametrize("dead", [None, 3, 2, 1])
@@ -201,12 +182,6 @@ def test_two_servos_with_one_id_talk_over_one_another(host):
 def test_change_of_id_is_answered_under_the_old_one(host):
     assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
     assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
-
-
-def test_each_reply_waits_its_return_delay(host):
-    host.write(2, "return_delay_time", 10)
-    replies = host.replies(dxl2.BROADCAST, dxl2.SYNC_READ, POSITIONS + b"\x01\x02")
-    assert [reply.pause_s for reply in replies] == pytest.approx([500e-6, 20e-6])
 
 
 def test_broadcast_ping_is_answered_in_slots(host):

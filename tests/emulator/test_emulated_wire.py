@@ -157,18 +157,6 @@ def test_unplugged_wire_hears_nothing_but_counts():
     assert not wire.hung
 
 
-def test_same_faults_and_requests_give_the_same_bytes():
-    def run(seed):
-        wire = wire_of(1, 2, 3, faults=["drop=0.2", "corrupt=0.2", "noise=0.3", "duplicate=0.1"], seed=seed)
-        out = []
-        for k in range(100):
-            wire.receive(sync_read(1, 2, 3), BAUD, 0.01 * k)
-            out.append(b"".join(each.data for each in wire.take(0.01 * k)))
-        return out
-
-    assert run(7) == run(7) != run(8)
-
-
 @pytest.mark.parametrize("chain_break", [True, False])
 def test_mute_servo_obeys_and_never_answers(chain_break):
     chain = xl330(1, 2, 3, chain_break=chain_break)

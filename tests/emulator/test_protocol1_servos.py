@@ -38,14 +38,6 @@ def test_goal_before_torque_switches_the_torque_on(model):
     assert get(device, 1, "torque_enable") == 1
 
 
-def test_only_servos_at_the_hosts_baud_hear_it_give_or_take_three_percent():
-    device = chain_of("ax-12a")
-    put(device, 1, "baud_rate", 34)  # 57,142 in truth
-    assert ask(device, 1, protocol1.PING) == []
-    assert len(ask(device, 1, protocol1.PING, baud=57_600)) == 1
-    assert ask(device, 1, protocol1.PING, baud=None) == []
-
-
 def test_dynamixel_says_what_it_refuses_and_changes_nothing():
     device = chain_of("ax-12a")
     put(device, 1, "cw_angle_limit", 200)

@@ -6,11 +6,9 @@ from motion_rows import motions
 
 from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_head
-from sfms_robot.data import data_dir
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, Plan
+from sfms_robot.frames import FRAME_S, Plan
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
-from sfms_robot.signals.motion_primitives import read_motions
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2
 HEAD = load_head("face28")
@@ -67,26 +65,6 @@ def test_a_blink_closes_the_lid_although_it_is_faster_than_the_servo(closed_fram
     assert sent[:, LID].max() > (0.9 if closed_frames == 1 else 0.99) * closed
     assert sent[-1, LID] == pytest.approx(HEAD.joints["lid_left"].rest_rad, abs=1e-9)
     assert not sent[:, JOINTS.index("lid_right")].any()
-
-
-def recorded_nods() -> list[np.ndarray]:
-    """Pitch [rad] of recorded heads, 25 a second, from rest and to it."""
-    clips = [
-        np.asarray(clip)[:, CHANNEL_INDEX["pitch"]]
-        for motion in read_motions(data_dir("sim") / "listeners" / "motions.npz").values()
-        for clip in motion.heads
-        if len(clip) >= 25
-    ]
-    fades = [np.minimum(1.0, np.minimum(np.arange(len(c)), np.arange(len(c))[::-1]) / 5) for c in clips]
-    return [np.pad((clip - clip[0]) * fade, 12) for clip, fade in zip(clips, fades, strict=True)]
-
-
-def test_recorded_nods_are_commanded_with_at_most_one_and_a_half_times_the_jerk_asked_for():
-    runs = [played(motions(len(nod), pitch=nod)) for nod in recorded_nods()]
-    asked = np.concatenate([wanted[:, PITCH] for wanted, _ in runs])
-    sent = np.concatenate([commanded[:, PITCH] for _, commanded in runs])
-    assert len(runs) >= 2 and np.ptp(asked) > np.radians(5)
-    assert rms_jerk(sent) <= 1.5 * rms_jerk(asked)
 
 
 @pytest.mark.parametrize("from_shut_to_open", [False, True])

@@ -1,17 +1,18 @@
 """Buses of chains of servos that are emulated in this process, in virtual time."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from emulated_devices import device_of, servos_of
-from emulated_port import BAUD, EmulatedPort, FaultyPort, Straight, bus_servo
+from emulated_port import BAUD, EchoingPort, EmulatedPort, Straight, bus_servo
 
 from sfms_robot.config import BusConfig, Faults, FirmwareMap, Safety, load_firmware_map
 from sfms_robot.servo.chain.bus import ChainBus
 from sfms_robot.servo.families import families
 from sfms_robot.servo.port import Port
+from sfms_robot.servo.registers import Table
 
 LIMIT_RAD = 1.0
 
@@ -38,6 +39,12 @@ def bus_of(
     options = BusConfig(family=name, baud=baud, **config)
     more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
     return family.build("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
+
+
+def limits_of(table: Table) -> tuple[str, str]:
+    """Registers of the lower and the upper end."""
+    old = "cw_angle_limit" in table.fields
+    return ("cw_angle_limit", "ccw_angle_limit") if old else ("min_position_limit", "max_position_limit")
 
 
 @dataclass
@@ -82,6 +89,16 @@ class ServoRig:
     def torques(self) -> list[int]:
         return [self.register(servo.id, "torque_enable") for servo in self.device.servos]
 
+    def state(self, servo_id: int) -> dict[str, Any]:
+        return self.servo(servo_id).state(self.clock.t)
+
+    def fault(self, servo_id: int, bits: int) -> None:
+        self.servo(servo_id).fail(bits, self.clock.t)
+
+    def supply(self, volts: float) -> None:
+        for servo in self.device.servos:
+            servo.set_supply(volts, self.clock.t)
+
 
 @dataclass
 class BusRig(ServoRig):
@@ -95,46 +112,37 @@ class BusRig(ServoRig):
         self.bus.connect()
         return self.bus.enable(self.bus.joints)
 
-
-@dataclass
-class Rig(BusRig):
-    port: FaultyPort
-    rejoined: set[str] = field(default_factory=set)
-    goals: np.ndarray | None = None
-
-    def ticks(self, goals_rad, n: int, each: Callable[[], None] = lambda: None):
-        """`n` ticks of 10 ms: write, then poll; the last readings. A joint that rejoins begins where it stands."""
-        wanted = np.asarray(goals_rad, dtype=float)
-        goals = wanted.copy() if self.goals is None else self.goals
+    def ticks(self, goals_rad, n: int, period_s: float = 0.01):
+        """`n` ticks: write, then poll; the last readings."""
         for _ in range(n):
-            self.clock.t += 0.01
-            away = np.array([joint in self.rejoined for joint in self.bus.joints])
-            goals = np.where(away, goals + np.clip(wanted - goals, -0.01, 0.01), wanted)
-            self.bus.write(goals, self.clock.t)
+            self.clock.t += period_s
+            self.bus.write(np.asarray(goals_rad, dtype=float), self.clock.t)
             readings = self.bus.poll(self.clock.t)
-            for i, (joint, reading) in enumerate(readings.items()):
-                if reading.rejoined:
-                    self.rejoined.add(joint)
-                    goals[i] = reading.position_rad
-            each()
-        self.goals = goals
         return readings
 
+    def until(self, goals_rad, done: Callable[[Any], bool], limit_s: float):
+        """Ticks until `done(readings)`; the seconds it took, and the readings."""
+        began_s = self.clock.t
+        while self.clock.t - began_s < limit_s:
+            readings = self.ticks(goals_rad, 1)
+            if done(readings):
+                return self.clock.t - began_s, readings
+        raise AssertionError(f"not within {limit_s} s")
 
-def rig_of(
-    model: str | Sequence[str],
-    starts: Sequence[int],
-    baud: int = BAUD,
-    servo_baud: int | None = None,
-    **more,
-) -> Rig:
-    """Servos 1, 2, ... that stand at `starts`. `more`: as for `bus_of`."""
+
+def plugged(servos, ids: Sequence[int] = (), maps: Sequence[FirmwareMap] = (), **more) -> BusRig:
+    """These servos and their bus, whose ports can be opened again. `ids` and `maps`: as the head names them."""
+    ids = ids or [servo.id for servo in servos]
+    port = EmulatedPort(device_of(*servos))
+    maps = maps or [load_firmware_map("xl330-m288")] * len(ids)
+    return BusRig(port, bus_of(maps, ids, lambda: replace(port, closed=False), **more))
+
+
+def rig_of(model: str | Sequence[str], starts: Sequence[int], baud: int = BAUD, **more) -> BusRig:
+    """Servos 1, 2, ... that stand at `starts`, on an adapter that may hear itself. `more`: as for `bus_of`."""
     models = [model] * len(starts) if isinstance(model, str) else list(model)
-    servos = [
-        each
-        for i, (model, ticks) in enumerate(zip(models, starts, strict=True), 1)
-        for each in servos_of(model, i, start_ticks=ticks, baud=servo_baud or baud)
-    ]
-    port = FaultyPort(device_of(*servos), baud, name="wire")
+    rows = enumerate(zip(models, starts, strict=True), 1)
+    servos = [each for i, (name, ticks) in rows for each in servos_of(name, i, start_ticks=ticks, baud=baud)]
+    port = EchoingPort(device_of(*servos), baud, name="wire")
     maps = [load_firmware_map(model) for model in models]
-    return Rig(port, bus_of(maps, [servo.id for servo in servos], lambda: port, baud=baud, **more))
+    return BusRig(port, bus_of(maps, [servo.id for servo in servos], lambda: port, baud=baud, **more))

@@ -128,29 +128,15 @@ class LossyPort(EmulatedPort):
 
 
 @dataclass
-class FaultyPort(EmulatedPort):
-    """An adapter with something wrong with it.
+class EchoingPort(EmulatedPort):
+    """A half-duplex adapter: with `hears_itself` it echoes what it sends."""
 
-    `late`: answers to the next so many requests come only with those to a later one.
-    `hears_itself`: half-duplex, it echoes what it sends.
-    """
-
-    late: int = 0
     hears_itself: bool = False
-    _held: bytes = b""
 
     def write(self, data: bytes) -> None:
         if self.hears_itself:
             self.inbox += data
-        came = len(self.inbox)
         super().write(data)
-        if self.late:
-            self.late -= 1
-            self._held += bytes(self.inbox[came:])
-            del self.inbox[came:]
-        else:
-            self.inbox[came:came] = self._held
-            self._held = b""
 
 
 class ScriptedPort(EmulatedPort):

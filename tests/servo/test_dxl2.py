@@ -2,16 +2,12 @@ import pytest
 from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from published import byte_by_byte, rows
 from vendor_port import VendorPort
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import Packet, crc16, encode_fast_status, encode_instruction, encode_status
 from sfms_robot.servo.codecs.dxl2 import maybe_packet as take
-
-ROWS = rows("dxl2_packets.csv")
-PACKETS = [pytest.param(bytes.fromhex(row["packet"]), id=row["name"]) for row in ROWS]
 
 ids = st.integers(0, dxl2.MAX_ID) | st.just(dxl2.BROADCAST)
 # Bytes that look like a header are what stuffing is about: make them common.
@@ -28,21 +24,6 @@ def test_crc_continues(head, tail):
     assert crc16(tail, crc16(head)) == crc16(head + tail)
 
 
-@pytest.mark.parametrize("wire", PACKETS)
-def test_known_packet_is_read_and_written(wire):
-    packet = take(buffer := bytearray(wire))
-    assert packet is not None and not buffer
-    if packet.instruction == dxl2.STATUS:
-        assert encode_status(packet.servo, packet.error, packet.params) == wire
-    else:
-        assert encode_instruction(packet.servo, packet.instruction, packet.params) == wire
-
-
-@pytest.mark.parametrize("wire", PACKETS)
-def test_packet_arriving_one_byte_at_a_time(wire):
-    assert byte_by_byte(take, wire) == take(bytearray(wire))
-
-
 @given(ids, st.sampled_from([dxl2.READ, dxl2.WRITE, dxl2.SYNC_WRITE]), params)
 def test_instruction_round_trip(servo, code, data):
     assert take(bytearray(encode_instruction(servo, code, data))) == Packet(servo, code, data)
@@ -55,14 +36,6 @@ def test_status_round_trip(servo, error, data):
     assert b"\xff\xff\xfd\x00" not in wire[1:-2]
 
 
-@given(st.binary(max_size=30), params, params)
-def test_packets_are_found_behind_rubbish(rubbish, first, second):
-    wire = encode_status(3, 0, first) + rubbish.replace(b"\xff", b"\xfe") + encode_status(4, 0, second)
-    buffer = bytearray(wire)
-    assert take(buffer) == Packet(3, dxl2.STATUS, first)
-    assert take(buffer) == Packet(4, dxl2.STATUS, second)
-
-
 @given(params, st.integers(1, 200))
 def test_packet_cut_off_does_not_swallow_the_next(data, cut):
     whole = encode_status(4, 0, b"\x01\x02")
@@ -72,23 +45,6 @@ def test_packet_cut_off_does_not_swallow_the_next(data, cut):
     while (packet := take(buffer)) is not None:
         found.append(packet)
     assert found == [Packet(4, dxl2.STATUS, b"\x01\x02")]
-
-
-@given(st.data())
-def test_wrong_byte_is_never_taken_for_a_packet_of_the_same_length(data):
-    wire = bytearray(encode_status(1, 0, b"\x10\x20\x30\x40"))
-    wire[data.draw(st.integers(7, len(wire) - 1))] ^= data.draw(st.integers(1, 255))
-    assert take(wire) is None
-
-
-@given(st.lists(st.binary(max_size=300), max_size=30))
-def test_buffer_stays_bounded(chunks):
-    buffer = bytearray()
-    for chunk in chunks:
-        buffer += chunk
-        while take(buffer) is not None:
-            pass
-        assert len(buffer) < dxl2.MAX_PACKET
 
 
 def test_too_long_a_packet_is_refused():

@@ -5,9 +5,7 @@ import re
 
 import pytest
 
-from sfms_robot.config import load_head
 from sfms_robot.config.joint import BUS_FAMILIES, BUS_GROUP
-from sfms_robot.data import head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.servo.families import BusFamily, families, family_named, servo_families
 
@@ -18,12 +16,6 @@ def test_every_family_names_classes_that_there_are():
         assert isinstance(family.build(), type)
     for family in servo_families().values():
         assert isinstance(family.link_class(), type) and family.bauds and family.protocol in (1, 2)
-
-
-def test_every_bus_of_a_shipped_head_has_a_family():
-    for name in head_names():
-        for bus in load_head(name).buses.values():
-            family_named(bus.family)
 
 
 def test_unknown_family_is_refused_with_those_there_are():

@@ -38,22 +38,16 @@ def test_what_was_written_is_there_or_an_error_says_that_it_may_not_be(model, fa
         assert held(servo, field, port.clock.t) == table.center_ticks + 7
 
 
+@pytest.mark.parametrize("lost", ["answer", "request"])
 @pytest.mark.parametrize("model", MODELS)
-def test_a_lost_acknowledgement_costs_its_silence_and_nothing_else(model):
-    table, servo, port, link = rig(model, ["answer"])
+def test_a_lost_request_is_repeated_and_a_lost_acknowledgement_costs_its_silence_and_nothing_else(model, lost):
+    table, servo, port, link = rig(model, [lost])
     field = table.role("goal_position")
     finish(verified_write(link, 1, field, table.center_ticks - 5))
     assert held(servo, field, port.clock.t) == table.center_ticks - 5
-    assert len(port.sent) == 2  # written once: the value read back is what counts
-    assert SILENCE_S < port.clock.t < 2 * SILENCE_S
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_a_lost_request_is_repeated(model):
-    table, servo, port, link = rig(model, ["request"])
-    field = table.role("goal_position")
-    finish(verified_write(link, 1, field, table.center_ticks + 9))
-    assert held(servo, field, port.clock.t) == table.center_ticks + 9
+    if lost == "answer":
+        assert len(port.sent) == 2  # written once: the value read back is what counts
+        assert SILENCE_S < port.clock.t < 2 * SILENCE_S
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -120,36 +114,34 @@ def heard(*pieces: bytes, echo: bool = False, protocol: int = 2):
     return ping_replies(ScriptedPort(*pieces, echo=echo), protocol, 3, 0.02)
 
 
-def test_one_servo_is_one_answer_also_in_pieces_and_behind_an_echo():
-    assert not heard(ONE).duplicate and heard(ONE).answers == 1
-    assert not heard(ONE[:5], ONE[5:]).duplicate
+GARBLED = bytes(a & b for a, b in zip(ONE, OTHER, strict=True))
+OLDER = protocol1.encode(3, 0)
+HEARD = [  # protocol, pieces that come, answers, whether two servos have the id
+    (2, [], 0, False),
+    (2, [ONE], 1, False),
+    (2, [ONE[:5], ONE[5:]], 1, False),
+    (2, [ONE, OTHER], 2, True),
+    (2, [GARBLED], 0, True),  # one on top of the other
+    (1, [OLDER], 1, False),
+    (1, [OLDER, OLDER], 2, True),
+    (1, [OLDER, b"\x00"], 1, True),
+]
+
+
+@pytest.mark.parametrize(("protocol", "pieces", "answers", "duplicate"), HEARD)
+def test_two_servos_with_one_id_are_told_from_one(protocol, pieces, answers, duplicate):
+    replies = heard(*pieces, protocol=protocol)
+    assert (replies.answers, replies.duplicate) == (answers, duplicate)
+
+
+def test_an_echo_is_no_second_servo():
     assert not heard(ONE, echo=True).duplicate
-
-
-def test_an_empty_wire_holds_no_duplicate_id():
-    assert heard().answers == 0 and not heard().duplicate
-
-
-def test_two_answers_one_after_the_other_are_a_duplicate_id():
-    assert heard(ONE, OTHER).answers == 2 and heard(ONE, OTHER).duplicate
-
-
-def test_two_answers_on_top_of_each_other_are_a_duplicate_id():
-    garbled = bytes(a & b for a, b in zip(ONE, OTHER, strict=True))
-    assert heard(garbled).answers == 0 and heard(garbled).duplicate
 
 
 @pytest.mark.parametrize("shift", range(1, len(ONE)))
 def test_an_answer_that_begins_inside_the_other_is_a_duplicate_id(shift):
     overlap = bytes(a & b for a, b in zip(ONE[shift:] + b"\xff" * shift, OTHER, strict=True))
     assert heard(ONE[:shift] + overlap + OTHER[len(OTHER) - shift :]).duplicate
-
-
-def test_the_older_frame_is_judged_the_same_way():
-    answer = protocol1.encode(3, 0)
-    assert not heard(answer, protocol=1).duplicate
-    assert heard(answer, answer, protocol=1).answers == 2
-    assert heard(answer, b"\x00", protocol=1).duplicate
 
 
 def test_a_wire_that_never_falls_silent_is_left_alone():

@@ -119,6 +119,7 @@ ARROWS = [  # how its head is set, what happens, where it is then, the fault it 
     (pinch("hold", on_fault="reduce"), [("overloads",), ("fails",)], FAULTY, "overload"),
     (pinch("limp"), [("overloads",), ("run", 0.1 + rules.LIMP_S)], LIMP, "pinched"),  # not yet seen limp
     (pinch("limp"), [("overloads",), ("take_torque", False, 4.0), ("run", 4.0)], REJOINING, None),
+    (pinch("limp"), [("overloads",), ("silent", 1.0), ("take_torque", False, 4.0), ("run", 4.0)], REJOINING, None),
     ({}, [("take_torque", False, 0.0)], RETURNING, "torque lost"),
     ({"on_fault": "hold"}, [("fails",), ("take_torque", False, 0.1)], LIMP, "overload"),  # its own protection
     ({}, [("distrust", "watchdog", 0.0)], RETURNING, "watchdog"),

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from chain_rig import ServoRig
+from chain_rig import ServoRig, limits_of, plugged
 from emulated_devices import device_of, servos_of
 from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_on
 from hypothesis import given
@@ -28,13 +28,10 @@ class Rig(ServoRig):
         firmware_map = load_firmware_map(model)
         self.table = table = Table.of(firmware_map)
         self.deg = 360.0 / table.ticks_per_revolution
-        self.names = ("cw_angle_limit", "ccw_angle_limit")
-        if "cw_angle_limit" not in table.fields:
-            self.names = ("min_position_limit", "max_position_limit")
         self.limits = tuple(round(table.center_ticks + end / self.deg) for end in (-LOW_DEG, LOW_DEG))
         end, sign = (self.limits[0], -1) if outside_deg < 0 else (self.limits[1], 1)
         self.start = end + sign * max(1, round(abs(outside_deg) / self.deg))
-        stored = dict(zip(self.names, self.limits, strict=True)) | (registers or {})
+        stored = dict(zip(limits_of(table), self.limits, strict=True)) | (registers or {})
         (there,) = servos_of(model, 1, start_ticks=self.start, registers=stored)
         self.port = LossyPort(device_of(there))
         self.leg = self.servo(1)
@@ -60,12 +57,9 @@ class Rig(ServoRig):
         """The steps of a startup that has its servo moving by now."""
         self.start_up()
         steps = self.startups[0].torque_on()
-        while not (self.state()["torque"] and self.state()["speed"]):
+        while not (self.state(1)["torque"] and self.state(1)["speed"]):
             self.clock.t += next(steps)
         return steps
-
-    def state(self):
-        return self.leg.state(self.clock.t)
 
     def inside(self, ticks):
         return self.limits[0] <= round(ticks) <= self.limits[1]
@@ -75,27 +69,24 @@ class Rig(ServoRig):
         return {name: self.held(name) for name in wanted} == dict(wanted)
 
 
+PROFILES = [(model, {}) for model in MODELS] + [
+    (model, {"drive_mode": BY_TIME}) for model in ("xl330-m288", "mx-28-2.0")
+]
+
+
 @pytest.mark.parametrize("outside_deg", [-12.0, -0.3, 0.3, 12.0])
-@pytest.mark.parametrize("model", MODELS)
-def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, outside_deg):
-    rig = Rig(model, outside_deg)
+@pytest.mark.parametrize(("model", "registers"), PROFILES)
+def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, registers, outside_deg):
+    rig = Rig(model, outside_deg, registers)
     rig.start_up()
     held = switched_on(rig.startups[0])
     assert rig.inside(held) and rig.held("torque_enable") == 1 and rig.held("goal_position") == held
     assert rig.usual_profile()
     assert all(rig.inside(goal) for goal in rig.goals)
     assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
-    assert rig.state()["position"] == pytest.approx(held, abs=2)
+    assert rig.state(1)["position"] == pytest.approx(held, abs=2)
     rig.clock.t += 1.0
-    assert rig.state()["position"] == pytest.approx(held, abs=2)
-
-
-@pytest.mark.parametrize("model", ["xl330-m288", "mx-28-2.0"])
-def test_a_profile_that_is_told_in_time_is_as_slow(model):
-    rig = Rig(model, -12.0, {"drive_mode": BY_TIME})
-    rig.start_up()
-    assert rig.inside(switched_on(rig.startups[0])) and rig.usual_profile()
-    assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert rig.state(1)["position"] == pytest.approx(held, abs=2)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -126,7 +117,7 @@ def test_one_that_does_not_come_is_let_go_and_named(model):
     expected = rf"leg \(id 1\) stands at {rig.start}, outside its own limits {low}\.\.{high}.*torque is off"
     with pytest.raises(ServoError, match=expected):
         switched_on(rig.startups[0])
-    assert not rig.state()["torque"] and rig.clock.t < 5.0 and rig.usual_profile()
+    assert not rig.state(1)["torque"] and rig.clock.t < 5.0 and rig.usual_profile()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -136,7 +127,7 @@ def test_whoever_takes_the_torque_meanwhile_ends_it(model):
     rig.leg.write(torque.address, torque.to_bytes(0), rig.clock.t)
     with pytest.raises(ServoError, match="leg"):
         finish(steps, lambda duration_s: rig.port.wait_until(rig.clock.t + duration_s))
-    assert not rig.state()["torque"] and not rig.inside(rig.state()["position"])
+    assert not rig.state(1)["torque"] and not rig.inside(rig.state(1)["position"])
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -144,7 +135,7 @@ def test_a_job_that_is_dropped_half_way_leaves_torque_off(model):
     rig = Rig(model, -12.0)
     steps = rig.on_the_way()
     steps.close()
-    assert not rig.state()["torque"]
+    assert not rig.state(1)["torque"]
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -155,9 +146,9 @@ def test_one_that_was_lost_sight_of_half_way_is_let_go_before_its_profile_is_mad
     with pytest.raises(Silent):
         finish(steps)
     rig.port.fate = iter(())
-    assert rig.state()["torque"]  # nobody could tell it
+    assert rig.state(1)["torque"]  # nobody could tell it
     rig.start_up()
-    assert not rig.state()["torque"] and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert not rig.state(1)["torque"] and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
     assert rig.inside(switched_on(rig.startups[0])) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
 
 
@@ -185,7 +176,7 @@ def test_one_that_would_go_round_the_other_side_is_refused():
     with pytest.raises(ServoError, match=r"stands at 4060, outside its own limits 20\.\.3000.*turn it in by hand"):
         rig.start_up()
         switched_on(rig.startups[0])
-    assert not rig.state()["torque"]
+    assert not rig.state(1)["torque"]
 
 
 # --- with a bus -------------------------------------------------------------------------------------------------
@@ -194,13 +185,13 @@ STORED = {"min_position_limit": 1300, "max_position_limit": 2800}
 SAGGED = 1200
 
 
-def sagged(make_rig):
-    return make_rig([EmulatedServo(1, start_ticks=2048), EmulatedServo(2, start_ticks=SAGGED, registers=STORED)])
+def sagged():
+    return plugged([EmulatedServo(1, start_ticks=2048), EmulatedServo(2, start_ticks=SAGGED, registers=STORED)])
 
 
-def test_enable_waits_for_it_and_says_so(make_rig, caplog):
+def test_enable_waits_for_it_and_says_so(caplog):
     caplog.set_level(NOTE)
-    rig = sagged(make_rig)
+    rig = sagged()
     held = rig.hold()
     assert rig.state(2)["position"] >= STORED["min_position_limit"]
     assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
@@ -209,8 +200,8 @@ def test_enable_waits_for_it_and_says_so(make_rig, caplog):
     assert readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
 
 
-def test_torque_off_from_outside_ends_enable_with_torque_off(make_rig):
-    rig = sagged(make_rig)
+def test_torque_off_from_outside_ends_enable_with_torque_off():
+    rig = sagged()
     rig.bus.connect()
     plain = rig.clock.wait_until
 
@@ -227,8 +218,8 @@ def test_torque_off_from_outside_ends_enable_with_torque_off(make_rig):
     assert rig.state(2)["position"] < STORED["min_position_limit"]
 
 
-def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_rig):
-    rig = sagged(make_rig)
+def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus():
+    rig = sagged()
     held = rig.hold()
     rig.supply(0.0)
     rig.ticks(held, 60)
@@ -238,9 +229,9 @@ def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus(make_r
     assert rig.state(2)["position"] >= STORED["min_position_limit"]
 
 
-def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(make_rig, caplog):
+def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(caplog):
     caplog.set_level(NOTE)
-    rig = make_rig([EmulatedServo(1, start_ticks=4000)])
+    rig = plugged([EmulatedServo(1, start_ticks=4000)])
     held = rig.hold()
     (line,) = caplog.messages
     assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line

@@ -3,7 +3,7 @@
 import logging
 
 import pytest
-from chain_rig import bus_of
+from chain_rig import bus_of, plugged
 from emulated_port import EmulatedPort, Says
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,11 +30,10 @@ class OldFirmware(WrappedPort):
 
 
 @pytest.mark.parametrize("fast_read", ["auto", "on"])
-def test_servos_without_fast_sync_read_are_read_plainly_from_then_on(make_rig, fast_read, caplog):
-    rig = make_rig([EmulatedServo(i) for i in range(1, 6)])
-    port = OldFirmware(rig.open_port())
-    maps = [load_firmware_map("xl330-m288")] * rig.count
-    rig.bus = bus_of(maps, range(1, rig.count + 1), lambda: port, fast_read=fast_read)
+def test_servos_without_fast_sync_read_are_read_plainly_from_then_on(fast_read, caplog):
+    rig = plugged([EmulatedServo(i) for i in range(1, 6)])
+    port = OldFirmware(rig.port)
+    rig.bus = bus_of([load_firmware_map("xl330-m288")] * 5, range(1, 6), lambda: port, fast_read=fast_read)
     held = rig.hold()
     for _ in range(60):
         assert all(r.age_s == 0.0 for r in rig.ticks(held, 1).values())
@@ -44,8 +43,8 @@ def test_servos_without_fast_sync_read_are_read_plainly_from_then_on(make_rig, f
     assert ("fast sync read is not answered" in caplog.text) == (fast_read == "on")
 
 
-def test_slow_wire_brings_positions_every_tick_and_the_rest_in_turn(make_rig):
-    rig = make_rig([EmulatedServo(i, start_ticks=2048) for i in range(1, 29)])
+def test_slow_wire_brings_positions_every_tick_and_the_rest_in_turn():
+    rig = plugged([EmulatedServo(i, start_ticks=2048) for i in range(1, 29)])
     held = rig.hold()
     rig.supply(5.5)
     seen = []

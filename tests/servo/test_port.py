@@ -11,13 +11,9 @@ from contextlib import contextmanager
 
 import pytest
 import serial
-from emulated_port import ScriptedPort
 from virtual_time import Time
 
-from sfms_robot.emulator.launch import EmulatedServo, launch
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
-from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.port import (
     DEVICE_ERRORS,
     PolledIO,
@@ -88,21 +84,6 @@ def test_impossible_baud_rate_is_an_error_of_one_line(baud):
         with pytest.raises(PortError, match=f"{device}: "):
             SerialPort(device, baud, Time())
         SerialPort(device, 57600, Time()).close()
-
-
-@contextmanager
-def virtual(servo, baud=1_000_000):
-    """The emulator of one servo in its own process: it, its clock, and what opens a port to it."""
-    clock = Time()
-    with launch([servo], virtual=True) as chain:
-        yield chain, clock, lambda: VirtualTimePort(chain.device, chain.control, baud, clock)
-
-
-@contextmanager
-def linked(open_port, baud=1_000_000):
-    link = Dynamixel2Link(open_port(), baud, 0.003)
-    yield link
-    link.port.close()
 
 
 def test_device_that_takes_no_more_bytes_is_a_failure_and_no_hang():
@@ -178,47 +159,6 @@ def test_device_that_goes_away_is_a_failure_of_the_bus():
 def test_virtual_port_needs_an_emulator(tmp_path):
     with pytest.raises(PortError, match="no emulator answers there"):
         VirtualTimePort("/dev/null", str(tmp_path / "control"), 57600, Time())
-
-
-def test_rubbish_neither_hangs_nor_confuses():
-    noise = bytes((i * i * 31 + i // 7) & 0xFF for i in range(100_000))
-    with virtual(EmulatedServo(1)) as (chain, clock, open_port):
-        port = open_port()
-        port.write(noise)
-        assert port.read(1 << 16, 0.0) == b""
-        port.close()
-        clock.t = 1.0
-        with linked(open_port) as link:
-            assert link.ping(1) is not None
-        assert chain.digest()[1] > 100_000
-
-
-def test_second_host_in_virtual_time_starts_from_zero():
-    with virtual(EmulatedServo(1)) as (_, _, open_port):
-        for _ in range(2):
-            with linked(open_port) as link:
-                assert link.read(1, 132, 4) is not None
-
-
-def test_answers_are_taken_by_id_and_length():
-    four, late, foreign = (
-        dxl2.encode_status(1, 0, b"\x01\x02\x03\x04"),
-        dxl2.encode_status(1, 0, b"\x09"),
-        dxl2.encode_status(2, 0, b"\x05\x06\x07\x08"),
-    )
-    link = Dynamixel2Link(ScriptedPort(late + foreign[:5], foreign[5:] + b"\xff\xff" + four), 1_000_000, 0.003)
-    assert link.read(1, 132, 4).data == b"\x01\x02\x03\x04"
-
-
-def test_own_echo_is_not_an_answer():
-    echo = dxl2.encode_instruction(1, dxl2.PING)
-    link = Dynamixel2Link(ScriptedPort(echo), 1_000_000, 0.003)
-    assert link.ping(1) is None
-
-
-def test_refusal_without_data_is_an_answer():
-    link = Dynamixel2Link(ScriptedPort(dxl2.encode_status(1, dxl2.ACCESS_ERROR)), 1_000_000, 0.003)
-    assert link.read(1, 132, 4).error == dxl2.ACCESS_ERROR
 
 
 @contextmanager
@@ -298,14 +238,10 @@ def test_a_driver_that_switches_by_itself_is_told_to():
 
 @pytest.mark.parametrize(("how", "problem"), [("kernel", "driver of this device does not"), ("rts", "no RTS line")])
 def test_a_device_without_a_direction_is_refused_and_left_closed(how, problem):
-    far, near = os.openpty()
-    tty.setraw(near)
-    device = os.ttyname(near)
-    with pytest.raises(PortError, match=f"{device}: rs485 = '{how}': .*{problem}"):
-        SerialPort(device, 57600, Time(), how)
-    SerialPort(device, 57600, Time()).close()  # somebody who still held it would be in the way
-    os.close(near)
-    os.close(far)
+    with terminal() as (_, device):
+        with pytest.raises(PortError, match=f"{device}: rs485 = '{how}': .*{problem}"):
+            SerialPort(device, 57600, Time(), how)
+        SerialPort(device, 57600, Time()).close()  # somebody who still held it would be in the way
 
 
 REFUSED = """

@@ -86,9 +86,7 @@ def test_error_byte_of_protocol_1_names_the_servos_faults_and_not_the_packets():
 @pytest.mark.parametrize(
     ("role", "names"),
     [
-        ("goal_position", ["goal_position"] * 5),
         ("present_speed", ["present_velocity", "present_speed", "present_speed"] + ["present_velocity"] * 2),
-        ("voltage", ["present_input_voltage"] + ["present_voltage"] * 4),
         ("status_level", ["status_return_level"] * 3 + ["response_level"] * 2),
         ("error_status", ["hardware_error_status", None, None, "status", "status"]),
         ("present_current", ["present_current", None, "current", "present_current", "present_current"]),

@@ -405,19 +405,6 @@ def test_bytes_on_the_wire_are_those_that_are_counted(rig, request, count):
             assert spent(read) == framing.reads(count, where.size, way)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_same_goals_make_the_same_bytes(family):
-    def sent():
-        with emulated(family) as rig:
-            held = rig.hold()
-            for k in range(60):
-                rig.ticks(held - np.copysign(0.1, held) * math.sin(k / 10) ** 2, 1)
-            rig.bus.stop("release")
-            return rig.sent
-
-    assert sent() == sent()
-
-
 # --- what servos have stored ------------------------------------------------------------------------------------
 
 REFUSED, WARNED, SET = "refused", "warned", "set"
@@ -477,22 +464,15 @@ def gone_and_back(name, register, value):
     """A rig in whose run servo 2 went away, got a value stored, and came back."""
     rig = stored_rig(name, {})
     held = rig.hold()
-
-    def ticks(n):
-        for _ in range(n):
-            rig.clock.t += 0.02
-            rig.bus.write(held, rig.clock.t)
-            rig.bus.poll(rig.clock.t)
-
-    ticks(3)
+    rig.ticks(held, 3, 0.02)
     rig.kill(2)
-    ticks(30)
+    rig.ticks(held, 30, 0.02)
     rig.set(2, "torque_enable", 0)
     if "lock" in rig.servo(2).table.fields:
         rig.set(2, "lock", 0)
     rig.set(2, register, value)
     rig.revive(2)
-    ticks(600)
+    rig.ticks(held, 600, 0.02)
     assert rig.register(2, register) == value
     return rig
 
@@ -547,6 +527,9 @@ def test_no_joint_is_confirmed_over_a_port_that_is_gone(rig):
     rig.ticks(held, 5)
     rig.bus.stop("release")
     assert unconfirmed(rig) == list(rig.bus.joints)
+    rig.chain.come_back()
+    rig.bus.stop("release")  # opens the port that is back
+    assert unconfirmed(rig) == [] and not any(rig.torques())
 
 
 @pytest.mark.emulated

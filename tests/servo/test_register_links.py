@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import PacketError
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink
+from sfms_robot.servo.codecs.dxl2 import ACCESS_ERROR, encode_status
 from sfms_robot.servo.codecs.protocol1 import encode
 
 
@@ -31,20 +32,13 @@ def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):
     assert tool.broadcast_ping() == {1: found, 2: found}
 
 
-@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
-def test_registers_are_read_and_written(model):
-    link, rig = link_of(model, [500])
-    position = rig.servo(1).table["present_position"]
-    assert link.read(1, position.address, 2) == Answer(0, b"\xf4\x01")
-    goal = rig.servo(1).table["goal_position"].address
-    assert link.write(1, goal, b"\x00\x02") == Answer(0, b"")
-    assert link.read(1, goal, 2) == Answer(0, b"\x00\x02")
-
-
 def test_refusal_is_an_answer():
     link, _ = link_of("ax-12a", [512])
     assert link.write(1, 36, b"\x00\x00") == Answer(0x08, b"")
     assert link.read(1, 48, 20) == Answer(0x08, b"")
+    newer, rig = link_of("xl330-m288", [2048])
+    rig.port.device = Says(encode_status(1, ACCESS_ERROR))
+    assert newer.read(1, 132, 4).error == ACCESS_ERROR
 
 
 def test_what_the_protocol_cannot_do_is_said():
@@ -56,10 +50,11 @@ def test_what_the_protocol_cannot_do_is_said():
     assert link.factory_reset(1, 0xFF) == Answer(0, b"")
 
 
-@pytest.mark.parametrize("other", [encode(2, 0, b"\x01\x02"), encode(1, 0, b"\x01"), encode(1, 0, b"\x01\x02\x03")])
-def test_answer_of_another_servo_or_length_is_left_alone(other):
-    link, rig = link_of("ax-12a", [500])
-    rig.port.device = Says(other)
+@pytest.mark.parametrize(("model", "status"), [("ax-12a", encode), ("xl330-m288", encode_status)])
+@pytest.mark.parametrize(("servo", "data"), [(2, b"\x01\x02"), (1, b"\x01"), (1, b"\x01\x02\x03")])
+def test_answer_of_another_servo_or_length_is_left_alone(model, status, servo, data):
+    link, rig = link_of(model, [500])
+    rig.port.device = Says(status(servo, 0, data))
     assert link.read(1, 36, 2) is None
 
 
@@ -104,11 +99,12 @@ def test_debt_is_forgotten_after_a_second():
     assert len(rig.port.sent) - before == 1
 
 
-@pytest.mark.parametrize("model", ["ax-12a", "sts3215"])
+@pytest.mark.parametrize("model", ["ax-12a", "sts3215", "xl330-m288"])
 def test_own_words_heard_again_are_no_answer(model):
     link, rig = link_of(model, [500])
     rig.port.hears_itself = True
-    assert link.read(1, rig.servo(1).table["present_position"].address, 2) == Answer(0, b"\xf4\x01")
+    position = rig.servo(1).table["present_position"]
+    assert link.read(1, position.address, position.size) == Answer(0, position.to_bytes(500))
     rig.kill(1)
     assert link.ping(1) is None
     assert link.read(1, 36, 2) is None
@@ -129,6 +125,8 @@ def test_servo_whose_answer_to_a_ping_is_the_ping_itself_is_there(model, hears_i
 
 @given(st.binary(max_size=40))
 def test_rubbish_before_an_answer_does_not_hide_it(rubbish):
-    link, rig = link_of("sts3215", [500])
-    rig.port.device = Says(rubbish.replace(b"\xff", b"\x00"), rig.device)
-    assert link.read(1, 56, 2) == Answer(0, b"\xf4\x01")
+    for model in ("sts3215", "xl330-m288"):
+        link, rig = link_of(model, [500])
+        position = rig.servo(1).table["present_position"]
+        rig.port.device = Says(rubbish.replace(b"\xff", b"\x00"), rig.device)
+        assert link.read(1, position.address, 2) == Answer(0, b"\xf4\x01")
