@@ -179,14 +179,6 @@ def test_mode_that_cannot_be_changed_under_torque_is_an_error():
         rig.bus.connect()
 
 
-def test_servo_in_shutdown_is_named_at_torque_on():
-    rig = rig_of("ax-12a", [512, 512])
-    rig.bus.connect()
-    rig.servo(2).fail(1 << 2, 0.0)
-    with pytest.raises(ServoError, match=r"joint2 \(id 2\).*torque_enable was set to 1 and reads 0.*overheating"):
-        rig.bus.enable(rig.bus.joints)
-
-
 def test_mx_servos_are_read_together_and_a_mixed_bus_one_by_one():
     together = rig_of("mx-28-1.0", [2048] * 6)
     held = together.hold()

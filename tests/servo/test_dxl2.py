@@ -19,11 +19,6 @@ def test_crc_check_value():
     assert crc16(b"123456789") == 0xFEE8
 
 
-@given(st.binary(max_size=50), st.binary(max_size=50))
-def test_crc_continues(head, tail):
-    assert crc16(tail, crc16(head)) == crc16(head + tail)
-
-
 @given(ids, st.sampled_from([dxl2.READ, dxl2.WRITE, dxl2.SYNC_WRITE]), params)
 def test_instruction_round_trip(servo, code, data):
     assert take(bytearray(encode_instruction(servo, code, data))) == Packet(servo, code, data)

@@ -62,10 +62,6 @@ def test_value_that_does_not_fit_is_refused(table, name, value):
         table[name].to_bytes(value)
 
 
-def test_current_velocity_and_position_are_one_block():
-    assert X.span(["present_position", "present_current", "present_velocity"]) == (126, 10)
-
-
 @pytest.mark.parametrize("model", [*SERVOS, "xl-320", "maestro-24", "ssc-32"])
 def test_table_survives_json(model):
     firmware_map = load_firmware_map(model)

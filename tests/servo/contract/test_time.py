@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from families import FAMILIES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from timed import CHAINS, READ_DEADLINE_S, timed
@@ -320,7 +319,3 @@ def test_watchdog_whose_first_write_is_lost_is_armed_all_the_same():
     servo.write = write
     rig.ticks(held, 3)
     assert [rig.register(i, "bus_watchdog") for i in rig.ids] == [10] * 4
-
-
-def test_every_family_of_a_chain_is_tried():
-    assert set(CHAINS) == {name for name, family in FAMILIES.items() if family.table.protocol is not None}
