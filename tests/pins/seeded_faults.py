@@ -112,10 +112,10 @@ FAULTS = (
     Fault("runtime/loop.py", "if not parts.halt.causes:", "if True:", LOOP),
     Fault("runtime/states.py", "        elif halted:", "        elif False:", LOOP),
     # decoders
-    Fault("sources/live_link.py", "if data[0] != VERSION:", "if data[0] > VERSION:", SOURCES),
+    Fault("sources/live_link.py", "if 0 < data[0] < VERSION:", "if data[0] > VERSION:", SOURCES),
     Fault("sources/live_link.py", "return motion_of(packet.values)", "return packet.values[:58]", SOURCES),
     Fault("sources/live_link.py", "if forward < 0:", "if forward < -9:", SOURCES),
-    Fault("sources/live_link.py", "[2.0] * 52 + [2 * np.pi] * 9", "[9e9] * 61", SOURCES),
+    Fault("sources/live_link.py", "values <= len(data) == values + 4 * data[values - 1]", "True", SOURCES),
     Fault(
         "sources/live_link.py",
         '_FRAME: Final = struct.Struct(">ifiiB")',
