@@ -151,7 +151,7 @@ def test_commands_that_learn_and_measure_stay_here(watched):
     flags = ["--config", "tiny.yaml", "--data", "data", "--out", "out", "--device", "cpu"]
     watched.run("train", "tokenizer", *flags, "--tensorboard")
     watched.run("train", "listener", *flags, "--no-tensorboard")
-    watched.run("evaluate", "tokenizer", "--listener", "out", "--data", "data")
+    watched.run("evaluate", "tokenizer", "--listener", "out", "--data", "data", "--split", "validation")
     watched.run("bench", "retarget")
     assert watched.strangers() == []
 

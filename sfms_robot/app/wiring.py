@@ -66,7 +66,7 @@ class EmulatedPort(SerialPort):
     """
 
     def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
-        self._late_s = 0.0
+        self._late_s = self._written_s = 0.0
         self._written = self._got = 0
         self._settled = True  # the emulator has confirmed that nothing is to come
         self._owed = 0  # answers of the emulator that have not come
@@ -85,12 +85,13 @@ class EmulatedPort(SerialPort):
         self._settled = False
         super().write(data)
         self._written += len(data)
+        self._written_s = self.now_s()
 
     def read(self, n: int, deadline_s: float) -> bytes:
         data = super().read(n, deadline_s)
         if not data and not self._settled:
             began_s = self.now_s()
-            data = self._late_bytes(n)
+            data = self._late_bytes(n, min(deadline_s - self._written_s, _PATIENCE_S))
             self._late_s += self.now_s() - began_s
         self._got += len(data)
         return data
@@ -109,9 +110,12 @@ class EmulatedPort(SerialPort):
         super().close()
         self._control.close()
 
-    def _late_bytes(self, n: int) -> bytes:
-        """Return bytes that the emulator has sent and that were not read; empty if there are none."""
-        sent = self._ask()
+    def _late_bytes(self, n: int, patience_s: float) -> bytes:
+        """Return bytes that the emulator has sent and that were not read; empty if there are none.
+
+        `patience_s`: from the last write to the deadline, which the emulator has too, from when the bytes came to it.
+        """
+        sent = self._ask(patience_s)
         self._settled = sent is not None and sent <= self._got
         if sent is None or self._settled:
             return b""
@@ -120,15 +124,15 @@ class EmulatedPort(SerialPort):
             self._got, self._settled = sent, True
         return data
 
-    def _ask(self) -> int | None:
+    def _ask(self, patience_s: float = 0.0) -> int | None:
         """Return the bytes that the emulator has sent so far; None if it does not answer in time."""
         answers = b""
         try:
             self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
             while self._owed:
                 self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
-            self._control.settimeout(_PATIENCE_S)
-            self._control.sendall(b"quiet %d\n" % self._written)
+            self._control.settimeout(_PATIENCE_S + max(0.0, patience_s))
+            self._control.sendall(b"quiet %d %.6f\n" % (self._written, max(0.0, patience_s)))
             self._owed = 1
             while not answers.endswith(b"\n"):
                 if not (part := self._control.recv(_CHUNK)):

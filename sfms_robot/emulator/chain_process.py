@@ -11,8 +11,9 @@ control socket says how many there are and what time it is. Control requests and
 
     sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
                                                  due by UNTIL; what came by SECONDS for bytes before FROM is lost
-    quiet BYTES                      quiet LENGTH  take BYTES in total and send what is due: LENGTH bytes in total,
-                                                 both since the client's first such request
+    quiet BYTES SECONDS              quiet LENGTH  take BYTES in total and send what is due within SECONDS after the
+                                                 last of them: LENGTH bytes in total, both since the client's first
+                                                 such request
     time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
@@ -216,6 +217,7 @@ class Server:
         self._start_s = time.monotonic()
         self._now_s = 0.0
         self._idled_s = 0.0
+        self._received_s = 0.0  # when bytes came last
 
     def run(self, ended: socket.socket) -> None:
         """Serve until `ended` can be read."""
@@ -233,9 +235,13 @@ class Server:
                 elif each in self._clients:
                     self._serve(self._clients[each])
                 elif self._device is not None and (data := self._device.take(_CHUNK, 0.0)):
-                    self._wire.receive(data, self._device.baud(), self._now())
+                    self._receive(data, self._device)
             if not self._virtual:
                 self._deliver()
+
+    def _receive(self, data: bytes, device: Device) -> None:
+        self._received_s = self._now()
+        self._wire.receive(data, device.baud(), self._received_s)
 
     def _now(self) -> float:
         if not self._virtual:
@@ -277,7 +283,7 @@ class Server:
                 if words[0] == "sync":
                     self._sync(client, int(words[1]), int(words[2]), *map(float, words[3:5]))
                 elif words[0] == "quiet":
-                    client.reply(self._quiet(client, int(words[1])))
+                    client.reply(self._quiet(client, int(words[1]), float(words[2])))
                 else:
                     client.reply(self._command(words))
             except (ValueError, IndexError, TypeError):
@@ -316,16 +322,23 @@ class Server:
         device.send(reply, _PATIENCE_S)
         self._wire.sent(outs, None)
 
-    def _quiet(self, client: _Client, count: int) -> str:
-        """Take the bytes that a client has written, and send all that is due: a silence after that is the servos'."""
+    def _quiet(self, client: _Client, count: int, patience_s: float) -> str:
+        """Take the bytes that a client has written, and send what is due in its patience: silence is the servos' then.
+
+        Bytes may have come here later than they were written; the client's patience counts from when they came.
+        """
         if client.since is None:
             client.since = self._wire.traffic
         received, sent = client.since
         while self._device is not None and self._wire.traffic[0] - received < count:
             if not (data := self._device.take(_CHUNK, _PATIENCE_S)):
                 break
-            self._wire.receive(data, self._device.baud(), self._now())
+            self._receive(data, self._device)
         self._deliver()
+        until_s = self._received_s + patience_s
+        while self._device is not None and self._now() < until_s and self._wire.next_s <= until_s:
+            time.sleep(max(0.0, self._wire.next_s - self._now()))
+            self._deliver()
         return f"quiet {self._wire.traffic[1] - sent}"
 
     def _command(self, words: list[str]) -> str:

@@ -119,7 +119,7 @@ CASES = [
         )
         for number in ("1" * 21, "1" * 5000)
     ),
-    (TABLE + " 5", 2, ["--table '5' is not one of 3, 4, all"]),
+    (TABLE + " 5", 2, ["--table '5' is not one of 3, 4, 3-placements, 4-codes, all"]),
     (TABLE + " 3 --train", 2, ["--train needs --models DIR"]),
     (TABLE + " 4 --data {tmp}/folder.png --models {tmp}/m", 2, ["no face tracks (*.csv, *.csv.gz) below it"]),
     ("evaluate tokenizer", 2, ["--data is needed without --table"]),

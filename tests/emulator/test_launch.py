@@ -99,6 +99,11 @@ def test_a_silence_counts_only_if_the_emulator_confirms_it(transport):
         port.wait_until(deadline_s + 0.001)
         assert clock.now_s() > clock.at_s + 0.001  # which is not time of the servos
         assert port.read(14, port.now_s()) == b""
+        chain.inject("delay:1=0.01")  # less than the patience, which counts from when the request comes to the servo
+        clock.at_s = clock.now_s() + 0.02
+        os.kill(chain.pid, signal.SIGSTOP)
+        port.write(encode_instruction(1, dxl2.PING))
+        assert len(port.read(14, port.now_s() + 0.02)) == 14
         port.close()
 
 
