@@ -34,7 +34,8 @@ TESTS = (HERE.parent, HERE.parent / "servo", HERE.parent / "servo" / "contract")
 TOLERANCE = 1e-4
 SECTIONS = ("options", "keys", "wire", "figures")
 HEADS, LISTENERS, SEEDS, SECONDS = ("face28", "reachy_mini"), ("sfms-small", "arig-small"), (0, 1, 2, 3), 20
-MANY = 12  # a mapping with more keys, all of one shape, is keyed by names (joints, channels): written as "*"
+# A mapping with more keys, all of one shape, is keyed by names (joints, channels): written as "*". A servo has 13 values.
+MANY, MANY_VALUES = 12, 20
 
 # Commands that end within seconds on emulated servos. {tmp} is a folder of its own; earlier lines write what later
 # ones read. Commands that train or score for minutes are left out: every command fails the same way.
@@ -113,7 +114,8 @@ def key_paths(value: Any, at: str = "") -> set[str]:
         return {at}
     below = {name: key_paths(each) for name, each in value.items()}
     alike = len({frozenset(paths) for paths in below.values()}) == 1
-    if alike and len(below) > MANY:
+    values = all(paths == {""} for paths in below.values())
+    if alike and len(below) > (MANY_VALUES if values else MANY):
         below = {"*": next(iter(below.values()))}
     return {f"{at}.{name}{path}" for name, paths in below.items() for path in paths}
 
