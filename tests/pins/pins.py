@@ -34,7 +34,8 @@ TESTS = (HERE.parent, HERE.parent / "servo", HERE.parent / "servo" / "contract")
 TOLERANCE = 1e-4
 SECTIONS = ("options", "keys", "wire", "figures")
 HEADS, LISTENERS, SEEDS, SECONDS = ("face28", "reachy_mini"), ("sfms-small", "arig-small"), (0, 1, 2, 3), 20
-# A mapping with more keys, all of one shape, is keyed by names (joints, channels): written as "*". A servo has 13 values.
+# A mapping with more keys, all of one shape, is keyed by names (joints, channels): written as "*". A servo has 13
+# values.
 MANY, MANY_VALUES = 12, 20
 
 # Commands that end within seconds on emulated servos. {tmp} is a folder of its own; earlier lines write what later
