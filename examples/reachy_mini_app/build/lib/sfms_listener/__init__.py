@@ -1,1 +1,0 @@
-"""A Reachy Mini app in which the robot listens."""
