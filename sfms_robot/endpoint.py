@@ -14,6 +14,8 @@ import ipaddress
 import socket
 import struct
 import sys
+import threading
+from contextlib import suppress
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -179,3 +181,43 @@ def addresses_of_this_machine() -> list[str]:
                 continue
             addresses.append(socket.inet_ntoa(answer[20:24]))
     return [address for address in addresses if not address.startswith("127.")]
+
+
+class ServerThread:
+    """A thread with an event loop for a server on a socket that listens already. Its port is held until `close`.
+
+    A subclass defines `_serve`, which serves `_socket` and returns soon after `_closing` is set.
+    """
+
+    def __init__(self, listening: socket.socket, name: str, stop_s: float) -> None:
+        import asyncio  # slow to load, and most users of this module have no server
+
+        self._socket, self._stop_s = listening, stop_s
+        self._loop = asyncio.new_event_loop()
+        self._closing = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Take connections from now on. Idempotent."""
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Close every connection and give the port back. Blocks `stop_s` at most. Idempotent."""
+        if self._thread.ident is None:
+            self._loop.close()
+            self._socket.close()
+        elif self._thread.is_alive():
+            with suppress(RuntimeError):  # it has ended meanwhile
+                self._loop.call_soon_threadsafe(self._closing.set)
+            self._thread.join(self._stop_s)
+
+    async def _serve(self) -> None:
+        raise NotImplementedError
+
+    def _run(self) -> None:
+        try:
+            self._loop.run_until_complete(self._serve())
+        finally:
+            self._loop.close()
+            self._socket.close()

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from http import HTTPStatus
@@ -34,7 +33,7 @@ from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, listen, origin_problem, port_number
+from sfms_robot.endpoint import LOOPBACK, ServerThread, address_text, host_problem, listen, origin_problem, port_number
 from sfms_robot.errors import NOTE, ConfigError
 from sfms_robot.frames import BLENDSHAPES, POSE, POSE_CHANNELS, SHAPES
 from sfms_robot.ports import Output, OutputFrame
@@ -86,7 +85,7 @@ def json_of(frame: OutputFrame) -> bytes:
     )
 
 
-class JsonStream(Output):
+class JsonStream(ServerThread, Output):
     """Server of JSON frames. Holds its port from construction on. Raises ConfigError, PortError."""
 
     kind = "json"
@@ -98,19 +97,16 @@ class JsonStream(Output):
                 f"--output json:{argument}: expected a TCP port of this machine from 0 to 65535 (0: any free one), "
                 f"got {argument!r}"
             )
-        self._socket = listen("--output json", LOOPBACK, port)
+        super().__init__(listen("--output json", LOOPBACK, port), "output json", 2 * _STOP_S)
         self.peer = address_text(*self._socket.getsockname()[:2])
         self._counts = dict.fromkeys(("refused", "missed"), 0)
         self._clients: set[ServerConnection] = set()  # open; for the server's thread
         self._opening: dict[ServerConnection, None] = {}  # oldest first
-        self._loop = asyncio.new_event_loop()
-        self._closing = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="output json", daemon=True)
 
     def open(self) -> None:
         """Take clients from now on. Idempotent."""
         if self._thread.ident is None:
-            self._thread.start()
+            self.start()
             logger.log(NOTE, "output json: ws://%s/", self.peer)
 
     def send(self, frame: OutputFrame, now_s: float) -> None:
@@ -124,27 +120,10 @@ class JsonStream(Output):
         """Return connected clients, refused ones, and frames that slow ones missed."""
         return {"clients": len(self._clients), **self._counts}
 
-    def close(self) -> None:
-        """Disconnect all clients and give the port back. Idempotent."""
-        if self._thread.ident is None:
-            self._loop.close()
-            self._socket.close()
-        elif self._thread.is_alive():
-            with suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._closing.set)
-            self._thread.join(2 * _STOP_S)
-
     def _send(self, message: str) -> None:
         reading = [each for each in self._clients if each.transport.get_write_buffer_size() <= MOST_UNREAD]
         self._counts["missed"] += len(self._clients) - len(reading)
         broadcast(reading, message)
-
-    def _run(self) -> None:
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._loop.close()
-            self._socket.close()
 
     async def _serve(self) -> None:
         class Client(RoomyConnection):

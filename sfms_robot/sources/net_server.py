@@ -22,7 +22,6 @@ import re
 import socket
 import struct
 import sys
-import threading
 from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing, suppress
@@ -33,7 +32,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
-from sfms_robot.endpoint import address_text, listen, origin_problem
+from sfms_robot.endpoint import ServerThread, address_text, listen, origin_problem
 from sfms_robot.errors import PacketError
 from sfms_robot.sources.net_messages import LONGEST, Message, json_message, parse_message
 
@@ -66,7 +65,7 @@ class Handler(Protocol):
         """Note that a connection is closed, or about to be. Idempotent."""
 
 
-class NetServer:
+class NetServer(ServerThread):
     """Holds one address from construction until `close`; clients wait until `start`. Raises PortError.
 
     Args:
@@ -84,17 +83,9 @@ class NetServer:
         self.handler = handler
         self.connections: set[NetProgram] = set()
         self._said: set[str] = set()
-        self._socket = listen(flag, host, port)
+        super().__init__(listen(flag, host, port), "net", _STOP_S)
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
-        self._loop = asyncio.new_event_loop()
-        self._closing = asyncio.Event()
         self._posted: deque[Callable[[], None]] = deque(maxlen=4 * OUTBOX)
-        self._thread = threading.Thread(target=self._run, name="net", daemon=True)
-
-    def start(self) -> None:
-        """Take connections from now on. Idempotent."""
-        if self._thread.ident is None:
-            self._thread.start()
 
     def post(self, work: Callable[[], None]) -> None:
         """Have `work` called in the server's thread; the oldest is dropped when too much waits. Never blocks."""
@@ -111,25 +102,9 @@ class NetServer:
             self._said.add(key)
             logger.warning("%s (said once)", text)
 
-    def close(self) -> None:
-        """Close every connection and give the port back. Blocks until then. Idempotent."""
-        if self._thread.ident is None:
-            self._loop.close()
-            self._socket.close()
-        elif self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._closing.set)
-            self._thread.join(_STOP_S)
-
     def _work(self) -> None:
         while self._posted:
             self._posted.popleft()()
-
-    def _run(self) -> None:
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._loop.close()
-            self._socket.close()
 
     async def _serve(self) -> None:
         server = await asyncio.start_server(lambda *ends: NetProgram(self, *ends).run(), sock=self._socket)
