@@ -91,7 +91,7 @@ class EmulatedPort(SerialPort):
         data = super().read(n, deadline_s)
         if not data and not self._settled:
             began_s = self.now_s()
-            data = self._late_bytes(n, min(deadline_s - self._written_s, _PATIENCE_S))
+            data = self._late_bytes(n, min(max(0.0, deadline_s - self._written_s), _PATIENCE_S))
             self._late_s += self.now_s() - began_s
         self._got += len(data)
         return data
@@ -131,8 +131,8 @@ class EmulatedPort(SerialPort):
             self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
             while self._owed:
                 self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
-            self._control.settimeout(_PATIENCE_S + max(0.0, patience_s))
-            self._control.sendall(b"quiet %d %.6f\n" % (self._written, max(0.0, patience_s)))
+            self._control.settimeout(_PATIENCE_S + patience_s)
+            self._control.sendall(b"quiet %d %.6f\n" % (self._written, patience_s))
             self._owed = 1
             while not answers.endswith(b"\n"):
                 if not (part := self._control.recv(_CHUNK)):

@@ -248,10 +248,8 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
     check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
-            from sfms_robot.app.wiring import (
-                EmulatedPort,
-                plugged_in,
-            )  # its numerics take longer to load than most tools to run
+            # Its numerics take longer to load than most tools to run.
+            from sfms_robot.app.wiring import EmulatedPort, plugged_in
 
             described = load_head(head)
             board = family_named(next(iter(described.buses.values())).family)

@@ -24,6 +24,7 @@ import soxr
 from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
+from sfms_robot.app.progress import tracked
 from sfms_robot.config import Calmness, find
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -155,16 +156,22 @@ def voice_folders(data: Path | None) -> tuple[Path, ...]:
     return (data_dir("sim") / "speakers", *brought)
 
 
-@cache
 def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[UnseenSpeaker, ...]:
-    """Return all speakers in the folders whose voice is of `split`, by name. Raises ConfigError without any.
+    """Return all speakers in the folders whose voice is of `split`, by name. Raises ConfigError without any."""
+    found = _kept(voices, split)
+    if not found:
+        raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for {split}")
+    return found
+
+
+@cache
+def _kept(voices: tuple[Path, ...], split: Split) -> tuple[UnseenSpeaker, ...]:
+    """Return the speakers of `unseen`; none where no voice is kept for the split.
 
     The face has the speaker's own mouth if it was filmed, else another's that opens with the voice.
     """
     motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
     kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
-    if not kept:
-        raise ConfigError(f"{', '.join(map(str, voices))}: no voice that is kept for {split}")
 
     def speaker(number: int, name: str) -> UnseenSpeaker:
         rng, recording, mouth = np.random.default_rng(number), kept[name].recording, kept[name].mouth
@@ -331,7 +338,7 @@ def returned_smiles(
     model, motions = EventModel.load(), read_motions(data_dir("sim") / "listeners" / "motions.npz")["test"]
     length_s, calm = 60 * max(minutes, LEAST_MINUTES), Calmness()
     answered, rates_a_minute, false = [], [], []
-    for place, speaker in enumerate(people):
+    for place, speaker in enumerate(tracked(people, "smiles returned")):
         rng = np.random.default_rng([seeds[0], place])
         plain = heard_and_seen(speaker, "both", CONDITIONS[0], length_s / 60, rng)
         onsets_s, smiling = _smiling(plain, motions, rng)
@@ -357,12 +364,6 @@ def returned_smiles(
         "never_smiles_per_minute": rounded(float(np.mean(rates_a_minute))),
         "false_per_minute": rounded(float(np.mean(false))),
     }
-
-
-def _kept(voices: tuple[Path, ...], split: Split) -> tuple[UnseenSpeaker, ...]:
-    """Return the speakers of a split; none where no voice is kept for it."""
-    names = {voice.name for voice in find_voices(voices)}
-    return unseen(voices, split) if any(split_of_voice(name) == split for name in names) else ()
 
 
 def _smiling(

@@ -309,9 +309,9 @@ class EventModel:
             hazards[kind] = probability / STEP_S
             if draws[at] < probability and not any(event.kind in EXCLUDES[kind] for event in events):
                 event = self.shaped(kind, sensed.frame, memory.seed)
-                their_s, size = (sensed.heard.item(AT[name]) for name in ("others_smile_s", "others_smile"))
-                if kind == "smile" and their_s <= LISTENING_S:
-                    event = changed(event, size=max(RETURN_SIZE * size, self.tables.shapes[kind].size[0]))
+                if kind == "smile" and sensed.heard.item(AT["others_smile_s"]) <= LISTENING_S:
+                    theirs = RETURN_SIZE * sensed.heard.item(AT["others_smile"])
+                    event = changed(event, size=max(theirs, self.tables.shapes[kind].size[0]))
                 events.append(
                     changed(
                         event, probability=probability, draw=float(draws[at]), evidence=self.bank.largest(terms, kind)

@@ -158,6 +158,9 @@ def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line
     for kind in RANGES:
         rates = [row[f"{kind}s_per_minute"] for row in found["rows"]]
         assert found[f"{kind}s_per_minute"] == [min(rates), max(rates)]
+    smiles = found["returned_smiles"]
+    assert smiles["difference"] == pytest.approx(smiles["answered"] - smiles["shifted"], abs=2e-4)
+    assert smiles["false_per_minute"] <= smiles["never_smiles_per_minute"]
     named = {(row["inputs"], row["condition"]) for row in found["outside"]}
     low, high = found["people"]["nods_per_minute"]
     assert named >= {

@@ -266,9 +266,6 @@ def test_own_history_replaces_what_was_decided():
     assert (hazards[before:] != none[before:]).any()
 
 
-# --- smiles that are returned ---------------------------------------------------------------------------------------
-
-
 def smiling(onsets_s, frames=FRAMES, size=0.7):
     """(N, 58) a face that smiles for two seconds from each onset on."""
     face = np.zeros((frames, MOTION_DIM), np.float32)
@@ -289,8 +286,8 @@ def test_a_smile_is_returned_in_time_and_size_and_more_smiles_more_often():
     share = returned.sum() / (8 * len(onsets_s))
     others = ((after_s > 4.0) & (after_s <= 5.1)).any(axis=1).sum() / (8 * len(onsets_s))
     assert 0.1 + others <= share <= 0.6
-    sizes = [event.size for events in found for event in events]
-    assert np.array(sizes)[returned] == pytest.approx(RETURN_SIZE * 0.7, abs=0.06)
+    sizes = np.array([event.size for events in found for event in events])
+    assert sizes[returned] == pytest.approx(RETURN_SIZE * 0.7, abs=0.06)
     few = [of("smile", listen(conversation(face=smiling(onsets_s[::5])), seed)[0]) for seed in range(8)]
     assert sum(map(len, few)) < 0.6 * len(begun_s)
 

@@ -130,14 +130,15 @@ def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     scene = replace(scene, smiles=_seen_smiles(np.concatenate([smiles, _laughing(person)]), len(listening)))
     spans = spans_of(person, rng, smiles)
     nods = begun_in(spans["nod"], listening)
-    smiled = (heard_in(scene)[:, AT["others_smile_s"]] <= LISTENING_S) & ~scene.speaks[:, MINE]
+    heard = heard_in(scene)
+    smiled = (heard[:, AT["others_smile_s"]] <= LISTENING_S) & ~scene.speaks[:, MINE]
     may = {"smile": listening | smiled}
     lessons = {kind: lesson(each, may.get(kind, listening)) for kind, each in spans.items()}
     own, aside = {**spans, "nod": nods}, None
     if person.gaze is not None:
         own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
     ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
-    rows = np.concatenate([heard_in(scene), done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
+    rows = np.concatenate([heard, done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
     return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
 
 

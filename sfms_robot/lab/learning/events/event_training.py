@@ -87,8 +87,9 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
             raise ConfigError(f"{data}: in {len(taught)} people to learn from there is no {kind}: {FROM[kind]}")
     groups, ridge = ({**GROUPS, "nod": STUDY}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
     hazards = {}
-    silent, judged_silent = ([event_trainer.muted(one) for one in some] for some in (taught, judged))
-    examples = taught if all_series else [*taught, *silent]  # each with and without the own voice
+    judged_silent = [event_trainer.muted(one) for one in judged]
+    # Each with and without the own voice.
+    examples = taught if all_series else [*taught, *(event_trainer.muted(one) for one in taught)]
     for kind in tracked(LEARNED, "kinds of events"):
         learned = event_trainer.teach(examples, kind, groups[kind], seed, ridge)
         hazards[kind] = hazard(learned, groups[kind], FROM[kind], event_trainer.rate_per_minute(taught, kind))
