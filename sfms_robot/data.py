@@ -64,6 +64,11 @@ def speaker_names() -> list[str]:
     return shipped_names(data_dir("sim") / "speakers", SPEAKER_VOICE)
 
 
+def head_file(name: str) -> Path:
+    """Return the file of a shipped head by name, or of another by path. Raises ConfigError."""
+    return find("heads", name, "head.yaml") / "head.yaml"
+
+
 def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
     """Return the folder of a shipped head or listener by name, or of another by path. Raises ConfigError."""
     root = data_dir("configs") / kind

@@ -68,6 +68,12 @@ def did_you_mean(given: object, choices: Iterable[str]) -> str:
     return f"; did you mean {known[near[0]]!r}?" if near and known[near[0]] != given else ""
 
 
+def not_one_of(given: object, what: str, choices: Iterable[str]) -> str:
+    """Return `'NAME' is not WHAT (choices)`, and the choice that may have been meant."""
+    names = list(choices)
+    return f"{given!r} is not {what} ({', '.join(names)}){did_you_mean(given, names)}"
+
+
 class MissingExtra(ConfigError):
     """A feature needs an optional package that is not installed; names the command that installs it."""
 

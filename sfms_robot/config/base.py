@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, Va
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from sfms_robot.endpoint import whole_number
-from sfms_robot.errors import ConfigError, InputError, did_you_mean
+from sfms_robot.errors import ConfigError, InputError, did_you_mean, not_one_of
 
 DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
 _LEADING_ZERO: Final = "!leading-zero"
@@ -46,8 +46,7 @@ class Model(BaseModel):
             if isinstance(key, (int, float)) and given is None:  # of 25,5 in a list of keys
                 found.append(f"{key} stands alone, without a key: a decimal number is written with a point, as 25.5")
             elif key not in cls.model_fields:
-                meant = did_you_mean(key, cls.model_fields)
-                found.append(f"{key!r} is not a known key ({', '.join(cls.model_fields)}){meant}")
+                found.append(not_one_of(key, "a known key", cls.model_fields))
             # Python takes true for 1: `id: true` would be servo 1.
             elif isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
                 found.append(f"{key} = {str(given).lower()} is neither a number nor a name")
@@ -59,6 +58,16 @@ class Model(BaseModel):
         except ValidationError as error:
             details += [_detail(each["msg"], each["loc"], each["input"]) for each in error.errors()]
         raise ValidationError.from_exception_data(cls.__name__, details)
+
+    @model_validator(mode="after")
+    def _without_contradictions(self) -> Self:
+        for problem in self.contradictions():
+            raise ValueError(problem)
+        return self
+
+    def contradictions(self) -> Iterable[str]:
+        """Yield what the values of this section, each valid by itself, get wrong together; the first is reported."""
+        return ()
 
 
 def all_of(problems: Iterable[str]) -> ValidationError:

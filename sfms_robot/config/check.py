@@ -7,7 +7,7 @@ none. The registers that a file may write into a servo, or expect to find stored
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Final
 
 from pydantic import ValidationError
@@ -17,7 +17,7 @@ from sfms_robot.config.firmware import FirmwareMap, load_firmware_map
 from sfms_robot.config.head import Head, load_head
 from sfms_robot.config.joint import BUS_FAMILIES, Safety
 from sfms_robot.config.overlay import load_overlay
-from sfms_robot.data import find
+from sfms_robot.data import head_file
 from sfms_robot.errors import ConfigError
 
 _SMALL_DEG: Final = 6.3  # of a joint in radians: a whole turn would be 6.28
@@ -29,7 +29,7 @@ def check_head(name: str) -> list[str]:
 
     For a sound head the overlay of this build is checked too. Raises ConfigError where there is no such head.
     """
-    file = find("heads", name, "head.yaml") / "head.yaml"
+    file = head_file(name)
     try:
         head = load_head(name)
         if not (found := list(_servos(head))):
@@ -109,10 +109,3 @@ def _refusal(key: str, name: str, table: FirmwareMap) -> str:
             f"and let stored.{name} compare it; a run writes only"
         )
     return f"of {table.model} is not the file's to set; it may set"
-
-
-def check_registers(head: str, joints: Mapping[str, tuple[Safety, FirmwareMap]]) -> None:
-    """Raise ConfigError for the first value of `joints` that a run must not write, or that cannot be stored."""
-    for joint, (safety, table) in joints.items():
-        for key, value, problem, choices in register_problems(safety, table):
-            raise ConfigError.at(head, f"joints.{joint}.safety.{key}", value, problem, choices)

@@ -6,14 +6,15 @@ from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, Final
 
-from sfms_robot.config.joint import Expression, Joint
+from sfms_robot.config.joint import Expression
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.config.wire_time import BITS, FRAMINGS
-from sfms_robot.errors import did_you_mean
+from sfms_robot.errors import did_you_mean, not_one_of
 from sfms_robot.frames import CHANNEL_INDEX
 
 MOST_NODES: Final = 2000
 HIGHEST_RATE_HZ: Final = 1000.0
+JOINT: Final = "a joint of this head"
 
 
 def problems(head: Any) -> list[str]:
@@ -26,11 +27,9 @@ def _wiring(head: Any) -> Iterator[str]:
     seen: dict[tuple[str, int], str] = {}
     for name, joint in head.joints.items():
         if joint.bus not in head.buses:
-            meant = did_you_mean(joint.bus, head.buses)
-            yield f"joints.{name}.bus = {joint.bus!r} is not a bus of this head ({', '.join(head.buses)}){meant}"
+            yield f"joints.{name}.bus = {not_one_of(joint.bus, 'a bus of this head', head.buses)}"
         if joint.limits not in head.limits:
-            meant = did_you_mean(joint.limits, head.limits)
-            yield f"joints.{name}.limits = {joint.limits!r} is not a limit class ({', '.join(head.limits)}){meant}"
+            yield f"joints.{name}.limits = {not_one_of(joint.limits, 'a limit class', head.limits)}"
         other = seen.setdefault((joint.bus, joint.id), name)
         if other != name:
             yield f"joints.{name}.id = {joint.id} is used twice on bus {joint.bus!r} (also by {other})"
@@ -75,8 +74,13 @@ def _drives(head: Any) -> Iterator[str]:
                 meant = did_you_mean(node.use, [*head.expressions, *CHANNEL_INDEX])
                 yield f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices}){meant}"
     for name, joint in head.joints.items():
-        if joint.mirror_of is not None:
-            yield from _mirror(name, joint, head.joints)
+        if (twin := joint.mirror_of) is None:
+            continue
+        other = head.joints[twin]  # `head.expanded` has looked for it
+        if twin == name or other.mirror_of is not None:
+            yield f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"
+        elif other.unit != joint.unit:
+            yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
     uses = {name: {node.use for node in tree.nodes() if node.use} for name, tree in head.expressions.items()}
     sizes: dict[str | None, int] = {}  # of shared expressions, those that they use in their places
     try:
@@ -96,28 +100,15 @@ def _size(tree: Expression, sizes: Mapping[str | None, int]) -> int:
     return sum(1 + sizes.get(node.use, 0) for node in tree.nodes())
 
 
-def _mirror(name: str, joint: Joint, joints: Mapping[str, Joint]) -> Iterator[str]:
-    twin = joint.mirror_of
-    other = joints[twin or ""]  # `head.expanded` has looked for it
-    if twin == name or other.mirror_of is not None:
-        yield f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"
-    elif other.unit != joint.unit:
-        yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
-
-
-def not_a_joint(name: str | None, joints: Mapping[str, Any]) -> str:
-    return f"{name!r} is not a joint of this head ({', '.join(joints)}){did_you_mean(name, joints)}"
-
-
 def _parts(head: Any) -> Iterator[str]:
     """Yield the joints of folds, couplings and regions that are unknown or claimed twice."""
     for index, fold in enumerate(head.folds):
         if fold.into not in head.joints:
-            yield f"folds.{index}.into = {not_a_joint(fold.into, head.joints)}"
+            yield f"folds.{index}.into = {not_one_of(fold.into, JOINT, head.joints)}"
     for index, coupling in enumerate(head.couplings):
         for name in coupling.keep:
             if name not in head.joints:
-                yield f"couplings.{index}.keep: {not_a_joint(name, head.joints)}"
+                yield f"couplings.{index}.keep: {not_one_of(name, JOINT, head.joints)}"
         for other, rival in enumerate(head.couplings):
             for name in coupling.moving:
                 if other != index and rival.keep.get(name):
@@ -126,7 +117,7 @@ def _parts(head: Any) -> Iterator[str]:
     for name, region in head.regions.items():
         for joint in region.joints:
             if joint not in head.joints:
-                yield f"regions.{name}.joints: {not_a_joint(joint, head.joints)}"
+                yield f"regions.{name}.joints: {not_one_of(joint, JOINT, head.joints)}"
             elif owner.setdefault(joint, name) != name:
                 yield f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}"
 
@@ -140,7 +131,7 @@ def _neck(head: Any) -> Iterator[str]:
             yield f"folds.{index}.into = {fold.into!r}: the neck moves this joint (kinematics)"
     for name in neck.joints():
         if (joint := head.joints.get(name)) is None:
-            yield f"kinematics: {not_a_joint(name, head.joints)}"
+            yield f"kinematics: {not_one_of(name, JOINT, head.joints)}"
             continue
         if joint.drive is not None:
             yield f"joints.{name}.drive: the neck moves this joint (kinematics), leave its drive out"
@@ -159,6 +150,6 @@ def _description(head: Any) -> Iterator[str]:
     owner: dict[str, str] = {}
     for name, follows in head.urdf.joints.items():
         if name not in head.joints:
-            yield f"urdf.joints: {not_a_joint(name, head.joints)}"
+            yield f"urdf.joints: {not_one_of(name, JOINT, head.joints)}"
         if owner.setdefault(follows.joint, name) != name:
             yield f"urdf.joints.{name}.joint = {follows.joint!r} already follows {owner[follows.joint]}"

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, computed_field, model_validator
+from pydantic import Field, computed_field
 
 from sfms_robot.config.base import Finite, Model, Name, Positive, load
 from sfms_robot.data import data_dir, user_dir
@@ -34,19 +34,6 @@ _SIGN_RULE = r"^(no|twos_complement|offset_2048|sign_bit_([0-9]|[12][0-9]|3[01])
 Bit = Annotated[int, Field(ge=0, le=15)]
 
 
-def value_range(size: int, signed: str) -> tuple[int, int]:
-    """Return the smallest and largest value that a register of `size` bytes holds under a sign rule."""
-    bits = 8 * size
-    if signed == "twos_complement":
-        return -(1 << bits - 1), (1 << bits - 1) - 1
-    if signed == "offset_2048":
-        return -2048, 2047
-    if signed.startswith("sign_bit_"):
-        magnitude = (1 << int(signed.removeprefix("sign_bit_"))) - 1
-        return -magnitude, magnitude
-    return 0, (1 << bits) - 1
-
-
 class Register(Model):
     """One row of a control table. `scale` turns the value into `unit`.
 
@@ -65,17 +52,30 @@ class Register(Model):
     signed: Annotated[str, Field(pattern=_SIGN_RULE)] = "no"
     initial: int | None = None
 
+    @property
+    def held(self) -> tuple[int, int]:
+        """Smallest and largest value that its bytes hold under its sign rule."""
+        if self.signed == "twos_complement":
+            half = 1 << 8 * self.size - 1
+            return -half, half - 1
+        if self.signed == "offset_2048":
+            return -2048, 2047
+        if self.signed.startswith("sign_bit_"):
+            magnitude = (1 << int(self.signed.removeprefix("sign_bit_"))) - 1
+            return -magnitude, magnitude
+        return 0, (1 << 8 * self.size) - 1
+
     @computed_field  # type: ignore[prop-decorator]  # mypy has no rule for decorated properties
     @property
     def low(self) -> int:
-        """Smallest value it takes: `min`, else what its size and sign rule hold."""
-        return value_range(self.size, self.signed)[0] if self.min is None else self.min
+        """Smallest value it takes: `min`, else what its bytes hold."""
+        return self.held[0] if self.min is None else self.min
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def high(self) -> int:
-        """Largest value it takes: `max`, else what its size and sign rule hold."""
-        return value_range(self.size, self.signed)[1] if self.max is None else self.max
+        """Largest value it takes: `max`, else what its bytes hold."""
+        return self.held[1] if self.max is None else self.max
 
     @property
     def end(self) -> int:
@@ -90,7 +90,7 @@ class Register(Model):
         if self.signed == "offset_2048" and self.size != 2:
             yield f"signed = {self.signed!r} needs a size of 2"
             return
-        low, high = value_range(self.size, self.signed)
+        low, high = self.held
         for key, value in (("min", self.min), ("max", self.max), ("initial", self.initial)):
             if value is not None and not low <= value <= high:
                 yield f"{key} = {value} does not fit {self.size} byte(s) ({low}..{high})"
@@ -106,11 +106,9 @@ class FirmwareRange(Model):
     min: Annotated[int, Field(ge=0, le=255)] = 0
     max: Annotated[int, Field(ge=0, le=255)] = 255
 
-    @model_validator(mode="after")
-    def _ordered(self) -> FirmwareRange:
+    def contradictions(self) -> Iterator[str]:
         if self.min > self.max:
-            raise ValueError(f"min = {self.min} is above max = {self.max}")
-        return self
+            yield f"min = {self.min} is above max = {self.max}"
 
     def overlaps(self, other: FirmwareRange) -> bool:
         return self.min <= other.max and other.min <= self.max
@@ -145,21 +143,18 @@ class FirmwareMap(Model):
     no_load_speed_deg_s: Positive | None = None  # None: not known
     watchdog: Literal["stops", "flags_only", "none"] = "none"  # what the servo does when its host falls silent
     position_mode: int | None = None  # value of role operating_mode for position control
-    baud_codes: dict[int, Annotated[int, Field(gt=0)]] = Field(default_factory=dict)  # code in role baud_rate -> bit/s
-    faults: dict[Bit, str] = Field(default_factory=dict)  # bit of role error_status, or of a board's error word
-    status_faults: dict[Bit, str] = Field(default_factory=dict)  # bit of the error byte of every status packet
+    baud_codes: dict[int, Annotated[int, Field(gt=0)]] = {}  # code in role baud_rate -> bit/s
+    faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word
+    status_faults: dict[Bit, str] = {}  # bit of the error byte of every status packet
     channels: Annotated[int, Field(gt=0, le=255)] | None = None
     pulse_us: PulseRange | None = None
     tick_us: Positive | None = None
-    roles: dict[Role, Name | None] = Field(default_factory=dict)  # where the register's name is not the role's own
-    registers: dict[Name, Register] = Field(default_factory=dict)
+    roles: dict[Role, Name | None] = {}  # where the register's name is not the role's own
+    registers: dict[Name, Register] = {}
 
-    @model_validator(mode="after")
-    def _possible(self) -> FirmwareMap:
-        problems = [*self._shape(), *self._layout(), *self._references()]
-        if problems:
-            raise ValueError("; ".join(problems))
-        return self
+    def contradictions(self) -> Iterator[str]:
+        if problems := [*self._shape(), *self._layout(), *self._references()]:
+            yield "; ".join(problems)
 
     def _shape(self) -> Iterator[str]:
         """Yield keys of a board in a servo's map, and the reverse."""

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, all_of, load
-from sfms_robot.config.consistency import not_a_joint, problems
+from sfms_robot.config.consistency import JOINT, problems
 from sfms_robot.config.joint import (
     BusConfig,
     Coupling,
@@ -24,7 +24,8 @@ from sfms_robot.config.joint import (
     Safety,
 )
 from sfms_robot.config.kinematics import Kinematics, Triple
-from sfms_robot.data import NO_HEAD, find
+from sfms_robot.data import NO_HEAD, head_file
+from sfms_robot.errors import not_one_of
 from sfms_robot.frames import LATERAL_POSE, Doubles
 
 VERSION: Final = 1  # of a head's file
@@ -133,8 +134,8 @@ class RobotDescription(Model):
     """
 
     file: Annotated[str, Field(min_length=1)]
-    packages: dict[str, str] = Field(default_factory=dict)
-    joints: dict[Name, FollowingJoint] = Field(default_factory=dict)
+    packages: dict[str, str] = {}
+    joints: dict[Name, FollowingJoint] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -165,10 +166,10 @@ class Head(Model):
     faults: Faults = Faults()
     joint_defaults: JointDefaults = JointDefaults()
     joints: Annotated[dict[Name, Joint], Field(min_length=1)]
-    expressions: dict[Name, Expression] = Field(default_factory=dict)
+    expressions: dict[Name, Expression] = {}
     couplings: tuple[Coupling, ...] = ()
     folds: tuple[Fold, ...] = ()
-    regions: dict[Name, Region] = Field(default_factory=dict)
+    regions: dict[Name, Region] = {}
     kinematics: Kinematics | None = None
     camera: CameraMount | None = None
     life: Life = Life()
@@ -205,9 +206,9 @@ def load_head(name: str, *, servos: bool = True) -> Head:
     """
     if name == NO_HEAD and not servos:
         return Head.model_construct(name=NO_HEAD, description="No servos", buses={}, limits={}, joints={})
-    folder = find("heads", name, "head.yaml")
-    head = load(Head, folder / "head.yaml")
-    head._folder = folder
+    file = head_file(name)
+    head = load(Head, file)
+    head._folder = file.parent
     return head
 
 
@@ -235,7 +236,7 @@ def expanded(raw: Any) -> Any:
     for name, joint in written.items():
         named = joint.get("mirror_of") if isinstance(joint, dict) else None
         if isinstance(named, str) and named not in written:
-            raise ValueError(f"joints.{name}.mirror_of = {not_a_joint(named, written)}")
+            raise ValueError(f"joints.{name}.mirror_of = {not_one_of(named, JOINT, written)}")
         if isinstance(named, str) and isinstance(twin := written[named], dict):
             joints[name] = {**_seen_in_mirror({**shared, **twin}, joint.get("mirror_sense")), **joint}
     return {**raw, "joints": joints}
@@ -331,15 +332,15 @@ class StoredRegisters(Model):
 
     source: str = ""
     supply_v: Positive | None = None
-    registers: dict[Name, int] = Field(default_factory=dict)
-    joints: dict[Name, dict[Name, int]] = Field(default_factory=dict)
+    registers: dict[Name, int] = {}
+    joints: dict[Name, dict[Name, int]] = {}
 
     def of(self, joint: str) -> dict[str, int]:
         """Return all registers stored in a joint's servo."""
         return {**self.registers, **self.joints.get(joint, {})}
 
 
-def load_stored(head: str) -> StoredRegisters:
-    """Return the stored registers of a head, by shipped name or folder; without a file, those of a new servo."""
-    file = find("heads", head, "head.yaml") / "emulate.yaml"
-    return load(StoredRegisters, file) if file.is_file() else StoredRegisters()
+def load_stored(head: Head) -> StoredRegisters:
+    """Return the stored registers of a head, from its folder; without a file, those of a new servo."""
+    file = head.folder and head.folder / "emulate.yaml"
+    return load(StoredRegisters, file) if file and file.is_file() else StoredRegisters()

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field, StrictInt, ValidationInfo, WithJsonS
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
 from sfms_robot.config.firmware import model_name
-from sfms_robot.errors import did_you_mean
+from sfms_robot.errors import did_you_mean, not_one_of
 from sfms_robot.frames import CHANNEL_INDEX
 from sfms_robot.plugins import plugins
 
@@ -31,7 +31,7 @@ BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other package
 
 def _channel(name: str) -> str:
     if name not in CHANNEL_INDEX:
-        raise ValueError(f"{name!r} is not a channel ({', '.join(CHANNEL_INDEX)}){did_you_mean(name, CHANNEL_INDEX)}")
+        raise ValueError(not_one_of(name, "a channel", CHANNEL_INDEX))
     return name
 
 
@@ -78,17 +78,15 @@ class Expression(Model):
             return {"channel" if value in CHANNEL_INDEX else "use": value}
         return value
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> Expression:
+    def contradictions(self) -> Iterator[str]:
         kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(kinds) != 1:
-            raise ValueError(f"needs exactly one of {', '.join(KINDS)}; has {', '.join(kinds) or 'none'}")
+            yield f"needs exactly one of {', '.join(KINDS)}; has {', '.join(kinds) or 'none'}"
         if self.clamp is not None and self.clamp[0] >= self.clamp[1]:
-            raise ValueError(f"clamp {list(self.clamp)} is reversed or empty")
+            yield f"clamp {list(self.clamp)} is reversed or empty"
         for (before, _), (after, _) in pairwise(self.curve or ()):
             if after - before < SMALLEST_STEP:
-                raise ValueError(f"curve is not a function: x goes from {before:g} to {after:g}, it has to rise")
-        return self
+                yield f"curve is not a function: x goes from {before:g} to {after:g}, it has to rise"
 
     @property
     def parts(self) -> tuple[Expression, ...]:
@@ -126,14 +124,12 @@ class Coupling(Model):
     at_least: Annotated[float, Field(le=0, ge=-1000)]  # at rest the sum is 0: rest has to be allowed
     moving: Annotated[tuple[Name, ...], Field(min_length=1)]
 
-    @model_validator(mode="after")
-    def _can_move(self) -> Coupling:
+    def contradictions(self) -> Iterator[str]:
         for name in self.moving:
             if not self.keep.get(name):
-                raise ValueError(f"moving: {name!r} has no weight under keep ({', '.join(self.keep)})")
+                yield f"moving: {name!r} has no weight under keep ({', '.join(self.keep)})"
         if len(set(self.moving)) != len(self.moving):
-            raise ValueError(f"moving {list(self.moving)} has a joint twice")
-        return self
+            yield f"moving {list(self.moving)} has a joint twice"
 
 
 class Fold(Model):
@@ -192,14 +188,12 @@ class Safety(Model):
     halt: Literal["release", "hold"] | None = None
     warm_C: Positive = 60.0
     hot_C: Positive = 67.0
-    registers: dict[Name, StrictInt] = Field(default_factory=dict)
-    stored: dict[Name, StrictInt] = Field(default_factory=dict)
+    registers: dict[Name, StrictInt] = {}
+    stored: dict[Name, StrictInt] = {}
 
-    @model_validator(mode="after")
-    def _hot_is_warmer(self) -> Safety:
+    def contradictions(self) -> Iterator[str]:
         if self.hot_C <= self.warm_C:
-            raise ValueError(f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})")
-        return self
+            yield f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})"
 
     def merged(self, other: Safety | None) -> Safety:
         """Return this, overridden by the keys that `other` gives explicitly."""
@@ -217,7 +211,7 @@ class Faults(Model):
     """The servo faults that cause a reaction, by the names in the firmware map."""
 
     mask: tuple[str, ...] = ()
-    thresholds: dict[MeasuredFault, Threshold] = Field(default_factory=dict)
+    thresholds: dict[MeasuredFault, Threshold] = {}
 
 
 class LimitClass(Model):
@@ -256,15 +250,13 @@ class Joint(Model):
     safety: Safety | None = None  # over that of the head
     note: str = ""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Joint:
+    def contradictions(self) -> Iterator[str]:
         if self.min_deg >= self.max_deg:
-            raise ValueError(f"min_deg {self.min_deg:g} is not below max_deg {self.max_deg:g}: limits reversed")
+            yield f"min_deg {self.min_deg:g} is not below max_deg {self.max_deg:g}: limits reversed"
         if not self.min_deg <= self.rest_deg <= self.max_deg:
-            raise ValueError(f"rest_deg {self.rest_deg:g} is outside {self.min_deg:g}..{self.max_deg:g}")
+            yield f"rest_deg {self.rest_deg:g} is outside {self.min_deg:g}..{self.max_deg:g}"
         if self.mirror_of is not None and self.drive is not None:
-            raise ValueError(f"has a drive and is mirror_of {self.mirror_of!r}: one of them")
-        return self
+            yield f"has a drive and is mirror_of {self.mirror_of!r}: one of them"
 
     @property
     def min_rad(self) -> float:

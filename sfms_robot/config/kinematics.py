@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share
 
@@ -26,11 +27,9 @@ class Split(Model):
     lower_share: Share | None = None
     crossover_hz: Positive | None = None
 
-    @model_validator(mode="after")
-    def _one_rule(self) -> Split:
+    def contradictions(self) -> Iterator[str]:
         if (self.lower_share is None) == (self.crossover_hz is None):
-            raise ValueError("needs exactly one of lower_share, crossover_hz")
-        return self
+            yield "needs exactly one of lower_share, crossover_hz"
 
 
 class Differential(Model):
@@ -44,19 +43,16 @@ class Differential(Model):
     pitch_gain: Finite = 1.0
     roll_gain: Finite = 1.0
 
-    @model_validator(mode="after")
-    def _invertible(self) -> Differential:
+    def contradictions(self) -> Iterator[str]:
         for key in ("pitch_gain", "roll_gain"):
             if getattr(self, key) == 0:
-                raise ValueError(f"{key} is 0: no servo angle would move that axis")
-        return self
+                yield f"{key} is 0: no servo angle would move that axis"
 
 
-def _one_or_two(value: object) -> str:
-    return "joint" if isinstance(value, str) else "split"
-
-
-AxisJoints = Annotated[Annotated[Name, Tag("joint")] | Annotated[Split, Tag("split")], Discriminator(_one_or_two)]
+AxisJoints = Annotated[
+    Annotated[Name, Tag("joint")] | Annotated[Split, Tag("split")],
+    Discriminator(lambda value: "joint" if isinstance(value, str) else "split"),
+]
 
 
 class SerialNeck(Model):
@@ -64,22 +60,20 @@ class SerialNeck(Model):
 
     kind: Literal["serial"]
     order: Annotated[tuple[AxisName, ...], Field(min_length=1, max_length=3)]
-    axes: dict[AxisName, AxisJoints] = Field(default_factory=dict)
+    axes: dict[AxisName, AxisJoints] = {}
     differential: Differential | None = None
 
-    @model_validator(mode="after")
-    def _each_axis_once(self) -> SerialNeck:
+    def contradictions(self) -> Iterator[str]:
         if len(set(self.order)) != len(self.order):
-            raise ValueError(f"order {list(self.order)} has an axis twice; two joints of one axis are a split")
+            yield f"order {list(self.order)} has an axis twice; two joints of one axis are a split"
         geared: tuple[AxisName, ...] = ("pitch", "roll") if self.differential else ()
         for axis in self.order:
             if (axis in self.axes) == (axis in geared):
-                raise ValueError(f"axis {axis!r} of order needs a joint under axes, or the differential, not both")
+                yield f"axis {axis!r} of order needs a joint under axes, or the differential, not both"
         for axis in (*self.axes, *geared):
             if axis not in self.order:
-                raise ValueError(f"axis {axis!r} has a joint but is not in order ({', '.join(self.order)})")
-        _distinct(self.joints())
-        return self
+                yield f"axis {axis!r} has a joint but is not in order ({', '.join(self.order)})"
+        yield from _distinct(self.joints())
 
     def joints(self) -> tuple[str, ...]:
         """Return every joint that the neck moves, from the base up; a differential has its two at its first axis."""
@@ -131,14 +125,12 @@ class StewartPlatform(Model):
     limits: PoseLimits = PoseLimits()
     body_yaw: BodyYaw | None = None
 
-    @model_validator(mode="after")
-    def _sound(self) -> StewartPlatform:
-        _distinct(self.joints())
+    def contradictions(self) -> Iterator[str]:
+        yield from _distinct(self.joints())
         for number, leg in enumerate(self.legs):
             turn = np.array(leg.servo_from_body)[:, :3]
             if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6:
-                raise ValueError(f"legs.{number}.servo_from_body is not a rotation and a shift")
-        return self
+                yield f"legs.{number}.servo_from_body is not a rotation and a shift"
 
     def joints(self) -> tuple[str, ...]:
         """Return the joint of body yaw, if any, then those of the legs in order."""
@@ -149,7 +141,7 @@ class StewartPlatform(Model):
 Kinematics = Annotated[SerialNeck | StewartPlatform, Field(discriminator="kind")]
 
 
-def _distinct(joints: tuple[str, ...]) -> None:
+def _distinct(joints: tuple[str, ...]) -> Iterator[str]:
     for joint in joints:
         if joints.count(joint) > 1:
-            raise ValueError(f"joint {joint!r} is used twice")
+            yield f"joint {joint!r} is used twice"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -92,12 +92,10 @@ class SmileCourse(Model):
     rise: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0)
     fall: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 1.0)
 
-    @model_validator(mode="after")
-    def _complete(self) -> SmileCourse:
+    def contradictions(self) -> Iterator[str]:
         for key, shares, at in (("rise", self.rise, self.RISE_S), ("fall", self.fall, self.FALL_S)):
             if len(shares) != len(at):
-                raise ValueError(f"{key}: {len(shares)} shares, {len(at)} are needed")
-        return self
+                yield f"{key}: {len(shares)} shares, {len(at)} are needed"
 
 
 class NodCourse(Model):
@@ -133,11 +131,11 @@ class Sampling(Model):
     smile: SmileCourse | None = None
 
 
-def check_heads(heads: int, **widths: int) -> None:
-    """Raise ValueError for a width, by its key, that cannot be cut into `heads` heads of even width."""
+def uneven_heads(heads: int, **widths: int) -> Iterator[str]:
+    """Yield the problem of each width, by its key, that cannot be cut into `heads` heads of even width."""
     for key, width in widths.items():
         if width % (2 * heads):
-            raise ValueError(f"{key} {width} is not a multiple of twice heads ({heads})")
+            yield f"{key} {width} is not a multiple of twice heads ({heads})"
 
 
 class Scores(Model):
@@ -148,10 +146,8 @@ class Scores(Model):
     heads: Count = 4
     sweeps: Annotated[int, Field(ge=0)] = 2
 
-    @model_validator(mode="after")
-    def _heads_fit(self) -> Scores:
-        check_heads(self.heads, width=self.width)
-        return self
+    def contradictions(self) -> Iterator[str]:
+        yield from uneven_heads(self.heads, width=self.width)
 
 
 class ListenerSettings(Model):
@@ -185,15 +181,13 @@ class ListenerSettings(Model):
         """Channels that the model draws; the others stay 0."""
         return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
-    @model_validator(mode="after")
-    def _fits_space(self) -> ListenerSettings:
+    def contradictions(self) -> Iterator[str]:
         if self.neutral is not None and len(self.neutral) != len(self.channels):
-            raise ValueError(f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}")
+            yield f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}"
         if self.flame_matrix is not None and self.motion_space != "deca56":
-            raise ValueError(f"flame_matrix: {self.motion_space} already is ARKit's expression (deca56 takes one)")
+            yield f"flame_matrix: {self.motion_space} already is ARKit's expression (deca56 takes one)"
         if self.sway and not self.events:
-            raise ValueError("sway: expected events: true, without which a nod counts as sway")
-        return self
+            yield "sway: expected events: true, without which a nod counts as sway"
 
 
 class Sfms(ListenerSettings):
@@ -246,41 +240,58 @@ class Sfms(ListenerSettings):
     @model_validator(mode="before")
     @classmethod
     def _presets(cls, raw: Any) -> Any:
-        if isinstance(raw, dict) and isinstance(raw.get("groups"), dict) and "preset" in raw["groups"]:
-            return raw | {"groups": preset_groups(raw.get("motion_space", "arkit58"), raw["groups"])}
-        return raw
+        """Write a preset of groups out: one, four (neck, brows, eyes, mouth and jaw), or all channels alone."""
+        if not (isinstance(raw, dict) and isinstance(raw.get("groups"), dict) and "preset" in raw["groups"]):
+            return raw
+        wanted, space = raw["groups"], raw.get("motion_space", "arkit58")
+        if set(wanted) != {"preset", "levels", "keyframes"}:
+            raise ValueError(f"groups: a preset takes the keys preset, levels, keyframes, not {', '.join(wanted)}")
+        if space not in SPACE_CHANNELS:
+            raise ValueError(f"motion_space: {space!r} is not known ({', '.join(SPACE_CHANNELS)})")
+        channels = SPACE_CHANNELS[space]
+        if wanted["preset"] == "one":
+            sets = {"face": channels}
+        elif wanted["preset"] == "all":
+            sets = {channel: (channel,) for channel in channels}
+        elif wanted["preset"] == "four" and space != "deca56":  # FLAME's components are not parts of a face
+            sets = {"neck": (), "brows": (), "eyes": (), "mouth": ()}
+            for channel in channels:
+                sets[_part(channel)] += (channel,)
+        else:
+            raise ValueError(f"groups.preset: {wanted['preset']!r} is none of one, four (not for deca56), all")
+        rest = {key: wanted[key] for key in ("levels", "keyframes")}
+        return raw | {"groups": {name: {"channels": members, **rest} for name, members in sets.items()}}
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Sfms:
+    def contradictions(self) -> Iterator[str]:
+        yield from super().contradictions()
         owner: dict[str, str] = {}
         for name, group in self.groups.items():
             for channel in group.channels:
                 if channel not in self.drawn_channels:
                     choices = ", ".join(self.drawn_channels)
-                    raise ValueError(f"groups.{name}.channels: {channel!r} is not a channel ({choices})")
+                    yield f"groups.{name}.channels: {channel!r} is not a channel ({choices})"
                 if owner.setdefault(channel, name) != name:
-                    raise ValueError(f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}")
+                    yield f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}"
         missing = [channel for channel in self.drawn_channels if channel not in owner]
         if missing:
-            raise ValueError(f"groups: no group holds {', '.join(missing)}")
+            yield f"groups: no group holds {', '.join(missing)}"
         if len({len(group.levels) for group in self.groups.values()}) != 1:
-            raise ValueError("groups: every group needs the same number of levels")
+            yield "groups: every group needs the same number of levels"
         for name, group in self.groups.items():
             if self.placement == "penalised" and (group.keyframe_cost is None or group.keyframes is not None):
-                raise ValueError(f"groups.{name}: placement penalised takes keyframe_cost, not keyframes")
+                yield f"groups.{name}: placement penalised takes keyframe_cost, not keyframes"
             if self.placement != "penalised" and (group.keyframes is None or group.keyframe_cost is not None):
-                raise ValueError(f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost")
+                yield f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost"
         for kind in ("nod", "smile"):
             if getattr(self.sampling, kind) is not None and not self.events:
-                raise ValueError(f"sampling.{kind}: expected events: true, without which there is no {kind}")
+                yield f"sampling.{kind}: expected events: true, without which there is no {kind}"
         if self.sampling.smile is not None and self.smiling_group is None:
-            raise ValueError(f"sampling.smile: no group holds both of {', '.join(SMILE_CORNERS)}")
+            yield f"sampling.smile: no group holds both of {', '.join(SMILE_CORNERS)}"
         if self.wav2vec2 is not None and self.audio != "wav2vec2":
-            raise ValueError(f"wav2vec2: audio is {self.audio}, which needs no model")
+            yield f"wav2vec2: audio is {self.audio}, which needs no model"
         if self.hop_frames > self.future_frames:
-            raise ValueError(f"hop {self.hop} is above future_frames {self.future_frames}")
-        check_heads(self.heads, tokenizer_width=self.tokenizer_width, predictor_width=self.predictor_width)
-        return self
+            yield f"hop {self.hop} is above future_frames {self.future_frames}"
+        yield from uneven_heads(self.heads, tokenizer_width=self.tokenizer_width, predictor_width=self.predictor_width)
 
     @property
     def smiling_group(self) -> str | None:
@@ -300,31 +311,6 @@ class Sfms(ListenerSettings):
     @property
     def window_frames(self) -> int:
         return self.past_frames + self.future_frames
-
-
-def preset_groups(space: str, wanted: dict[str, Any]) -> dict[str, Any]:
-    """Return groups of channels by the number of keyframe sets: one, four (neck, brows, eyes, mouth and jaw), or all.
-
-    Raises ValueError for an unknown preset, key or space.
-    """
-    if set(wanted) != {"preset", "levels", "keyframes"}:
-        raise ValueError(f"groups: a preset takes the keys preset, levels, keyframes, not {', '.join(wanted)}")
-    if space not in SPACE_CHANNELS:
-        raise ValueError(f"motion_space: {space!r} is not known ({', '.join(SPACE_CHANNELS)})")
-    channels = SPACE_CHANNELS[space]
-    if wanted["preset"] == "one":
-        sets = {"face": channels}
-    elif wanted["preset"] == "all":
-        sets = {channel: (channel,) for channel in channels}
-    elif wanted["preset"] == "four" and space != "deca56":  # FLAME's components are not parts of a face
-        sets = {"neck": (), "brows": (), "eyes": (), "mouth": ()}
-        for channel in channels:
-            sets[_part(channel)] += (channel,)
-    else:
-        raise ValueError(f"groups.preset: {wanted['preset']!r} is none of one, four (not for deca56), all")
-    return {
-        name: {"channels": c, "levels": wanted["levels"], "keyframes": wanted["keyframes"]} for name, c in sets.items()
-    }
 
 
 def _part(channel: str) -> str:
@@ -374,11 +360,9 @@ class Diffusion(Model):
         fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
         return next(fits, self.temperature)
 
-    @model_validator(mode="after")
-    def _fits(self) -> Diffusion:
+    def contradictions(self) -> Iterator[str]:
         if self.steps > self.train_steps:
-            raise ValueError(f"steps {self.steps} is above train_steps {self.train_steps}")
-        return self
+            yield f"steps {self.steps} is above train_steps {self.train_steps}"
 
 
 class Arig(ListenerSettings):
@@ -424,17 +408,16 @@ class Arig(ListenerSettings):
     diffusion: Diffusion = Diffusion()
     precision: Literal["auto", "fp32", "int8"] = "auto"
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Arig:
-        check_heads(self.heads, width=self.width)
+    def contradictions(self) -> Iterator[str]:
+        yield from super().contradictions()
+        yield from uneven_heads(self.heads, width=self.width)
         if self.discrete and self.draws != "motion":
-            raise ValueError(f"discrete: true is of draws: motion, not {self.draws}")
+            yield f"discrete: true is of draws: motion, not {self.draws}"
         if self.events and self.motion_space != "arkit58":
-            raise ValueError(f"events: true needs motion_space arkit58, not {self.motion_space}")
+            yield f"events: true needs motion_space arkit58, not {self.motion_space}"
         for prefix in self.diffusion.temperatures:
             if not any(channel.startswith(prefix) for channel in self.channels):
-                raise ValueError(f"diffusion.temperatures.{prefix}: no channel of {self.motion_space} begins so")
-        return self
+                yield f"diffusion.temperatures.{prefix}: no channel of {self.motion_space} begins so"
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import yaml
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sfms_robot.config.base import Model, Name, load, parse, read, with_number
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import NOT_SHARED, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
-from sfms_robot.data import data_dir, find, user_dir
+from sfms_robot.data import data_dir, head_file, user_dir
 from sfms_robot.errors import ConfigError
 
 CALIBRATE: Final = "calibrate"
@@ -73,14 +73,12 @@ class Measured(Identity):
     max_ticks: int
     sign: Literal[1, -1]
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Measured:
+    def contradictions(self) -> Iterator[str]:
         if not self.sign * self.min_ticks <= self.sign * self.center_ticks <= self.sign * self.max_ticks:
             ticks = f"{self.min_ticks}, {self.center_ticks}, {self.max_ticks}"
-            raise ValueError(f"min_ticks, center_ticks, max_ticks = {ticks} are not in the order of sign {self.sign}")
+            yield f"min_ticks, center_ticks, max_ticks = {ticks} are not in the order of sign {self.sign}"
         if self.min_ticks == self.max_ticks:
-            raise ValueError(f"min_ticks and max_ticks are both {self.min_ticks}: no travel")
-        return self
+            yield f"min_ticks and max_ticks are both {self.min_ticks}: no travel"
 
 
 class Layer(Model):
@@ -92,13 +90,13 @@ class Layer(Model):
 class CalibrateLayer(Layer):
     """Joints measured so far."""
 
-    joints: dict[Name, Measured] = Field(default_factory=dict)
+    joints: dict[Name, Measured] = {}
 
 
 class StoredLayer(Layer):
     """Registers that the servos of joints store, confirmed by the user."""
 
-    joints: dict[Name, dict[Name, int]] = Field(default_factory=dict)
+    joints: dict[Name, dict[Name, int]] = {}
 
 
 class Fitted(Model):
@@ -112,7 +110,7 @@ class FitLayer(Layer):
 
     date: date
     note: str = ""
-    joints: dict[Name, Fitted] = Field(default_factory=dict)
+    joints: dict[Name, Fitted] = {}
 
 
 class Overlay(Model):
@@ -122,6 +120,11 @@ class Overlay(Model):
     calibrate: CalibrateLayer | None = None
     stored: StoredLayer | None = None
     fit: FitLayer | None = None
+
+    @property
+    def measured(self) -> dict[str, Measured]:
+        """Measurements of joints, whether they hold or not."""
+        return {} if self.calibrate is None else self.calibrate.joints
 
     def confirmed(self, sha256: str) -> dict[str, dict[str, int]]:
         """Return the registers recorded as stored in servos, by joint, for a head file of this hash."""
@@ -159,7 +162,7 @@ def overlay_file(head: str, practice: bool = False) -> Path:
 
 def head_hash(name: str) -> str:
     """Return the SHA-256 of a head's file, by shipped name or folder."""
-    return hashlib.sha256((find("heads", name, "head.yaml") / "head.yaml").read_bytes()).hexdigest()
+    return hashlib.sha256(head_file(name).read_bytes()).hexdigest()
 
 
 def load_overlay(head: Head, file: Path | None = None) -> Overlay:
@@ -216,15 +219,19 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
     Raises ConfigError for a layer that makes no sound head.
     """
     joints, refused, notes = dict(head.joints), dict[str, str](), list[str]()
-    measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
-    for name, found in measured.items():
-        joint = head.joints[name]
-        problem = OLD_FILE if overlay.calibrate is None or overlay.calibrate.head_sha256 != sha256 else None
-        problem = problem or _another(found, joint, servos, name)
-        if problem is None:
-            joints[name] = calibrated(joint, found, head.safety)
+    for name, found in overlay.measured.items():
+        joint, now = head.joints[name], found if servos is None else servos.get(name, found)
+        if overlay.calibrate is None or overlay.calibrate.head_sha256 != sha256:
+            refused[name] = OLD_FILE
+        elif (found.id, found.model) != (joint.id, joint.model):
+            was = f"measured on {found.model} id {found.id}"
+            refused[name] = f"{was}, the head's file says {joint.model} id {joint.id}"
+        elif now is None:
+            refused[name] = "its servo does not answer"
+        elif (changed := found.difference(now)) is not None:
+            refused[name] = changed
         else:
-            refused[name] = problem
+            joints[name] = calibrated(joint, found, head.safety)
     joints |= {name: declared(joints[name], each, head.safety) for name, each in overlay.confirmed(sha256).items()}
     fit, fitted = overlay.fit, frozenset[str]()
     if fit is not None and fit.head_sha256 != sha256:
@@ -238,20 +245,11 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         joints |= {name: joints[name].model_copy(update=drive) for name, drive in drives.items()}
     return Layered(
         head=head.model_copy(update={"joints": joints}),
-        calibrated=frozenset(measured) - frozenset(refused),
+        calibrated=frozenset(overlay.measured) - frozenset(refused),
         refused=refused,
         fitted=fitted,
         notes=tuple(notes),
     )
-
-
-def _another(found: Measured, joint: Joint, servos: Mapping[str, Identity | None] | None, name: str) -> str | None:
-    if (found.id, found.model) != (joint.id, joint.model):
-        return f"measured on {found.model} id {found.id}, the head's file says {joint.model} id {joint.id}"
-    if servos is None or name not in servos:
-        return None
-    now = servos[name]
-    return "its servo does not answer" if now is None else found.difference(now)
 
 
 def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:
@@ -282,7 +280,7 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
     `practice`: found on emulated servos. Raises ConfigError for a file that cannot be written.
     """
     head = load_head(name)
-    own, file = find("heads", name, "head.yaml") / "head.yaml", overlay_file(head.name, practice)
+    own, file = head_file(name), overlay_file(head.name, practice)
     if not overlay_file(head.name).exists() and data_dir("configs").resolve() not in own.resolve().parents:
         text = own.read_bytes().decode()
         for register, value in stored.items():
@@ -313,15 +311,14 @@ def provenance(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
     Measurements count here whichever servos are plugged in now. Raises ConfigError for a head that is not sound.
     """
     head = load_head(name)
-    raw = read(find("heads", name, "head.yaml") / "head.yaml")
+    raw = read(head_file(name))
     overlay = load_overlay(head)
     layers = layered(head, overlay, head_hash(name))
-    measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
     found: dict[str, dict[str, tuple[Any, str]]] = {}
     for joint, config in layers.head.joints.items():
         origins = {key: _origin(key, head.joints[joint], raw["joints"][joint], raw) for key in SHOWN}
         if joint in layers.calibrated:
-            origins |= dict.fromkeys(MEASURED, f"{CALIBRATE} {measured[joint].date}")
+            origins |= dict.fromkeys(MEASURED, f"{CALIBRATE} {overlay.measured[joint].date}")
         if joint in layers.fitted and overlay.fit is not None:
             origins |= {"drive": f"{FIT} {overlay.fit.date}"}
         values = {key: getattr(config, key) for key in SHOWN}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sfms_robot.config.base import Model, Name, NonNegative, Positive, Share, parse, read
-from sfms_robot.config.listener import Arig, Count, Levels, Sfms, check_heads
+from sfms_robot.config.listener import Arig, Count, Levels, Sfms, uneven_heads
 from sfms_robot.errors import ConfigError
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -43,11 +44,9 @@ class Phase(Model):
     checkpoint_every: Count = 500
     checkpoint_minutes: Positive = 5.0
 
-    @model_validator(mode="after")
-    def _patience_looks(self) -> Phase:
+    def contradictions(self) -> Iterator[str]:
         if self.patience is not None and self.evaluate_every == 0:
-            raise ValueError(f"patience {self.patience} needs evaluate_every above 0")
-        return self
+            yield f"patience {self.patience} needs evaluate_every above 0"
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that must not change between a checkpoint and its resumption."""
@@ -120,13 +119,11 @@ class Training(Model):
     tokenizer: TokenizerTraining
     predictor: PredictorTraining
 
-    @model_validator(mode="after")
-    def _known_groups(self) -> Training:
+    def contradictions(self) -> Iterator[str]:
         for name in self.predictor.group_weights:
             if name not in self.listener.groups:
                 choices = ", ".join(self.listener.groups)
-                raise ValueError(f"predictor.group_weights: {name!r} is not a group of the listener ({choices})")
-        return self
+                yield f"predictor.group_weights: {name!r} is not a group of the listener ({choices})"
 
 
 class Stage(Model):
@@ -143,11 +140,9 @@ class Stage(Model):
     listening: NonNegative = 0.0
     interaction: NonNegative = 0.0
 
-    @model_validator(mode="after")
-    def _draws(self) -> Stage:
+    def contradictions(self) -> Iterator[str]:
         if not self.speaking + self.listening + self.interaction:
-            raise ValueError("a stage needs a weight above 0 (speaking, listening, interaction)")
-        return self
+            yield "a stage needs a weight above 0 (speaking, listening, interaction)"
 
 
 class GroupWeights(Model):
@@ -158,11 +153,9 @@ class GroupWeights(Model):
     brows: NonNegative = 1.0
     mouth: NonNegative = 1.0
 
-    @model_validator(mode="after")
-    def _weighs(self) -> GroupWeights:
+    def contradictions(self) -> Iterator[str]:
         if not self.head + self.lids + self.brows + self.mouth:
-            raise ValueError("a group needs a weight above 0 (head, lids, brows, mouth)")
-        return self
+            yield "a group needs a weight above 0 (head, lids, brows, mouth)"
 
 
 class ArigPhase(Phase):
@@ -214,12 +207,11 @@ class ArigPhase(Phase):
         Stage(share=0.5, speaking=0.15, listening=0.5, interaction=0.35),
     )
 
-    @model_validator(mode="after")
-    def _whole(self) -> ArigPhase:
+    def contradictions(self) -> Iterator[str]:
+        yield from super().contradictions()
         total = sum(stage.share for stage in self.stages)
         if abs(total - 1) > 1e-6:
-            raise ValueError(f"shares of the stages add up to {total:g}, not 1")
-        return self
+            yield f"shares of the stages add up to {total:g}, not 1"
 
     def stage(self, step: int) -> Stage:
         """Return the stage of a step; the last one from the end of its shares on."""
@@ -276,10 +268,8 @@ class Baseline(Model):
     def codes(self) -> int:
         return math.prod(self.levels)
 
-    @model_validator(mode="after")
-    def _heads_fit(self) -> Baseline:
-        check_heads(self.heads, width=self.width)
-        return self
+    def contradictions(self) -> Iterator[str]:
+        yield from uneven_heads(self.heads, width=self.width)
 
 
 class Dense(Baseline):
@@ -293,11 +283,10 @@ class Grouped(Baseline):
 
     kind: Literal["grouped"] = "grouped"
 
-    @model_validator(mode="after")
-    def _whole_groups(self) -> Grouped:
+    def contradictions(self) -> Iterator[str]:
+        yield from super().contradictions()
         if self.window_frames % 2**HALVINGS:
-            raise ValueError(f"window_frames {self.window_frames} is not a multiple of {2**HALVINGS}")
-        return self
+            yield f"window_frames {self.window_frames} is not a multiple of {2**HALVINGS}"
 
 
 class Recipe(Model):
