@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.servo.serial_line import Wire
-from sfms_robot.app.wiring import Opened, calibration_of, devices, firmware_maps, open_wires, port_of
-from sfms_robot.config import FirmwareMap, Head, Joint, load_head
-from sfms_robot.config.check import check_registers
+from sfms_robot.app.wiring import Opened, calibration_of, devices, open_wires, port_of
+from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
+from sfms_robot.config.check import register_problems
 from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.data import NO_HEAD
@@ -121,7 +121,9 @@ def prepare_head(options: HeadOptions) -> Head:
     if options.port == SIM:
         return head
     where = devices(head, options.port)
-    if (jumping := on_boards(head)) and not options.confirmed:
+    # Their servos report no position, so that they jump when they come on.
+    jumping = [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
+    if jumping and not options.confirmed:
         raise ConfigError(
             f"head {head.name!r}: hobby servos report no position, and each jumps to rest when it comes on "
             f"({', '.join(jumping)}); keep clear, and confirm it with --yes"
@@ -146,7 +148,7 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
 
         head = calibrated_head(options.head, options.port, clock, kept)
         motion = build_motion(head, fastest_hz(head))
-        opened = stack.enter_context(open_wires(head, options))
+        opened = stack.enter_context(open_wires(head, options.port, options.fast))
         doctor = doctor_command(options.head, options.port)
         confirmed = options.confirmed
         bus = build_bus(head, opened, clock, confirmed=confirmed, without=options.without, doctor=doctor, kept=kept)
@@ -176,8 +178,7 @@ def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -
     if port == SIM:
         layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
     else:
-        measured = overlay.calibrate.joints if overlay.calibrate is not None else {}
-        servos = identify(head, measured, devices(head, port), clock, kept)
+        servos = identify(head, overlay.measured, devices(head, port), clock, kept)
         layers = layered(head, overlay, sha256, servos)
     for joint, problem in layers.refused.items():
         log.warning("head %s: the calibration of %s does not hold: %s", head.name, joint, problem)
@@ -265,11 +266,6 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     )
 
 
-def on_boards(head: Head) -> list[str]:
-    """Return joints whose servos report no position, so that they jump when they come on."""
-    return [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
-
-
 def build_bus(
     head: Head,
     opened: Opened,
@@ -302,12 +298,11 @@ def build_bus(
 
 def bus_servos(head: Head, joints: Mapping[str, Joint], doctor: str = BusServo.doctor) -> list[BusServo]:
     """Return the servos of joints; `doctor`: see `BusServo`."""
-    maps = firmware_maps(joints)
     return [
         BusServo(
             joint=name,
             id=joint.id,
-            table=Table.of(maps[joint.model]),
+            table=Table.of(load_firmware_map(joint.model)),
             min_rad=joint.min_rad,
             max_rad=joint.max_rad,
             safety=head.safety_of(name),
@@ -364,11 +359,12 @@ def check_safety(head: Head, joints: Mapping[str, Joint]) -> None:
     Raises ConfigError for a limit that a joint's servo cannot keep, a register that a run must not write, or more
     turns than it makes.
     """
-    maps = firmware_maps(joints)
     for name, joint in joints.items():
-        _check_limits(head, name, maps[joint.model])
-        _check_turns(head, name, maps[joint.model])
-    check_registers(head.name, {name: (head.safety_of(name), maps[joint.model]) for name, joint in joints.items()})
+        table = load_firmware_map(joint.model)
+        _check_limits(head, name, table)
+        _check_turns(head, name, table)
+        for key, value, problem, choices in register_problems(head.safety_of(name), table):
+            raise ConfigError.at(head.name, f"joints.{name}.safety.{key}", value, problem, choices)
 
 
 def _check_limits(head: Head, name: str, table: FirmwareMap) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sfms_robot.data import NO_HEAD, find
+from sfms_robot.data import NO_HEAD, head_file
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router
 from sfms_robot.plugins import listener_folder
@@ -115,7 +115,7 @@ def check_names(options: RunOptions) -> None:
     Raises ConfigError, PortError.
     """
     if options.head != NO_HEAD:
-        find("heads", options.head, "head.yaml")
+        head_file(options.head)
     if options.outputs:
         from sfms_robot.outputs.registry import check_outputs
 

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.options import SIM, HeadOptions
-from sfms_robot.config import BusConfig, FirmwareMap, Head, Joint, load_firmware_map
+from sfms_robot.app.options import SIM
+from sfms_robot.config import BusConfig, Head, Joint, load_firmware_map
 from sfms_robot.config.head import StoredRegisters, load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.endpoint import connect
@@ -38,14 +38,16 @@ def devices(head: Head, port: str) -> dict[str, str]:
 
 
 @contextmanager
-def open_wires(head: Head, options: HeadOptions) -> Iterator[Opened]:
-    """Give the place of each bus of the head: emulated servos, which live as long as this does, or devices."""
+def open_wires(head: Head, port: str, fast: bool = False) -> Iterator[Opened]:
+    """Give the place of each bus of the head: emulated servos, which live as long as this does, or devices.
+
+    `fast`: virtual time.
+    """
     with ExitStack() as stack:
-        if options.port != SIM:
-            yield devices(head, options.port)
-            return
-        chains = plugged_in(options.head, head) if head.joints else {}
-        yield {name: stack.enter_context(launch(chains[name], options.fast)) for name in chains}
+        if port != SIM:
+            yield devices(head, port)
+        else:
+            yield {name: stack.enter_context(launch(servos, fast)) for name, servos in plugged_in(head).items()}
 
 
 def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Port]:
@@ -144,14 +146,9 @@ class EmulatedPort(SerialPort):
             return None
 
 
-def firmware_maps(joints: Mapping[str, Joint]) -> dict[str, FirmwareMap]:
-    return {model: load_firmware_map(model) for model in {joint.model for joint in joints.values()}}
-
-
 def calibration_of(joints: dict[str, Joint]) -> Calibration:
-    maps = firmware_maps(joints)
-    turns = np.array([maps[joint.model].ticks_per_revolution for joint in joints.values()])
-    return Calibration(joints, turns)
+    turns = [load_firmware_map(joint.model).ticks_per_revolution for joint in joints.values()]
+    return Calibration(joints, np.array(turns))
 
 
 def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[EmulatedServo]]:
@@ -183,9 +180,9 @@ def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[Emula
     return by_bus
 
 
-def plugged_in(name: str, head: Head) -> dict[str, list[EmulatedServo]]:
-    """Return the servos of `emulated` with what the emulate.yaml of head `name` says. Raises ConfigError."""
-    return emulated(head, load_stored(name))
+def plugged_in(head: Head) -> dict[str, list[EmulatedServo]]:
+    """Return the servos of `emulated` with what the head's emulate.yaml says. Raises ConfigError."""
+    return emulated(head, load_stored(head))
 
 
 # --- where the joints of a head stand that is switched off ----------------------------------------------------------

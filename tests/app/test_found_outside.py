@@ -59,7 +59,7 @@ def found_outside(head, whole, rng, least_rad=0.002, most_rad=1.0, share=1.0):
         high = servo.registers.get("max_position_limit", turn - 2)
         return replace(servo, start_ticks=min(max(ticks, low), high))
 
-    return {bus: [found(bus, servo) for servo in servos] for bus, servos in plugged_in(head.name, head).items()}
+    return {bus: [found(bus, servo) for servo in servos] for bus, servos in plugged_in(head).items()}
 
 
 def driven(head, servos, seconds, seed, fault=None):
@@ -78,7 +78,7 @@ def driven(head, servos, seconds, seed, fault=None):
         there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
         parts = run_parts(there, silence, InlineFeed(Restless(), seed, 0.01))
-        drove = drive_head(there, parts, Interrupt(), duration_s=seconds, signals=False)
+        drove = drive_head(there, parts, Interrupt(), duration_s=seconds)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
     assert (drove.outcome, drove.error) == ("done", None)
     assert not any(state["torque"] for state in stand.values())

@@ -98,7 +98,7 @@ def test_masked_fault_is_none_in_every_family(family, model, mask, fault):
 
 def test_emulated_servos_have_stored_what_those_of_the_head_have():
     head = load_head("reachy_mini")
-    legs = {servo.id: servo for servo in plugged_in("reachy_mini", head)["main"]}
+    legs = {servo.id: servo for servo in plugged_in(head)["main"]}
     assert all(servo.supply_v == 7.2 and servo.registers["shutdown"] == 52 for servo in legs.values())
     assert (legs[11].registers["homing_offset"], legs[12].registers["homing_offset"]) == (1024, -1024)
-    assert plugged_in("face28", load_head("face28")) == emulated(load_head("face28"))
+    assert plugged_in(load_head("face28")) == emulated(load_head("face28"))

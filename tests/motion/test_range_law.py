@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfms_robot.app.wiring import calibration_of, firmware_maps
+from sfms_robot.app.open_head import bus_servos
+from sfms_robot.app.wiring import calibration_of
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.head import held_back
 from sfms_robot.data import head_names
@@ -14,8 +15,6 @@ from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
 from sfms_robot.motion.limits import JerkLimiter, JointLimits, curve_s
 from sfms_robot.runtime.safety import ARRIVED_RAD, EASE_S, FOLLOW_S, REST_LIMIT_S
 from sfms_robot.servo.bus import Goals
-from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.registers import Table
 
 DT_S = 0.01
 HEADS = head_names()
@@ -51,11 +50,7 @@ class Law:
 
     def __init__(self, head: Head, chase) -> None:
         joints = head.joints
-        maps, calibration = firmware_maps(joints), calibration_of(joints)
-        servos = [
-            BusServo(joint=name, id=j.id, table=Table.of(maps[j.model]), min_rad=j.min_rad, max_rad=j.max_rad)
-            for name, j in joints.items()
-        ]
+        servos, calibration = bus_servos(head, joints), calibration_of(joints)
         self.limits = JointLimits.of(head)
         self.count = len(servos)
         self.limiter = JerkLimiter(self.limits, DT_S, chase)

@@ -20,7 +20,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from sfms_robot.app.open_head import build_bus, build_motion, doctor_command, fastest_hz, identify
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.options import SIM
 from sfms_robot.app.servo.move import SPEED_DEG_S
 from sfms_robot.app.wiring import Opened, calibration_of, open_wires
 from sfms_robot.config import Head, Joint, load_firmware_map, load_head
@@ -99,7 +99,7 @@ def calibrate(
     """
     head, guide = load_head(name), Guide(say, ask, date.today(), doctor_command(name, port))
     file = check_writable(overlay_file(head.name, practice=port == SIM))
-    with open_wires(head, HeadOptions(head=name, port=port)) as where:
+    with open_wires(head, port) as where:
         return calibrate_on(name, where, RealClock(), guide, file, joints=joints, again=again)
 
 
@@ -141,8 +141,7 @@ def calibrate_on(
                 outcome.skipped[joint] = str(reason)
                 say(f"  left out: {reason}")
                 continue
-            known = overlay.calibrate.joints if overlay.calibrate is not None else {}
-            layer = CalibrateLayer(head_sha256=sha256, joints={**known, joint: found})
+            layer = CalibrateLayer(head_sha256=sha256, joints={**overlay.measured, joint: found})
             overlay = overlay.model_copy(update={"calibrate": layer})
             if overlay.stored is not None:
                 overlay = overlay.recorded(sha256, joint, found.stored)

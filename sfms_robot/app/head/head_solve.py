@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sfms_robot.config import find, load_head
-from sfms_robot.data import head_names
+from sfms_robot.config import load_head
+from sfms_robot.data import head_file, head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
@@ -31,9 +31,8 @@ def solve_poses(head_name: str, file: Path) -> dict[str, Any]:
     """
     head = load_head(head_name)
     if head.kinematics is None:
-        file = find("heads", head_name, "head.yaml") / "head.yaml"
         with_neck = [name for name in head_names() if load_head(name).kinematics]
-        raise ConfigError.at(file, "name", head.name, "has no kinematics", with_neck)
+        raise ConfigError.at(head_file(head_name), "name", head.name, "has no kinematics", with_neck)
     neck = build_neck(head.kinematics, head.joints)
     poses, body_yaw_rad = read_poses(file)
     if body_yaw_rad is not None and not neck.turns_body:

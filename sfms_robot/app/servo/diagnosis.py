@@ -179,12 +179,6 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
         yield Finding("warning", device.path, problem, fix)
 
 
-def judge_rivals(path: str, found: Iterable[tuple[str, str]]) -> Iterator[Finding]:
-    """Yield what else uses a port, or takes it when it is plugged in (`discovery.rivals`)."""
-    for problem, fix in found:
-        yield Finding("warning", path, problem, fix)
-
-
 def udev_rule(device: SerialDevice) -> str | None:
     """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 

@@ -27,7 +27,6 @@ from sfms_robot.app.servo.diagnosis import (
     judge_port,
     judge_presence,
     judge_rate,
-    judge_rivals,
     judge_servo,
     stored_contradictions,
     udev_rule,
@@ -37,6 +36,7 @@ from sfms_robot.app.servo.serial_line import (
     SIM,
     Confirm,
     FoundServo,
+    Row,
     Wire,
     check_baud,
     only_port,
@@ -64,6 +64,7 @@ _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still wait
 _BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
 
+Report = dict[str, Any]
 OpenPort = Callable[[str, int], Port]
 Found = Mapping[int, FoundServo]  # by id
 
@@ -75,7 +76,7 @@ def examine(
     baud: int | None,
     progress: Progress = no_progress,
     fix: Confirm | None = None,
-) -> dict[str, Any]:
+) -> Report:
     """Look at every bus of a head, or at one port; return the report, whose `exit_code` is that of the command.
 
     `family` (None: dynamixel2) and `baud` (None: every rate) are of a port alone: a head's file has both of each bus.
@@ -93,8 +94,7 @@ def examine(
     clock = RealClock()
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
-        controls = {line.device: line.control for line in lines}
-        buses = [examine_line(line, clock, partial(_port, controls, clock), progress, fix) for line in lines]
+        buses = [examine_line(line, clock, partial(_port, line.control, clock), progress, fix) for line in lines]
     codes = {bus["exit_code"] for bus in buses}
     return {
         "version": 1,
@@ -106,9 +106,9 @@ def examine(
     }
 
 
-def _port(controls: Mapping[str, str | None], clock: Clock, device: str, baud: int) -> Port:
+def _port(control: str | None, clock: Clock, device: str, baud: int) -> Port:
     """Open a device, on emulated servos as a run does: a silence is one only if the emulator confirms it."""
-    if (control := controls[device]) is None:
+    if control is None:
         return SerialPort(device, baud, clock)
     from sfms_robot.app.wiring import EmulatedPort
 
@@ -117,15 +117,15 @@ def _port(controls: Mapping[str, str | None], clock: Clock, device: str, baud: i
 
 def examine_line(
     line: Line, clock: Clock, open_port: OpenPort, progress: Progress = no_progress, fix: Confirm | None = None
-) -> dict[str, Any]:
+) -> Report:
     """Look at one port; return a report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
     path, problem = line.device, access_problem(line.device)
-    report: dict[str, Any] = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
+    report: Report = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
+    others = [Finding("warning", path, trouble, cure) for trouble, cure in rivals(path)]
     if problem is not None:
         failed = judge_port(path, problem, group_of(path), list_ports())
-        return _finished(report, [failed, *judge_rivals(path, rivals(path))], PORT_FAILED)
-    others = list(judge_rivals(path, rivals(path)))
+        return _finished(report, [failed, *others], PORT_FAILED)
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port(path, line.first_baud)
@@ -146,7 +146,7 @@ def examine_line(
     return _finished(report, [*judge_adapter(adapter, held_by), *others, *found])
 
 
-def _finished(report: dict[str, Any], findings: Iterable[Finding], failed: int = BUS_FAILED) -> dict[str, Any]:
+def _finished(report: Report, findings: Iterable[Finding], failed: int = BUS_FAILED) -> Report:
     together = grouped(findings)
     counts = {name: sum(each.severity == name for each in together) for name in SEVERITIES}
     found = [each.plain() for each in together]
@@ -161,11 +161,10 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         device = port or only_port()
         yield Line(device=device, shown=device, family=family, baud=baud)
         return
-    from sfms_robot.app.options import HeadOptions  # slow to load, and only a head needs it
-    from sfms_robot.app.wiring import open_wires
+    from sfms_robot.app.wiring import open_wires  # slow to load, and only a head needs it
 
     described = load_head(head)
-    where = stack.enter_context(open_wires(described, HeadOptions(head=head, port=port or only_port())))
+    where = stack.enter_context(open_wires(described, port or only_port()))
     if port != SIM:
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, each in where.items():
@@ -209,7 +208,7 @@ def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
 
 def _look(
     line: Line, wire: Wire, adapter: SerialDevice, progress: Progress, fix: Confirm | None
-) -> tuple[list[Finding], dict[str, Any]]:
+) -> tuple[list[Finding], Report]:
     """Return findings and facts that need the open port."""
     here, elsewhere = _present(wire, line, progress)
     baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
@@ -342,7 +341,7 @@ def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: Seria
     )
 
 
-def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
+def _servo_row(state: ServoState, line: Line) -> Row:
     want = line.wanted.get(state.seen.id)
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
     row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the bus has it
@@ -352,7 +351,7 @@ def _servo_row(state: ServoState, line: Line) -> dict[str, Any]:
 # --- a board of hobby servos ----------------------------------------------------------------------------------------
 
 
-def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], dict[str, Any]]:
+def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], Report]:
     """Return what can be said of a board, whose port could be opened."""
     channels = max(1, len(line.wanted))
     budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)

@@ -102,7 +102,7 @@ def _servos(
     if head is not None:
         from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
 
-        wires = plugged_in(head, load_head(head))
+        wires = plugged_in(load_head(head))
     else:
         wires = {"servos": parse_servos(servo or "")}
     for servos in wires.values():

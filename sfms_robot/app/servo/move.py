@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from contextlib import closing
+from typing import Final
 
 from sfms_robot.app.open_head import build_one
-from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Wire
+from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Row, Wire
 from sfms_robot.app.servo.single_servo import parse_number, scan
 from sfms_robot.app.wiring import Opened, open_wires, port_of
-from sfms_robot.config import Head, Joint, load_firmware_map, load_head
-from sfms_robot.emulator.launch import Chain
+from sfms_robot.config import Head, load_firmware_map, load_head
 from sfms_robot.errors import BusError, ConfigError, PortError, RobotError, ServoError, TorqueError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
@@ -32,7 +31,7 @@ SETTLE_S: Final = 1.0
 CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
 
 
-def move(seen: FoundServo, to: str | None, by: str | None) -> dict[str, Any]:
+def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
     """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
 
     Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`. Torque comes on as at startup, where
@@ -154,26 +153,35 @@ Unconfirmed = dict[int, str]  # by id: why it is not known that its torque is of
 SILENT: Final = "does not answer; torque off was sent"
 
 
-def release_head(name: str, port: str, everything: bool = False) -> list[dict[str, Any]]:
+def release_head(name: str, port: str, everything: bool = False) -> list[Row]:
     """Take torque off the servos of a head on `port`, as `release`."""
     head = load_head(name)
-    with open_wires(head, HeadOptions(head=name, port=port)) as opened:
+    with open_wires(head, port) as opened:
         return release(head, opened, RealClock(), everything)
 
 
-def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) -> list[dict[str, Any]]:
+def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) -> list[Row]:
     """Take torque off the servos of a head, and write nothing else; return a row per joint.
 
     The servos need not be those that the head's file names. `everything`: also servos and channels of other ids.
     Joints on a bus whose port fails are unconfirmed. Raises PortError and BusError if no bus could be used.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     failures: list[RobotError] = []
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
         names = {joint.id: key for key, joint in joints.items()}
+        bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
         try:
-            off = _release_bus(head, name, joints, where, clock, everything)
+            if family_named(bus.family).board:
+                most = max((table.channels or 0 for table in tables.values()), default=0)
+                channels = range(most) if everything else list(tables)
+                board = build_one(head, name, joints, where, clock, confirmed=True, kept={}) if joints else None
+                off = dict.fromkeys(channels, "" if board is None or board.end_pulses(channels) else SILENT)
+            else:
+                with closing(port_of(where, bus, clock)()) as port:
+                    wire = Wire(port, bus.family, clock, bus.baud, fixed=True)
+                    off = release_chain(wire, tables, everything)
         except (PortError, BusError) as error:
             failures.append(error)
             off = dict.fromkeys(names, str(error))
@@ -183,24 +191,6 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     if len(failures) == len(opened):
         raise failures[0]
     return rows
-
-
-def _release_bus(
-    head: Head, name: str, joints: dict[str, Joint], where: Chain | str, clock: Clock, everything: bool
-) -> Unconfirmed:
-    bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
-    if family_named(bus.family).board:
-        most = max((table.channels or 0 for table in tables.values()), default=0)
-        channels = range(most) if everything else list(tables)
-        confirmed = not joints or build_one(head, name, joints, where, clock, confirmed=True, kept={}).end_pulses(
-            channels
-        )
-        return dict.fromkeys(channels, "" if confirmed else SILENT)
-    port = port_of(where, bus, clock)()
-    try:
-        return release_chain(Wire(port, bus.family, clock, bus.baud, fixed=True), tables, everything)
-    finally:
-        port.close()
 
 
 def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool = False) -> Unconfirmed:

@@ -27,6 +27,7 @@ from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Field, Table
 
 Confirm = Callable[[str], bool]
+Row = dict[str, Any]  # of a table, and of --json
 
 SIM: Final = "sim"
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
@@ -82,7 +83,7 @@ class FoundServo:
             raise ConfigError.at(table.model, "register", name, "is unknown", table.fields)
         return found
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> Row:
         """Return the row of a report."""
         note = "two servos with one id?" if self.twice else ""
         return {
@@ -255,7 +256,7 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
             board = family_named(next(iter(described.buses.values())).family)
             if board.board:
                 raise ConfigError(f"--head {head}: its servos are on a {board.title}, which has no ids or registers")
-            servos = next(iter(plugged_in(head, described).values()))
+            servos = next(iter(plugged_in(described).values()))
             chain, first = stack.enter_context(launch(servos)), servos[0].baud
             line: Port = EmulatedPort(chain.device, chain.control, baud or first, clock)
             place = f"--port {SIM} --head {quote(head)}"

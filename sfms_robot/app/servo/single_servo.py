@@ -17,7 +17,7 @@ import yaml
 
 from sfms_robot.app.output_paths import checked_file
 from sfms_robot.app.progress import Progress, no_progress, tracked
-from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Wire, ask, other_wires, protocol_hint
+from sfms_robot.app.servo.serial_line import Confirm, FoundServo, Row, Wire, ask, other_wires, protocol_hint
 from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
@@ -141,10 +141,10 @@ class ServoState:
         """Return values in their units, each under the name of its argument; None for one that was not read."""
         return {key: None if (x := self.in_unit(role)) is None else round(x, digits) for key, role in roles.items()}
 
-    def health(self) -> dict[str, Any]:
+    def health(self) -> Row:
         return {"torque": self.torque(), "faults": self.faults()}
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> Row:
         """Return the row of `servo monitor`."""
         measured = self.measured(
             2,
@@ -170,7 +170,7 @@ def read_all(seen: FoundServo) -> ServoState:
     return ServoState.of(seen, 0, data, error)
 
 
-def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[dict[str, Any]]]:
+def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[Row]]:
     """Yield a row per servo (`watched`) every `period_s`, `count` times or without end."""
     clock = servos[0].wire.clock
     due_s = clock.now_s()
@@ -180,7 +180,7 @@ def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = N
         due_s = max(due_s + period_s, clock.now_s())
 
 
-def watched(seen: FoundServo) -> dict[str, Any]:
+def watched(seen: FoundServo) -> Row:
     """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
     names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
     if seen.table is None or not names:
@@ -195,7 +195,7 @@ def watched(seen: FoundServo) -> dict[str, Any]:
 # --- registers --------------------------------------------------------------------------------------------------
 
 
-def register_row(field: Field, raw: int) -> dict[str, Any]:
+def register_row(field: Field, raw: int) -> Row:
     """Return the row of `servo read`."""
     return {
         "register": field.name,
@@ -211,7 +211,7 @@ def register_row(field: Field, raw: int) -> dict[str, Any]:
     }
 
 
-def read_registers(seen: FoundServo, names: Sequence[str]) -> list[dict[str, Any]]:
+def read_registers(seen: FoundServo, names: Sequence[str]) -> list[Row]:
     """Read registers by name, or `all` of them, into rows. Raises ServoError where one cannot be read."""
     fields = [seen.named(name) for name in names if name != "all"]
     if "all" in names:
@@ -219,7 +219,7 @@ def read_registers(seen: FoundServo, names: Sequence[str]) -> list[dict[str, Any
     return [register_row(field, seen.read(field)) for field in fields]
 
 
-def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> dict[str, Any]:
+def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> Row:
     """Write one register; return the row of `servo write`.
 
     `text`: a raw number, or one with the register's unit: 90deg. The status return level is written without reading it
@@ -343,15 +343,11 @@ def factory_reset(seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
     for baud in dict.fromkeys((expected, expected if taken else home)):
         wire.at(baud)
         if (back := _wait_for(wire, new_id)) is not None:
-            return _as_before(back, None if keep == "all" else seen.id, home if keep == "keep-id-and-baud" else None)
+            if keep != "all" and back.id != seen.id:
+                back = set_id(back, seen.id, lambda question: True, in_chain=True)
+            kept_rate = keep == "keep-id-and-baud" and back.baud != home
+            return set_baud(back, home, lambda question: True) if kept_rate else back
     raise ServoError(f"id {seen.id} was reset and does not answer as {new_id} at {expected} baud")
-
-
-def _as_before(seen: FoundServo, servo: int | None, baud: int | None) -> FoundServo:
-    """Give a servo that was reset its id and its rate again, if they are to be kept."""
-    if servo not in (None, seen.id):
-        seen = set_id(seen, servo, lambda question: True, in_chain=True)
-    return seen if baud in (None, seen.baud) else set_baud(seen, baud, lambda question: True)
 
 
 def _accepted(seen: FoundServo, answer: Any, what: str) -> None:
@@ -441,7 +437,7 @@ def differences(seen: FoundServo, was: DumpedServo) -> list[tuple[str, int, int]
     return [(n, now[n], then[n]) for n in lasting if n in then and now.get(n) != then[n]]
 
 
-def restore(seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool = False) -> list[dict[str, Any]]:
+def restore(seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool = False) -> list[Row]:
     """Write the EEPROM of a dumped servo into `seen`, each register verified; return a row for each change.
 
     The changes are shown in one question. With `identity` the servo gets id and rate of the file as well, last.

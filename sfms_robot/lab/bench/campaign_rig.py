@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from sfms_robot.app.open_head import build_bus
-from sfms_robot.app.wiring import calibration_of, emulated, firmware_maps, port_of
+from sfms_robot.app.wiring import calibration_of, emulated, port_of
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
@@ -230,9 +230,8 @@ def plugged_in(
 
 def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
     [(name, config)] = head.buses.items()
-    maps = firmware_maps(head.joints)
     servos = [
-        BusServo(joint=key, id=j.id, table=Table.of(maps[j.model]), min_rad=j.min_rad, max_rad=j.max_rad)
+        BusServo(joint=key, id=j.id, table=Table.of(load_firmware_map(j.model)), min_rad=j.min_rad, max_rad=j.max_rad)
         for key, j in head.joints.items()
     ]
     open_port, family = port_of(chains[name], config, clock), family_named(config.family)
