@@ -18,25 +18,23 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES, Floats
-from sfms_robot.outputs.websocket_peer import CONNECT_S, WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.avatars import eye_directions
+from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
 from sfms_robot.ports import ChannelLimit, OutputFrame
-from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, directions
 
 PORT: Final = 9000
-RATE_HZ: Final = 50.0  # the maker's example sends faces every 20 ms
 KEY: Final = "FURHAT_KEY"
 
 _OWN: Final = ("blinking", "microexpressions", "head_sway")  # of the robot
 _NAMES: Final = ["".join(f"_{each}" if each.isupper() else each.upper() for each in name) for name in BLENDSHAPES]
 _LOOKS: Final = [place for place, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
 _NECK: Final = {"NECK_PAN": "yaw", "NECK_TILT": "pitch", "NECK_ROLL": "roll"}
-_FULL_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 
 
 def _neck(degrees: float) -> ChannelLimit:
@@ -48,7 +46,7 @@ def params_of(motion: Floats) -> dict[str, float]:
     """Return the parameters of a face for motion (58,)."""
     shapes = motion[SHAPES].astype(np.float64)
     shapes[_LOOKS] = 0.0
-    pan, tilt = np.degrees(directions(motion, _FULL_RAD).mean(axis=0)).round(2).tolist()
+    pan, tilt = np.degrees(eye_directions(motion).mean(axis=0)).round(2).tolist()
     turns = {name: round(math.degrees(float(motion[CHANNEL_INDEX[channel]])), 3) for name, channel in _NECK.items()}
     return {**dict(zip(_NAMES, shapes.round(4).tolist(), strict=True)), **turns, "GAZE_PAN": pan, "GAZE_TILT": tilt}
 
@@ -61,7 +59,7 @@ class Furhat(WebSocketOutput):
     usual_port = PORT
     path = "/v1/events"
     absent = "name the robot's host and switch on its Realtime API"
-    rate_hz = RATE_HZ
+    rate_hz = 50.0  # the maker's example sends faces every 20 ms
     moves = True
     answers = False
     limits: Mapping[str, ChannelLimit] = {"yaw": _neck(45), "pitch": _neck(25), "roll": _neck(20)}
@@ -81,10 +79,10 @@ class Furhat(WebSocketOutput):
         began_s = time.monotonic()
         self.heard([each for each in link.until(began_s + self.neutral_s)], began_s)
 
-    def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any]:
+    def message(self, frame: OutputFrame, now_s: float) -> Message:
         return {"type": "request.face.params", "params": params_of(frame.motion)}
 
-    def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
+    def heard(self, messages: Sequence[Message], now_s: float) -> None:
         for message in messages:
             if str(message.get("type")).endswith("error"):
                 raise OutputError(f"answers {message.get('type')}: {message.get('message') or message}")

@@ -31,7 +31,7 @@ import orjson
 
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNELS, POSE, Doubles, Floats
-from sfms_robot.outputs.websocket_peer import CONNECT_S, WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
 from sfms_robot.ports import ChannelLimit, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
@@ -146,7 +146,7 @@ class ReachyDaemon(WebSocketOutput):
     rate_hz = RATE_HZ
     moves = True
 
-    def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
+    def heard(self, messages: Sequence[Message], now_s: float) -> None:
         for message in messages:
             if message.get("type") == "daemon_status":
                 self._check_status(message)
@@ -159,7 +159,7 @@ class ReachyDaemon(WebSocketOutput):
         if version.partition(".")[0] != _KNOWN_MAJOR:
             self.note_once(f"its daemon is version {version}; versions 1 are known, 1.13 was tried")
 
-    def _check_status(self, status: Mapping[str, Any]) -> None:
+    def _check_status(self, status: Message) -> None:
         """Raise OutputError for a daemon that does not run, or a robot whose motors are off."""
         state, backend = status.get("state"), status.get("backend_status")
         if state != "running":
@@ -168,7 +168,7 @@ class ReachyDaemon(WebSocketOutput):
         if mode != "enabled":
             raise OutputError(f"its motors are {mode}, not enabled: wake the robot up in its dashboard")
 
-    def _get(self, path: str) -> Mapping[str, Any]:
+    def _get(self, path: str) -> Message:
         """Return the object that the daemon's HTTP interface has at `path`. Raises OutputError."""
         connection = http.client.HTTPConnection(self.host, self.port, timeout=CONNECT_S)
         try:
@@ -220,7 +220,7 @@ class ReachyMini(ReachyDaemon):
             raise OutputError(f"did not go to neutral: {_DRIVEN}")
         self._goal, self._together_s = np.eye(4), None
 
-    def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any]:
+    def message(self, frame: OutputFrame, now_s: float) -> Message:
         pose = in_reach(frame.motion[POSE].astype(np.float64))
         self._goal = matrix(pose)
         return {
@@ -233,7 +233,7 @@ class ReachyMini(ReachyDaemon):
     def shown(self, frame: OutputFrame, now_s: float) -> None:
         self._sent.append((now_s, _pitch(self._goal)))
 
-    def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
+    def heard(self, messages: Sequence[Message], now_s: float) -> None:
         super().heard(messages, now_s)
         poses = [_reported(each) for each in messages if each.get("type") == "head_pose"]
         for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest came now
@@ -269,7 +269,7 @@ class ReachyMiniOverlay(ReachyDaemon):
             self._send(link, left)
             deque(link.until(time.monotonic() + 1.0 / RATE_HZ), maxlen=0)
 
-    def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any]:
+    def message(self, frame: OutputFrame, now_s: float) -> Message:
         return _offset(frame.motion[POSE].astype(np.float64))
 
     def shown(self, frame: OutputFrame, now_s: float) -> None:
@@ -290,7 +290,7 @@ class ReachyMiniOverlay(ReachyDaemon):
         link.send(_offset(pose), time.monotonic(), may_drop=False)
 
 
-def _offset(pose: Doubles) -> dict[str, Any]:
+def _offset(pose: Doubles) -> Message:
     """Return the message of an offset (6,): place first, then angles."""
     return {"type": "set_speech_offsets", "offsets": np.concatenate([pose[3:], pose[:3]])}
 
@@ -304,7 +304,7 @@ def _pitch(pose: Doubles) -> float:
     return -math.asin(min(max(float(pose[2, 0]), -1.0), 1.0))
 
 
-def _reported(message: Mapping[str, Any]) -> Doubles:
+def _reported(message: Message) -> Doubles:
     """Return the pose (4, 4) of a message. Raises OutputError for another shape."""
     try:
         pose = np.array(message["head_pose"], dtype=np.float64)

@@ -7,7 +7,7 @@ colon ("" without one) and returns a `ports.Output`. Kinds are imported when the
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Final
 
@@ -22,23 +22,21 @@ if TYPE_CHECKING:  # numpy, which a look at a name does not need
 GROUP: Final = "sfms_robot.outputs"
 
 
-def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
-    named = {name.replace("_", "-"): place for name, place in kinds.items()}
-    return {name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP) for name, place in named.items()}
-
-
-KINDS: Final[Mapping[str, EntryPoint]] = _ours(
-    json="json_stream:JsonStream",
-    vmc="avatars:VmcOutput",
-    vmc_single="avatars:VmcSingleOutput",
-    live_link="avatars:LiveLinkOutput",
-    vtube_studio="vtube_studio:VtubeStudio",
-    vtube_studio_add="vtube_studio:VtubeStudioAdd",
-    reachy_mini="reachy_mini:ReachyMini",
-    reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
-    furhat="furhat:Furhat",
-    ros2="ros2:Ros2Output",
-)
+KINDS: Final[Mapping[str, EntryPoint]] = {
+    name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP)
+    for name, place in (
+        ("json", "json_stream:JsonStream"),
+        ("vmc", "avatars:VmcOutput"),
+        ("vmc-single", "avatars:VmcSingleOutput"),
+        ("live-link", "avatars:LiveLinkOutput"),
+        ("vtube-studio", "vtube_studio:VtubeStudio"),
+        ("vtube-studio-add", "vtube_studio:VtubeStudioAdd"),
+        ("reachy-mini", "reachy_mini:ReachyMini"),
+        ("reachy-mini-overlay", "reachy_mini:ReachyMiniOverlay"),
+        ("furhat", "furhat:Furhat"),
+        ("ros2", "ros2:Ros2Output"),
+    )
+}
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
     "json": "json[:PORT], 8782: WebSocket server of this machine, a JSON object a frame",
@@ -54,44 +52,38 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
 }
 
 
-def output_kinds(others: Iterable[EntryPoint] | None = None) -> Mapping[str, EntryPoint]:
-    """Return every kind by name, not yet imported; shipped kinds go before those of other packages.
-
-    `others`: those of other packages; None for the installed ones.
-    """
-    found = plugins(GROUP) if others is None else {each.name: each for each in others}
-    return {**found, **KINDS}
+def output_kinds() -> Mapping[str, EntryPoint]:
+    """Return every kind by name, not yet imported; shipped kinds go before those of other packages."""
+    return {**plugins(GROUP), **KINDS}
 
 
-def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> None:
+def check_outputs(values: Sequence[str]) -> None:
     """Check that there are such kinds. Imports and opens nothing. Raises ConfigError with the choices."""
-    kinds = output_kinds(others)
+    kinds = output_kinds()
     for value in values:
         if value.partition(":")[0] not in kinds:
             raise ConfigError(f"--output {value}: expected KIND or KIND:ADDRESS (valid: {', '.join(kinds)})")
 
 
-def open_output(value: str, others: Iterable[EntryPoint] | None = None, router: Router = LOCAL) -> Output:
+def open_output(value: str, router: Router = LOCAL) -> Output:
     """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError.
 
     router: of ROS 2.
     """
-    check_outputs([value], others)
+    check_outputs([value])
     kind, _, address = value.partition(":")
-    entry = output_kinds(others)[kind]
+    entry = output_kinds()[kind]
     output: Output = plug_in(entry, address, router) if kind == "ros2" else plug_in(entry, address)
     if not callable(getattr(output, "send", None)):
         raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
     return output
 
 
-def open_outputs(
-    values: Sequence[str], others: Iterable[EntryPoint] | None = None, router: Router = LOCAL
-) -> list[Output]:
+def open_outputs(values: Sequence[str], router: Router = LOCAL) -> list[Output]:
     """Return the outputs of a run, in order. Raises ConfigError, also for two that reach one program."""
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
-        output = open_output(value, others, router)
+        output = open_output(value, router)
         to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
         if to in opened:
             raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")
@@ -99,10 +91,10 @@ def open_outputs(
     return list(opened.values())
 
 
-def parse_address(kind: str, text: str, usual_port: int, host: str = LOOPBACK) -> tuple[str, int]:
+def parse_address(kind: str, text: str, usual_port: int) -> tuple[str, int]:
     """Return host and port of "", PORT, :PORT, HOST, HOST:PORT, [HOST] or [HOST]:PORT (IPv6 in brackets).
 
-    `host`: where none is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
+    Loopback where no host is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
     """
     name, colon, digits = text.rpartition(":")
     if text.endswith("]") or not (colon or text.isdigit()):  # no port
@@ -113,4 +105,4 @@ def parse_address(kind: str, text: str, usual_port: int, host: str = LOOPBACK) -
     odd = not bare if bracketed else any(mark in name for mark in ":[]/@ ") or (colon and not digits)
     if port is None or odd or not bare.isprintable():
         raise ConfigError(f"--output {kind}:{text}: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got {text!r}")
-    return bare or host, port
+    return bare or LOOPBACK, port

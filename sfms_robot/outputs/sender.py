@@ -95,9 +95,7 @@ class MotionShaper:
         aim = target if phase == "live" else np.zeros_like(target)
         aim = np.where(np.isfinite(aim), aim, shown.motion)
         share = np.float32(ease((now_s - shown.since_s) / EASE_S))
-        return self._limited(shown.origin + share * (aim - shown.origin), shown)
-
-    def _limited(self, ahead: Floats, shown: Shown) -> Shown:
+        ahead = shown.origin + share * (aim - shown.origin)
         if self._limiter is None or shown.limiter is None:
             return replace(shown, motion=ahead)
         before, here, next_ = np.stack([shown.before, shown.here, ahead])[:, self._columns].astype(np.float64)
@@ -145,19 +143,19 @@ class OutputSender:
         """Send a frame, or connect. `frame`: None before the first tick. Never raises; blocks as the output does."""
         frame = frame or OutputFrame(time_s=0.0, motion=np.zeros(MOTION_DIM, np.float32))
         phase = self._phase(frame.state, ending)
-        if self.shown is None:
-            if ending or phase == "held" or now_s < self._retry_s:  # to connect would move a halted machine
-                return
-            if (started := self._connect(now_s)) is None:
-                return
-            self.shown = started
-        self.shown = self._shaper.step(frame.motion, phase, now_s, self.shown)
+        if self.shown is None and (ending or phase == "held" or now_s < self._retry_s):
+            return  # to connect would move a halted machine
         try:
+            if self.shown is None:
+                self.output.open()
+                self.shown, self._opened_s = self._shaper.start(now_s), now_s
+                self._window = now_s, self._counts["frames"] + 1, 0.0  # the first frame begins it
+            self.shown = self._shaper.step(frame.motion, phase, now_s, self.shown)
             self.output.send(replace(frame, motion=self.shown.motion), now_s)
         except Exception as error:  # of a plug-in: any
             self._lose(error, now_s)
-            return
-        self._sent(now_s)
+        else:
+            self._sent(now_s)
 
     def statistics(self) -> dict[str, Any]:
         """Return state, peer, frames, frames a second and losses, and what the output counts. From any thread."""
@@ -188,15 +186,6 @@ class OutputSender:
         if state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
             return "held"
         return "neutral" if ending or state in ("starting", "halted") else "live"
-
-    def _connect(self, now_s: float) -> Shown | None:
-        try:
-            self.output.open()
-        except Exception as error:  # of a plug-in: any
-            self._lose(error, now_s)
-            return None
-        self._opened_s, self._window = now_s, (now_s, self._counts["frames"] + 1, 0.0)  # the first frame begins it
-        return self._shaper.start(now_s)
 
     def _sent(self, now_s: float) -> None:
         self._counts["frames"] += 1

@@ -29,12 +29,11 @@ import numpy as np
 from sfms_robot.data import user_dir
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats
-from sfms_robot.outputs.websocket_peer import WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.websocket_peer import Message, WebSocketOutput, WebSocketPeer
 from sfms_robot.ports import OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
 PORT: Final = 8001
-RATE_HZ: Final = 50.0
 PLUGIN: Final = {"pluginName": "sfms-robot", "pluginDeveloper": "sfms-robot"}
 GROW_S: Final = 1.0  # of weight, once access is given
 ANSWER_S: Final = 5.0  # longest wait for an answer, except for the user's
@@ -94,7 +93,6 @@ class VtubeStudio(WebSocketOutput):
     mode = "set"
     usual_port = PORT
     absent = "start VTube Studio and switch on the plug-in API in its settings"
-    rate_hz = RATE_HZ
     answers = False  # its silence is judged by its answers
 
     def __init__(self, address: str = "", folder: Path | None = None) -> None:
@@ -113,7 +111,7 @@ class VtubeStudio(WebSocketOutput):
         else:
             self._ask(link)
 
-    def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any] | None:
+    def message(self, frame: OutputFrame, now_s: float) -> Message | None:
         if not self._access:
             return None
         self._since_s = now_s if self._since_s is None else self._since_s
@@ -128,7 +126,7 @@ class VtubeStudio(WebSocketOutput):
     def shown(self, frame: OutputFrame, now_s: float) -> None:
         self._asked_s = now_s if self._asked_s is None else self._asked_s
 
-    def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
+    def heard(self, messages: Sequence[Message], now_s: float) -> None:
         if self._asked_s is not None and not messages and now_s - self._asked_s > ANSWER_S:
             raise OutputError(f"has not answered for {ANSWER_S:g} s")
         for message in messages:
@@ -142,7 +140,7 @@ class VtubeStudio(WebSocketOutput):
         """Return the frames that a slow VTube Studio missed, and whether its user gave access."""
         return {**super().statistics(), "access": self._access}
 
-    def _answered(self, kind: str, data: Mapping[str, Any]) -> None:
+    def _answered(self, kind: str, data: Message) -> None:
         link = self.link
         assert link is not None
         if kind == "AuthenticationTokenResponse":
@@ -200,5 +198,5 @@ class VtubeStudioAdd(VtubeStudio):
     mode = "add"
 
 
-def _request(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
+def _request(kind: str, data: Message) -> Message:
     return {**_API, "requestID": "sfms-robot", "messageType": f"{kind}Request", "data": data}

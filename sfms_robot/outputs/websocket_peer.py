@@ -27,6 +27,8 @@ from sfms_robot.errors import OutputError
 from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Output, OutputFrame
 
+Message = Mapping[str, Any]
+
 CONNECT_S: Final = 1.0
 SILENT_S: Final = 2.0
 GOODBYE_S: Final = 0.3
@@ -81,7 +83,7 @@ class WebSocketPeer:
             self._socket.close()
             raise
 
-    def send(self, message: Mapping[str, Any], now_s: float, may_drop: bool = True) -> bool:
+    def send(self, message: Message, now_s: float, may_drop: bool = True) -> bool:
         """Send a message, or leave it out while an older one waits for the network. Return whether it was taken."""
         self._exchange()
         if not self._out:
@@ -96,13 +98,13 @@ class WebSocketPeer:
         self._flush()
         return True
 
-    def receive(self) -> list[dict[str, Any]]:
+    def receive(self) -> list[Message]:
         """Return the messages that have arrived since, oldest first."""
         self._exchange()
         taken, self._messages = self._messages, []
         return [_parsed(each) for each in taken]
 
-    def until(self, until_s: float) -> Iterator[dict[str, Any]]:
+    def until(self, until_s: float) -> Iterator[Message]:
         """Yield the messages that arrive until `until_s` of `time.monotonic`, waiting for them."""
         while (left_s := until_s - time.monotonic()) > 0:
             if not self._messages:
@@ -144,7 +146,7 @@ class WebSocketPeer:
                 try:
                     data = self._socket.recv(_SLICE)
                 except (ConnectionError, ValueError) as error:
-                    raise self._gone(error) from error
+                    raise self._gone() from error
                 if not data:
                     raise self._gone()
                 self._take(data)
@@ -184,9 +186,9 @@ class WebSocketPeer:
             try:
                 del self._out[: self._socket.send(self._out)]
             except ConnectionError as error:
-                raise self._gone(error) from error
+                raise self._gone() from error
 
-    def _gone(self, error: Exception | None = None) -> OutputError:
+    def _gone(self) -> OutputError:
         self.closed = True
         received = self._protocol.close_rcvd
         reason = f" ({received.reason or received.code})" if received else ""
@@ -204,7 +206,7 @@ def _unreached(error: OSError | UnicodeError, host: str, absent: str) -> str:
     return str(error.strerror or error)
 
 
-def _parsed(data: bytes) -> dict[str, Any]:
+def _parsed(data: bytes) -> Message:
     """Return the object that a message holds. Raises OutputError."""
     with suppress(orjson.JSONDecodeError):
         if isinstance(message := orjson.loads(data), dict):
@@ -277,11 +279,11 @@ class WebSocketOutput(Output):
         """Lead the peer to neutral over a new connection. Raises OutputError."""
         raise NotImplementedError
 
-    def message(self, frame: OutputFrame, now_s: float) -> Mapping[str, Any] | None:
+    def message(self, frame: OutputFrame, now_s: float) -> Message | None:
         """Return the message of a frame; None: nothing is sent."""
         raise NotImplementedError
 
-    def heard(self, messages: Sequence[Mapping[str, Any]], now_s: float) -> None:
+    def heard(self, messages: Sequence[Message], now_s: float) -> None:
         """Take the peer's messages. Raises OutputError where they end the connection."""
 
     def shown(self, frame: OutputFrame, now_s: float) -> None:

@@ -1,7 +1,6 @@
 """Motion on its way to an output: eased, limited, over losses; every time is an argument."""
 
 import logging
-from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -202,6 +201,9 @@ def test_an_unknown_kind_names_the_kinds():
         open_output("vcm")
 
 
-def test_a_plug_in_that_gives_no_output_is_refused():
+def test_a_plug_in_that_gives_no_output_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "odd-1.0.dist-info").mkdir()
+    (tmp_path / "odd-1.0.dist-info" / "entry_points.txt").write_text("[sfms_robot.outputs]\nodd = builtins:list\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(ConfigError, match="gave a list, not an output"):
-        open_output("odd", [EntryPoint("odd", "builtins:list", "sfms_robot.outputs")])
+        open_output("odd")
