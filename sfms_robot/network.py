@@ -17,6 +17,7 @@ import struct
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -155,6 +156,7 @@ class Connection:
     """A session that is being opened in a thread, for as long as its router is away.
 
     Attributes:
+        session: None while no router answers.
         problem: why it cannot be opened; None as long as it may.
 
     begin: called with the session in that thread, before others see it.
@@ -162,30 +164,25 @@ class Connection:
 
     def __init__(self, config: zenoh.Config, begin: Callable[[zenoh.Session], None] = lambda session: None) -> None:
         self._config, self._begin = config, begin
-        self._session: zenoh.Session | None = None
+        self.session: zenoh.Session | None = None
         self._changed = threading.Condition()
         self._closed = False
         self.problem: str | None = None
         threading.Thread(target=self._open, name="zenoh", daemon=True).start()
 
-    @property
-    def session(self) -> zenoh.Session | None:
-        """The session; None while no router answers."""
-        return self._session
-
     def wait(self, limit_s: float) -> zenoh.Session | None:
         """Wait for the session; return None when it is not open by then. Raises PortError when it cannot be opened."""
         with self._changed:
-            self._changed.wait_for(lambda: self._session is not None or self.problem is not None, limit_s)
+            self._changed.wait_for(lambda: self.session is not None or self.problem is not None, limit_s)
         if self.problem is not None:
             raise PortError(self.problem)
-        return self._session
+        return self.session
 
     def close(self) -> None:
         """Close the session, at once or when it opens. Idempotent."""
         with self._changed:
             self._closed = True
-            session, self._session = self._session, None
+            session, self.session = self.session, None
         if session is not None:
             close_session(session)
 
@@ -202,7 +199,7 @@ class Connection:
             return
         with self._changed:
             if not self._closed:
-                self._session = session
+                self.session = session
             self._changed.notify_all()
         if self._closed:
             close_session(session)
@@ -341,29 +338,24 @@ class Ros2Node:
             mangled = topic.replace("/", "%")
             token("MS", entity, mangled, wire, _QOS)
             # Of any type and hash: a wrong one is worth a line.
-            self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", self._on_sample(topic)))
-            others = f"@ros2_lv/*/*/*/*/MP/*/*/*/{mangled}/**"
-            self._kept.append(live.declare_subscriber(others, self._on_presence(topic), history=True))
+            take = partial(self._take, topic)
+            self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", take))
+            others, note = f"@ros2_lv/*/*/*/*/MP/*/*/*/{mangled}/**", partial(self._note_publisher, topic)
+            self._kept.append(live.declare_subscriber(others, note, history=True))
 
-    def _on_presence(self, topic: str) -> Callable[[zenoh.Sample], None]:
+    def _note_publisher(self, topic: str, sample: zenoh.Sample) -> None:
         import zenoh
 
-        def change(sample: zenoh.Sample) -> None:
-            known = topic, str(sample.key_expr).split("/")[1]
-            (self._seen.add if sample.kind == zenoh.SampleKind.PUT else self._seen.discard)(known)
+        known = topic, str(sample.key_expr).split("/")[1]
+        (self._seen.add if sample.kind == zenoh.SampleKind.PUT else self._seen.discard)(known)
 
-        return change
-
-    def _on_sample(self, topic: str) -> Callable[[zenoh.Sample], None]:
-        def take(sample: zenoh.Sample) -> None:
-            self.counts["received"] += 1
-            try:
-                self._received(topic, "/".join(str(sample.key_expr).split("/")[-2:]), sample.payload.to_bytes())
-            except RobotError as error:
-                self.counts["refused"] += 1
-                self._say(topic, str(error))
-
-        return take
+    def _take(self, topic: str, sample: zenoh.Sample) -> None:
+        self.counts["received"] += 1
+        try:
+            self._received(topic, "/".join(str(sample.key_expr).split("/")[-2:]), sample.payload.to_bytes())
+        except RobotError as error:
+            self.counts["refused"] += 1
+            self._say(topic, str(error))
 
     def _say(self, topic: str, reason: str) -> None:
         key = topic + re.sub(r"[\d.]+", "", reason)

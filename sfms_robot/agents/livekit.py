@@ -126,10 +126,9 @@ def attach(session: AgentSession[Any], robot: Robot) -> None:
     Raises InputError for a session without sound.
     """
     heard, said = session.input.audio, session.output.audio
-    for way, found in (("input", heard), ("output", said)):
-        if found is None:
-            raise InputError(f"attach: session.{way}.audio: expected sound, got None: start the session first")
-    assert heard is not None and said is not None
+    if heard is None or said is None:
+        way = "input" if heard is None else "output"
+        raise InputError(f"attach: session.{way}.audio: expected sound, got None: start the session first")
     session.input.audio, session.output.audio = PersonTap(robot, heard), AgentTap(robot, said)
 
 

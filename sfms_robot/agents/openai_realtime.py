@@ -19,9 +19,10 @@ import binascii
 import json
 import time
 from collections.abc import AsyncIterable, Callable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedOK, InvalidStatus, WebSocketException
 
 from sfms_robot import InputError, PortError
@@ -150,8 +151,31 @@ async def converse(
             if session is not None:
                 await socket.send(json.dumps({"type": "session.update", "session": session}))
             head = RealtimeHead(robot)
-            tasks = [_send(socket, head, microphone), _receive(socket, head, (play, stop, seen))]
-            done, others = await asyncio.wait(map(asyncio.ensure_future, tasks), return_when=asyncio.FIRST_COMPLETED)
+
+            async def send() -> None:
+                async for pcm in microphone:
+                    event = {"type": "input_audio_buffer.append", "audio": base64.b64encode(pcm).decode()}
+                    head.sent(event)
+                    if len(pcm) % 2 == 0:
+                        await socket.send(json.dumps(event))
+
+            async def receive() -> None:
+                async for text in socket:
+                    if not isinstance(event := _plain(text), dict):
+                        head.robot_link.problem("message", f"expected a JSON object, got {text[:40]!r}")
+                        continue
+                    pcm, reply = head.received(event)
+                    if pcm and play is not None:
+                        play(pcm)
+                    if event.get("type") == "input_audio_buffer.speech_started" and stop is not None:
+                        stop()
+                    if reply is not None:
+                        await socket.send(json.dumps(reply))
+                    if seen is not None:
+                        seen(event)
+
+            tasks = map(asyncio.ensure_future, (send(), receive()))
+            done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in others:
                 task.cancel()
             await asyncio.gather(*done, *others, return_exceptions=True)
@@ -169,30 +193,8 @@ async def converse(
         raise PortError(f"{place}: cannot connect: {str(error) or type(error).__name__}") from None
 
 
-async def _send(socket: ClientConnection, head: RealtimeHead, microphone: AsyncIterable[bytes]) -> None:
-    async for pcm in microphone:
-        event = {"type": "input_audio_buffer.append", "audio": base64.b64encode(pcm).decode()}
-        head.sent(event)
-        if len(pcm) % 2 == 0:
-            await socket.send(json.dumps(event))
-
-
-async def _receive(socket: ClientConnection, head: RealtimeHead, to: Any) -> None:
-    play, stop, seen = to
-    async for text in socket:
-        try:
-            event = json.loads(text)
-        except ValueError:
-            event = None
-        if not isinstance(event, dict):
-            head.robot_link.problem("message", f"expected a JSON object, got {text[:40]!r}")
-            continue
-        pcm, reply = head.received(event)
-        if pcm and play is not None:
-            play(pcm)
-        if event.get("type") == "input_audio_buffer.speech_started" and stop is not None:
-            stop()
-        if reply is not None:
-            await socket.send(json.dumps(reply))
-        if seen is not None:
-            seen(event)
+def _plain(text: str | bytes) -> Any:
+    """Return what a JSON text says; None for another text."""
+    with suppress(ValueError):
+        return json.loads(text)
+    return None
