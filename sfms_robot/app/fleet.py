@@ -126,43 +126,50 @@ _COMMAND: Final[TypeAdapter[_Command]] = TypeAdapter(_Command)
 class FleetControls:
     """Carries out commands on a run, from any thread.
 
+    Args:
+        name: of the head; `key`: of the fleet (`fleet_key`), which `_Keyed` commands need; None where none is needed.
+
     Attributes:
         nonce: goes into the proof of the next command that needs the key.
     """
 
     def __init__(
-        self, halt: HaltLatch, interrupt: Interrupt, knobs: LiveKnobs, calm: Callable[[Calmness], None] | None
+        self,
+        halt: HaltLatch,
+        interrupt: Interrupt,
+        knobs: LiveKnobs,
+        calm: Callable[[Calmness], None] | None,
+        name: str = "",
+        key: bytes | None = None,
     ) -> None:
         self._lock = threading.Lock()
         self.nonce = secrets.token_hex(8)
         self._halt, self._interrupt, self._knobs, self._calm = halt, interrupt, knobs, calm
+        self._name, self._key = name, key
 
     def halt(self, by: str) -> None:
         """Halt; `by` is the name that the client gives itself."""
         name = "".join(each for each in by if each.isprintable())[:_LONGEST_NAME].strip()
         self._halt.close(name or "the fleet", "fleet")
 
-    def obey(self, message: bytes, name: str = "", key: bytes | None = None) -> dict[str, str]:
-        """Return the effect of a command, or why it has none. Never raises.
-
-        `name`: of the head; `key`: of the fleet, which `_Keyed` commands need; None where none is needed.
-        """
+    def obey(self, message: bytes) -> dict[str, str]:
+        """Return the effect of a command, or why it has none. Never raises."""
         try:
             command = _COMMAND.validate_json(message if len(message) <= _LONGEST else b"")
-            self._do(command, name, key)
+            self._do(command)
         except ValidationError as error:
             return {"error": " ".join(one_line(error.errors()[0]).split())}
         except RobotError as error:
             return {"error": str(error).splitlines()[0]}
         return {"done": command.command}
 
-    def _do(self, command: _Command, name: str, key: bytes | None) -> None:
+    def _do(self, command: _Command) -> None:
         match command:
             case _Halt():
                 self.halt(str(command.by))
             case _Keyed():
-                if key is not None:
-                    self._check_proof(command, name, key)
+                if self._key is not None:
+                    self._check_proof(command, self._key)
                 if command.command == "end":
                     self._interrupt.ask()
                 else:
@@ -175,10 +182,10 @@ class FleetControls:
             case _Knobs():
                 self._knobs.turn(command.intensity, command.style)
 
-    def _check_proof(self, command: _Keyed, name: str, key: bytes) -> None:
+    def _check_proof(self, command: _Keyed, key: bytes) -> None:
         """Raise ConfigError unless a command comes from a holder of the key; the nonce is used up then."""
         with self._lock:
-            wanted = proof(key, name, command.command, self.nonce)
+            wanted = proof(key, self._name, command.command, self.nonce)
             given = str(command.proof).encode(errors="replace")
             if not hmac.compare_digest(wanted.encode(), given):
                 raise ConfigError(
@@ -194,7 +201,6 @@ class FleetHead(Observer):
         name: of this head among others.
         document: returns the state that is sent.
         router: that joins the fleet.
-        key: of the fleet (`fleet_key`); None: commands need none.
 
     Raises ConfigError, MissingExtra.
     """
@@ -205,9 +211,7 @@ class FleetHead(Observer):
         document: Callable[[], Document],
         controls: FleetControls,
         router: Router = LOCAL,
-        key: bytes | None = None,
     ) -> None:
-        self._key = key
         self._name, self._document, self._controls = fleet_name(name), document, controls
         self._connection = Connection(session_config("call", router))
         self._news, self._over = threading.Event(), False
@@ -260,7 +264,7 @@ class FleetHead(Observer):
         query.reply(f"{ROOT}/{self._name}/command", json.dumps({"name": self._name, **answer}).encode())
 
     def _obey(self, message: bytes) -> dict[str, str]:
-        answer = self._controls.obey(message, self._name, self._key)
+        answer = self._controls.obey(message)
         if "error" in answer:
             self._malformed += 1
             if self._malformed == 1:

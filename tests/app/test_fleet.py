@@ -48,11 +48,11 @@ KEY = b"k" * 64
 
 @pytest.mark.parametrize("command", ["resume", "end"])
 def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
-    controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
-    assert controls.obey(b'{"command": "halt", "by": "kitchen"}', "hall", KEY) == {"done": "halt"}  # needs no key
+    controls = FleetControls(run.halt, run.interrupt, run.knobs, None, "hall", KEY)
+    assert controls.obey(b'{"command": "halt", "by": "kitchen"}') == {"done": "halt"}  # needs no key
 
     def sent(**more):
-        return controls.obey(json.dumps({"command": command, **more}).encode(), "hall", KEY)
+        return controls.obey(json.dumps({"command": command, **more}).encode())
 
     nonce = controls.nonce
     other = "end" if command == "resume" else "resume"

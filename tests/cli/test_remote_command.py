@@ -34,8 +34,8 @@ def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(rou
 def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(router, tmp_path, command_line, caplog):
     mine, other = tmp_path / "mine.key", tmp_path / "other.key"
     latch, interrupt = HaltLatch(), Interrupt()
-    controls = FleetControls(latch, interrupt, None, None)
-    head = FleetHead("hall", lambda: {"state": "halted"}, controls, router, fleet_key(mine))
+    controls = FleetControls(latch, interrupt, None, None, "hall", fleet_key(mine))
+    head = FleetHead("hall", lambda: {"state": "halted"}, controls, router)
     with closing(head), Fleet(router.file) as fleet:
         while not fleet.states():
             pass  # until it is connected

@@ -25,8 +25,8 @@ class Head:
 
     def __init__(self, name, router):
         self.halt = HaltLatch()
-        controls = FleetControls(self.halt, Interrupt(), None, None)
-        self.head = FleetHead(name, self.document, controls, router, fleet_key(None))
+        controls = FleetControls(self.halt, Interrupt(), None, None, name, fleet_key(None))
+        self.head = FleetHead(name, self.document, controls, router)
 
     def document(self):
         by = self.halt.by
