@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from typer import Argument, Exit, Option
 
-from sfms_robot.cli.show import JSON, print_rows, show
+from sfms_robot.cli.show import JSON, Result, print_rows, show
 from sfms_robot.lab.bench import ALL, BENCHES
 
 EPILOG = "\n\n".join(
@@ -19,13 +18,8 @@ EPILOG = "\n\n".join(
 )
 
 
-def bench_names() -> list[str]:
-    """Return the names of the benches."""
-    return [ALL, *BENCHES]
-
-
 def bench(
-    name: str = Argument(ALL, autocompletion=bench_names, help="The bench; all: see below."),
+    name: str = Argument(ALL, autocompletion=lambda: [ALL, *BENCHES], help="The bench; all: see below."),
     head: str | None = Option(None, help="For 'lead' and 'memory': this head."),
     minutes: float | None = Option(None, min=0.0, help="For 'live': so long; else 10 min, 30 with --torture."),
     audio: Literal["mic", "push"] | None = Option(
@@ -70,7 +64,7 @@ def bench(
 
         write_page(write, found.figures, (time.monotonic() - began_s) / 60)
 
-    def printed(_: Mapping[str, Any]) -> None:
+    def printed(_: Result) -> None:
         print_rows(found.table)
         for line in found.lines:
             print(line)

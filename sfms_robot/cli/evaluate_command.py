@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from typer import BadParameter, Option, Typer
 
 from sfms_robot.cli.run_command import MAX_SEED
-from sfms_robot.cli.show import JSON, print_report, print_rows, say, show
+from sfms_robot.cli.show import JSON, Result, print_report, print_rows, say, show
 from sfms_robot.cli.train_command import ORDER, Order, interruptible
 
 app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
@@ -64,9 +63,21 @@ def tokenizer(
         return
     from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
-    options: dict[str, Any] = {"train": train, "size": size, "steps": steps, "seeds": seeds, "only": only, "jobs": jobs}
-    options["plots"] = plots
-    show(interruptible(lambda: evaluate_table(table, data, models, **options)), json, _print_tokenizers)
+    found = interruptible(
+        lambda: evaluate_table(
+            table,
+            data,
+            models,
+            train=train,
+            size=size,
+            steps=steps,
+            seeds=seeds,
+            only=only,
+            jobs=jobs,
+            plots=plots,
+        )
+    )
+    show(found, json, _print_tokenizers)
 
 
 @app.command("listener")
@@ -105,19 +116,39 @@ def listener_(
             raise BadParameter("--order and --hop are for --table 1 and 2, or none")
         from sfms_robot.lab.evaluation.arig_tables import arig_table
 
-        trained: dict[str, Any] = {
-            "models": models, "training": config, "steps": steps, "seeds": seeds, "split": split,
-        }  # fmt: skip
-        found = interruptible(lambda: arig_table(table, listener, data, clips=clips, seed=seed, **trained))
-        show(found, json, note=_INTERVALS)
-        return
-    from sfms_robot.lab.evaluation.arig_tables import sfms_table
+        found = interruptible(
+            lambda: arig_table(
+                table,
+                listener,
+                data,
+                clips=clips,
+                seed=seed,
+                models=models,
+                training=config,
+                steps=steps,
+                seeds=seeds,
+                split=split,
+            )
+        )
+    else:
+        from sfms_robot.lab.evaluation.arig_tables import sfms_table
 
-    options: dict[str, Any] = {
-        "samples": samples, "limit": clips, "seed": seed, "order": order, "hop": hop,
-        "models": models, "steps": steps, "split": split,
-    }  # fmt: skip
-    show(interruptible(lambda: sfms_table(int(table), listener, data, **options)), json, note=_INTERVALS)
+        found = interruptible(
+            lambda: sfms_table(
+                int(table),
+                listener,
+                data,
+                samples=samples,
+                limit=clips,
+                seed=seed,
+                order=order,
+                hop=hop,
+                models=models,
+                steps=steps,
+                split=split,
+            )
+        )
+    show(found, json, note=_INTERVALS)
 
 
 @app.command()
@@ -140,11 +171,21 @@ def papers(
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
     from sfms_robot.lab.evaluation.arig_tables import EVERY, evaluate_papers
 
-    options: dict[str, Any] = {
-        "clips": clips, "samples": samples, "steps": steps, "seed": seed, "seeds": seeds, "split": split,
-    }  # fmt: skip
-    each = _quiet if json else _print_paper
-    show(interruptible(lambda: evaluate_papers(data, models, table or EVERY, each, **options)), json, _quiet)
+    found = interruptible(
+        lambda: evaluate_papers(
+            data,
+            models,
+            table or EVERY,
+            _quiet if json else _print_paper,
+            clips=clips,
+            samples=samples,
+            steps=steps,
+            seed=seed,
+            seeds=seeds,
+            split=split,
+        )
+    )
+    show(found, json, _quiet)
 
 
 @app.command()
@@ -321,13 +362,13 @@ def _quiet(*_: Any) -> None:
     """Print nothing."""
 
 
-def _print_paper(name: str, found: Mapping[str, Any]) -> None:
+def _print_paper(name: str, found: Result) -> None:
     """Print one table of `evaluate papers` when it is finished."""
     say(f"ARIG, table {name.removeprefix('arig-')}" if name.startswith("arig") else f"SFMS, table {name}", "bold")
     (_print_tokenizers if name in ("3", "4") else print_report)(found)
 
 
-def _print_tokenizers(found: Mapping[str, Any]) -> None:
+def _print_tokenizers(found: Result) -> None:
     """Print table 3 or 4 of the SFMS paper, or both."""
     for table in found.get("tables", [found]):
         print_report(table, _TABLES[table["table"]], ("rows", "ratios", "claims", "truth_silhouette", "not_trained"))
@@ -335,7 +376,7 @@ def _print_tokenizers(found: Mapping[str, Any]) -> None:
     say("The paper's figures are of other motion: compare ratios.", "dim")
 
 
-def _print_interaction(result: Mapping[str, Any]) -> None:
+def _print_interaction(result: Result) -> None:
     """Print every figure; then the states, labels down, answers across, in percent of the label."""
     confusion = result.get("confusion") or {"states": [], "label_by_answer": []}
     print_report({key: value for key, value in result.items() if key != "confusion"})

@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import sys
 import tempfile
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, cell, counted, print_rows, say, show
+from sfms_robot.cli.show import JSON, Result, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
 
 PACKAGES = Option(
@@ -113,7 +112,7 @@ def check(
         raise Exit(ConfigError.exit_code)
 
 
-def _print_check(checked: Mapping[str, Any]) -> None:
+def _print_check(checked: Result) -> None:
     """Print the verdict, the problems and remarks, one line each; without problems, the table of the joints."""
     problems, remarks = checked["problems"], checked["remarks"]
     found = ((problems, "problem"), (remarks, "remark"))
@@ -189,7 +188,7 @@ def show_head(
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)
         joints = {joint: joints[joint]}
 
-    def printed(_: Mapping[str, Any]) -> None:
+    def printed(_: Result) -> None:
         for joint, values in joints.items():
             rows = [{"key": key, "value": cell(value), "from": origin} for key, (value, origin) in values.items()]
             print_rows(rows, f"{name}: {joint}")
@@ -268,7 +267,7 @@ def fit(
     from sfms_robot.app.listen.panel import live_panel
     from sfms_robot.app.options import HeadOptions
 
-    def fitted(learnt: Mapping[str, Any]) -> None:
+    def fitted(learnt: Result) -> None:
         practice = "; practice on emulated servos: no run uses this file" if learnt["practice"] else ""
         show(
             learnt,
@@ -313,7 +312,7 @@ def solve(
     """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
     from sfms_robot.app.head.head_solve import solve_poses
 
-    def printed(table: Mapping[str, Any]) -> None:
+    def printed(table: Result) -> None:
         missing = ("residual_rad", "residual_m") if residual else ()
         rows = csv.writer(sys.stdout, lineterminator="\n")
         rows.writerow([*table["joints"], "reached", *missing])
@@ -334,12 +333,11 @@ def import_file(
     """Make a head folder from the file of other software, and list what has no place in it."""
     from sfms_robot.app.head.head_import import import_head
 
-    imported = import_head(file, to, model)
-
-    def printed(_: Mapping[str, Any]) -> None:
-        say(f"{imported.folder}/head.yaml: {len(imported.joints)} joints, from {imported.source}", "bold")
-        for remark in imported.remarks:
+    def printed(imported: Result) -> None:
+        folder = imported["folder"]
+        say(f"{folder}/head.yaml: {len(imported['joints'])} joints, from {imported['read_as']}", "bold")
+        for remark in imported["remarks"]:
             say(f"  {remark}")
-        say(f"next: sfms-robot head check {imported.folder}; sfms-robot doctor --head {imported.folder} --port DEVICE")
+        say(f"next: sfms-robot head check {folder}; sfms-robot doctor --head {folder} --port DEVICE")
 
-    show({"version": 1, **imported.as_dict()}, json, printed)
+    show(import_head(file, to, model), json, printed)

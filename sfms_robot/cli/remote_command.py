@@ -7,14 +7,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from typer import Argument, Context, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, print_json, show
+from sfms_robot.cli.show import JSON, Result, print_json, show
 from sfms_robot.data import listener_names
 from sfms_robot.errors import ConfigError
 
@@ -86,11 +86,11 @@ def page(
         threading.Event().wait()
 
 
-def _show_answers(answers: Sequence[Mapping[str, Any]], asked: Sequence[str], json: bool) -> None:
+def _show_answers(answers: Sequence[Result], asked: Sequence[str], json: bool) -> None:
     """Print the answers of heads; exit code 1 when a named head did not answer, or none did."""
     silent = [name for name in asked if name not in {each.get("name") for each in answers}]
 
-    def printed(_: Mapping[str, Any]) -> None:
+    def printed(_: Result) -> None:
         for each in answers:
             print(f"{each.get('name')}: {each.get('error') or each.get('done')}")
         for name in silent:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any
 
 from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
-from sfms_robot.cli.show import JSON, cell, counted, print_report, say, show
+from sfms_robot.cli.show import JSON, Result, cell, counted, print_report, say, show
 from sfms_robot.data import head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError
 
@@ -267,7 +265,7 @@ def run(
     show(report, json, None if dry_run else _print_run, heading="{head} on {port}: torque stays off")
 
 
-def _print_run(report: Mapping[str, Any]) -> None:
+def _print_run(report: Result) -> None:
     """Print the report of a run on one screen."""
     motion, limits, bus = report["motion"], report["limits"], report["bus"]
     tick, latency, step = report["tick"], report["latency_ms"], report["listener_step_ms"]
@@ -360,7 +358,7 @@ def demo(
     show(found, json, _print_demo)
 
 
-def _print_demo(found: Mapping[str, Any]) -> None:
+def _print_demo(found: Result) -> None:
     """Print what a demo showed, or the statistics of several seeds."""
     if "runs" in found:
         nods = found["nods"]
@@ -373,7 +371,7 @@ def _print_demo(found: Mapping[str, Any]) -> None:
         print(found["missing"], file=sys.stderr)
 
 
-def _line(seen: Mapping[str, Any]) -> str:
+def _line(seen: Result) -> str:
     return (
         f"{seen['head']} listened for {seen['duration_s']:.1f} s (seed {seen['seed']}): "
         f"{', '.join(counted(seen[f'{kind}s'], kind) for kind in ('nod', 'blink', 'smile'))}; "

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
-from functools import wraps
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, counted, print_json, print_rows, show
+from sfms_robot.cli.show import JSON, Row, counted, print_json, print_rows, show, with_shared_options
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -49,28 +47,11 @@ class Wiring:
         return open_wire(self.port, self.family, self.baud, self.head, self.model)
 
 
-def on_wire(command: Callable[..., None]) -> Callable[..., None]:
-    """Return `command(wiring, ...)` as typer is to see it: with the options of `Wiring` behind its own."""
-    own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
-    shared = list(inspect.signature(Wiring, eval_str=True).parameters.values())
-
-    @wraps(command)
-    def run(**given: Any) -> None:
-        wiring = Wiring(**{field.name: given.pop(field.name) for field in fields(Wiring)})
-        command(wiring, **given)
-
-    seen = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *shared)]
-    run.__dict__.pop("__wrapped__")  # or its signature would be looked at instead
-    run.__dict__["__signature__"] = inspect.Signature(seen)
-    run.__annotations__ = {each.name: each.annotation for each in seen}
-    return run
-
-
 # --- looking ----------------------------------------------------------------------------------------------------
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def scan(
     on: Wiring,
     ids: str | None = Option(None, "--ids", help="Ask these one by one, as 1-9,12. Default: all."),
@@ -87,12 +68,12 @@ def scan(
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
     from sfms_robot.app.progress import tracked
 
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     with on.open() as wire:
         for servo in tracked(_parsed(ids), "asking"):
             try:
@@ -106,7 +87,7 @@ def ping(on: Wiring, ids: str = IDS) -> None:
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def read(
     on: Wiring,
     ids: str = IDS,
@@ -119,7 +100,7 @@ def read(
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def monitor(
     on: Wiring,
     ids: str | None = Argument(None, metavar="ID", help="1-9,12. Default: all."),
@@ -129,7 +110,7 @@ def monitor(
     """Show position, load, voltage, temperature and faults, live. Reads only."""
     from sfms_robot.app.servo.single_servo import samples as looks
 
-    taken: list[list[dict[str, Any]]] = []
+    taken: Sequence[Sequence[Row]] = []
     with on.open() as wire:
         with _bar("looking for servos", hidden=on.json) as progress:
             servos = _chosen(wire, ids, progress)
@@ -196,7 +177,7 @@ def doctor(
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
-@on_wire
+@with_shared_options
 def write(
     on: Wiring,
     ids: str = IDS,
@@ -213,7 +194,7 @@ def write(
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
-@on_wire
+@with_shared_options
 def move(
     on: Wiring,
     servo: int = ONE_ID,
@@ -249,7 +230,7 @@ def release(
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def dump(
     on: Wiring,
     file: Path = Argument(..., help="Is written; must not exist yet."),
@@ -268,7 +249,7 @@ def dump(
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def restore(
     on: Wiring,
     file: Path = Argument(..., help="As `servo dump` wrote it."),
@@ -295,7 +276,7 @@ def restore(
 
 
 @app.command("set-id")
-@on_wire
+@with_shared_options
 def set_id(
     on: Wiring,
     old: int = Argument(..., help="The id it has."),
@@ -310,7 +291,7 @@ def set_id(
 
 
 @app.command("set-baud")
-@on_wire
+@with_shared_options
 def set_baud(
     on: Wiring,
     ids: str = IDS,
@@ -325,7 +306,7 @@ def set_baud(
 
 
 @app.command()
-@on_wire
+@with_shared_options
 def reboot(on: Wiring, ids: str = IDS, yes: bool = YES) -> None:
     """Start servos over: torque goes off, latched hardware errors are cleared."""
     from sfms_robot.app.servo.single_servo import reboot as restart
@@ -335,7 +316,7 @@ def reboot(on: Wiring, ids: str = IDS, yes: bool = YES) -> None:
 
 
 @app.command("factory-reset")
-@on_wire
+@with_shared_options
 def factory_reset(
     on: Wiring,
     servo: int = ONE_ID,
@@ -390,9 +371,9 @@ def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:
     return servos
 
 
-def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], list[dict[str, Any]]]) -> None:
+def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], Sequence[Row]]) -> None:
     """Do `work` for every id; the rows of the first ids are shown even when a later one fails."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     servos = _parsed(ids)
     try:
         with on.open() as wire:
@@ -405,11 +386,11 @@ def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], list[dict
     _show(rows, {key: rows}, on.json)
 
 
-def _show(rows: Sequence[dict[str, Any]], result: dict[str, Any], json: bool, title: str = "") -> None:
+def _show(rows: Sequence[Row], result: Row, json: bool, title: str = "") -> None:
     show(result, json, lambda _: print_rows([_for_people(row) for row in rows], title))
 
 
-def _for_people(row: dict[str, Any]) -> dict[str, Any]:
+def _for_people(row: Row) -> Row:
     """Return a register in fewer columns, and any other row unchanged."""
     if "area" not in row:
         return row

@@ -1,16 +1,18 @@
-"""The printer of every command: one JSON object with --json, lines and tables for people without.
+"""The printer of every command: one JSON object with --json, lines and tables for people without; shared options.
 
 rich is imported when something is printed. Output that is piped keeps whole rows: nothing is cut or folded there.
 """
 
 from __future__ import annotations
 
+import inspect
 import json as to_json
 import math
 import os
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from itertools import chain
 from string import Formatter
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,9 @@ from typer import Exit, Option
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+Result = Mapping[str, Any]  # of a command: what --json prints
+Row = Mapping[str, Any]  # of a table
 
 JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
@@ -47,9 +52,9 @@ _WORDS = {
 
 
 def show(
-    result: Mapping[str, Any],
+    result: Result,
     json: bool,
-    printed: Callable[[Mapping[str, Any]], None] | None = None,
+    printed: Callable[[Result], None] | None = None,
     *,
     heading: str = "",
     keys: Sequence[str] = (),
@@ -71,7 +76,23 @@ def show(
         raise Exit(result["exit_code"])
 
 
-def print_report(result: Mapping[str, Any], heading: str = "", keys: Sequence[str] = (), note: str = "") -> None:
+def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return `command(shared, ...)` as typer is to see it: the fields of `shared`, a dataclass, are options too."""
+    first, *own = inspect.signature(command, eval_str=True).parameters.values()
+    shared = inspect.signature(first.annotation, eval_str=True).parameters.values()
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        command(first.annotation(**{each.name: given.pop(each.name) for each in shared}), **given)
+
+    seen = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *shared)]
+    run.__dict__.pop("__wrapped__")  # or its signature would be looked at instead
+    run.__dict__["__signature__"] = inspect.Signature(seen)
+    run.__annotations__ = {each.name: each.annotation for each in seen}
+    return run
+
+
+def print_report(result: Result, heading: str = "", keys: Sequence[str] = (), note: str = "") -> None:
     """Print a heading, the values of `keys` (default: all), and a note.
 
     A value is a line, or a table where it is a list of rows or a mapping of names to rows. Heading and note may hold
@@ -92,7 +113,7 @@ def print_report(result: Mapping[str, Any], heading: str = "", keys: Sequence[st
         say(note.format_map(texts), "dim")
 
 
-def print_json(result: Mapping[str, Any]) -> None:
+def print_json(result: Result) -> None:
     """Print an object as one line, and flush it. NaN and infinity, which JSON does not have, become null."""
     print(to_json.dumps(_finite(result), allow_nan=False), flush=True)
 
@@ -120,7 +141,7 @@ def say(line: str, style: str = "") -> None:
     screen().print(line, style=style, markup=False, soft_wrap=True)
 
 
-def print_rows(rows: Sequence[Mapping[str, Any]], title: str = "") -> None:
+def print_rows(rows: Sequence[Row], title: str = "") -> None:
     """Print a title, and a table unless there are no rows."""
     if title:
         say(title, "bold")
@@ -128,7 +149,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]], title: str = "") -> None:
         screen().print(table_of(rows))
 
 
-def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
+def table_of(rows: Sequence[Row]) -> Table:
     """Return rows as a table: a column for each key that is not empty in all of them.
 
     A key `interval` of figures by name is printed behind these figures. A mapping with more than `_NESTED` keys is left
@@ -160,7 +181,7 @@ def _words(key: str) -> str:
     return _WORDS.get(key, key.replace("_", " "))
 
 
-def _with_intervals(row: Mapping[str, Any]) -> Mapping[str, Any]:
+def _with_intervals(row: Row) -> Row:
     ends = row.get("interval")
     if not isinstance(ends, Mapping):
         return row

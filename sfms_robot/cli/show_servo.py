@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from sfms_robot.cli.show import counted, print_rows, say, screen, table_of
+from sfms_robot.cli.show import Result, Row, counted, print_rows, say, screen, table_of
 
 _COLUMNS = (
     "id",
@@ -27,10 +26,10 @@ _COLUMNS = (
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
-def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
+def live(samples: Iterable[Sequence[Row]], title: str) -> None:
     """Show one table, redrawn with every sample, until they end or Ctrl-C is pressed."""
     console = screen()
-    rows: Sequence[Mapping[str, Any]] = []
+    rows: Sequence[Row] = []
     try:
         with Live(console=console, auto_refresh=False, transient=console.is_terminal) as view:
             for rows in samples:
@@ -42,7 +41,7 @@ def live(samples: Iterable[Sequence[Mapping[str, Any]]], title: str) -> None:
         print_rows(rows, title)
 
 
-def print_doctor(report: Mapping[str, Any]) -> None:
+def print_doctor(report: Result) -> None:
     """Print adapter, servos, budget, findings and verdict of every bus."""
     for bus in report["buses"]:
         say(f"bus {bus['bus']} on {bus['port']}" if bus["bus"] else bus["port"], "bold")
@@ -65,7 +64,7 @@ def print_doctor(report: Mapping[str, Any]) -> None:
         say(f"{verdict}: {', '.join(numbers)}", "bold red" if counts["error"] else "bold green")
 
 
-def _print_adapter(adapter: Mapping[str, Any]) -> None:
+def _print_adapter(adapter: Result) -> None:
     usb = f"{adapter['vendor']}:{adapter['product']} {adapter['serial'] or ''}" if adapter.get("vendor") else None
     latency = f"latency timer {adapter['latency_ms']} ms" if adapter.get("latency_ms") is not None else None
     known = [adapter.get("description"), usb, adapter.get("driver"), latency, adapter.get("by_id")]
@@ -73,7 +72,7 @@ def _print_adapter(adapter: Mapping[str, Any]) -> None:
         say("adapter: " + ", ".join(str(each).strip() for each in known if each))
 
 
-def _print_budget(bus: Mapping[str, Any]) -> None:
+def _print_budget(bus: Result) -> None:
     budget = bus["budget"]
     say(
         f"One turn of the loop with {budget['servos']} servos at {budget['baud']} baud; wanted {bus['rate_hz']:g} a "
@@ -85,10 +84,10 @@ def _print_budget(bus: Mapping[str, Any]) -> None:
         "plain": "and each servo read",
         "fast": f"and all read in one answer ({tried})",
     }
-    costs = [(name, budget[key]) for key, name in names.items() if budget[key]]
     print_rows(
         [
             {"on the wire": name, "bytes": cost["bytes"], "ms": cost["ms"], "turns a second": cost["hz"]}
-            for name, cost in costs
+            for key, name in names.items()
+            if (cost := budget[key])
         ]
     )

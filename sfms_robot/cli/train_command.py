@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, cell, print_rows, say, show
+from sfms_robot.cli.show import JSON, Result, cell, print_rows, say, show, with_shared_options
 from sfms_robot.data import listener_names
 from sfms_robot.errors import INTERRUPTED, ConfigError
 
@@ -28,135 +29,102 @@ _LAYOUTS = (
 
 
 Order = Literal["exp-first", "pose-first"]
-DeviceName = Literal["auto", "cpu", "cuda"]
 CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
-DATA = Option(None, help="Folder with train/ and validation/ (see `sfms-robot data compose`), or a `train pack`.")
-OUT = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
-RESUME = Option(False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data.")
-OVERWRITE = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
-DEVICE = Option("auto", help="auto: the GPU if there is one.")
-STEPS = Option(None, min=1, help="Another number of steps than the file's.")
-TENSORBOARD = Option(None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed.")
 ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
-ACCUMULATE = Option(
-    None, min=1, help="Pieces of a step's batch that each process takes one after the other; saves memory."
-)
-SCRATCH = Option(None, help="Folder for frames that are read from disk as they are drawn, not held in memory.")
-DRY_RUN = Option(
-    False, "--dry-run", help="One step of every stage on made-up frames, and what all of it would take; no data needed."
-)
 
 
 # --- train ------------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, kw_only=True)
+class PhaseFlags:
+    """Options of both phases of training. A field is an option of each."""
+
+    config: Path = CONFIG
+    data: Path | None = Option(
+        None, help="Folder with train/ and validation/ (see `sfms-robot data compose`), or a `train pack`."
+    )
+    out: Path | None = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
+    resume: bool = Option(
+        False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data."
+    )
+    overwrite: bool = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
+    device: Literal["auto", "cpu", "cuda"] = Option("auto", help="auto: the GPU if there is one.")
+    steps: int | None = Option(None, min=1, help="Another number of steps than the file's.")
+    tensorboard: bool | None = Option(
+        None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed."
+    )
+    order: Order | None = ORDER
+    accumulate: int | None = Option(
+        None, min=1, help="Pieces of a step's batch that each process takes one after the other; saves memory."
+    )
+    scratch: Path | None = Option(
+        None, help="Folder for frames that are read from disk as they are drawn, not held in memory."
+    )
+    dry_run: bool = Option(
+        False,
+        "--dry-run",
+        help="One step of every stage on made-up frames, and what all of it would take; no data needed.",
+    )
+    json: bool = JSON
+
+
 @app.command()
+@with_shared_options
 def tokenizer(
-    config: Path = CONFIG,
-    data: Path | None = DATA,
-    out: Path | None = OUT,
-    resume: bool = RESUME,
-    overwrite: bool = OVERWRITE,
-    device: DeviceName = DEVICE,
-    steps: int | None = STEPS,
+    flags: PhaseFlags,
     placement: Literal["exact", "static", "static_paper", "learned"] | None = Option(
         None, help="Another keyframe placement than the file's, to compare."
     ),
-    tensorboard: bool | None = TENSORBOARD,
-    order: Order | None = ORDER,
-    accumulate: int | None = ACCUMULATE,
-    scratch: Path | None = SCRATCH,
-    dry_run: bool = DRY_RUN,
-    json: bool = JSON,
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
     from sfms_robot.lab.learning.train_runs import train_tokenizer
 
-    _train(
-        train_tokenizer,
-        dry_run,
-        json,
-        file=config,
-        data=data,
-        out=out,
-        resume=resume,
-        device=device,
-        steps=steps,
-        changes={"placement": placement} if placement else {},
-        tensorboard=tensorboard,
-        order=order,
-        overwrite=overwrite,
-        accumulate=accumulate,
-        scratch=scratch,
-    )
+    _train(train_tokenizer, flags, {"placement": placement} if placement else {})
 
 
 @app.command()
-def listener(
-    config: Path = CONFIG,
-    data: Path | None = DATA,
-    out: Path | None = OUT,
-    resume: bool = RESUME,
-    overwrite: bool = OVERWRITE,
-    device: DeviceName = DEVICE,
-    steps: int | None = STEPS,
-    tensorboard: bool | None = TENSORBOARD,
-    order: Order | None = ORDER,
-    accumulate: int | None = ACCUMULATE,
-    scratch: Path | None = SCRATCH,
-    dry_run: bool = DRY_RUN,
-    json: bool = JSON,
-) -> None:
+@with_shared_options
+def listener(flags: PhaseFlags) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
     from sfms_robot.lab.learning.train_runs import train_listener
 
-    _train(
-        train_listener,
-        dry_run,
-        json,
-        file=config,
-        data=data,
-        out=out,
-        resume=resume,
-        device=device,
-        steps=steps,
-        tensorboard=tensorboard,
-        order=order,
-        overwrite=overwrite,
-        accumulate=accumulate,
-        scratch=scratch,
-    )
+    _train(train_listener, flags, {})
 
 
-def _train(
-    work: Callable[[TrainOptions], dict[str, Any]],
-    dry_run: bool,
-    json: bool,
-    *,
-    file: Path,
-    data: Path | None,
-    out: Path | None,
-    **options: Any,
-) -> None:
+def _train(work: Callable[[TrainOptions], dict[str, Any]], flags: PhaseFlags, changes: Mapping[str, str]) -> None:
     """Run a phase of training, or one step of every phase, and print its figures."""
-    if dry_run:
+    if flags.dry_run:
         from sfms_robot.config import load_training
-        from sfms_robot.lab.learning.dry_run import dry_run as estimate
+        from sfms_robot.lab.learning.dry_run import dry_run
 
-        show(
-            estimate(load_training(file)), json, keys=("rows", "hours"), note="hours of all stages, computed; {assumed}"
-        )
+        note = "hours of all stages, computed; {assumed}"
+        show(dry_run(load_training(flags.config)), flags.json, keys=("rows", "hours"), note=note)
         return
     from sfms_robot.lab.learning.train_runs import TrainOptions
 
-    if data is None or out is None:
-        raise ConfigError(f"{'--data' if data is None else '--out'} is missing; only --dry-run goes without")
-    figures = interruptible(lambda: work(TrainOptions(file=file, data=data, out=out, **options)))
+    if flags.data is None or flags.out is None:
+        raise ConfigError(f"{'--data' if flags.data is None else '--out'} is missing; only --dry-run goes without")
+    options = TrainOptions(
+        file=flags.config,
+        data=flags.data,
+        out=flags.out,
+        resume=flags.resume,
+        device=flags.device,
+        steps=flags.steps,
+        changes=changes,
+        tensorboard=flags.tensorboard,
+        order=flags.order,
+        overwrite=flags.overwrite,
+        accumulate=flags.accumulate,
+        scratch=flags.scratch,
+    )
+    figures = interruptible(lambda: work(options))
     if not figures:  # of a process that is not the first of its group
         return
     if figures["resumed_at"] == figures["steps"]:
         print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
-    show(figures, json)
+    show(figures, flags.json)
 
 
 def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -271,7 +239,7 @@ def convert(
     show(converted, json, _print_conversion)
 
 
-def _print_conversion(report: Mapping[str, Any]) -> None:
+def _print_conversion(report: Result) -> None:
     """Print the splits that were written, the clips left out of them, and the loss."""
     say(f"{report['layout']}: {report['folder']} -> {report['out']}")
     if report["licence"]:
@@ -287,7 +255,7 @@ def _print_conversion(report: Mapping[str, Any]) -> None:
         say(note, "dim")
 
 
-def _print_data(report: Mapping[str, Any], channels: bool) -> None:
+def _print_data(report: Result, channels: bool) -> None:
     """Print splits, their problems, and if wanted the range of every channel."""
     order = f", {report['order']}" if report["order"] else ""
     splits, first = report["splits"], report["splits"][0]
@@ -357,7 +325,7 @@ def export(
 
     files = export_listener(listener, out, int8, weight_bits)
 
-    def printed(_: Mapping[str, Any]) -> None:
+    def printed(_: Result) -> None:
         for file in files:
             print(f"{file.stat().st_size / 1000:8.1f} kB  {file}")
 
