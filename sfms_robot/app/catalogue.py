@@ -16,8 +16,10 @@ from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.registry import shipped_speaker
 
+Row = dict[str, Any]
 
-def shipped_heads() -> list[dict[str, Any]]:
+
+def shipped_heads() -> list[Row]:
     """Return the rows of `head list`."""
     heads = [load_head(name) for name in head_names()]
     return [
@@ -32,7 +34,7 @@ def shipped_heads() -> list[dict[str, Any]]:
     ]
 
 
-def shipped_listeners() -> list[dict[str, Any]]:
+def shipped_listeners() -> list[Row]:
     """Return the rows of `listener list`."""
     folder = data_dir("configs") / "listeners"
     rows = []
@@ -49,7 +51,7 @@ def shipped_listeners() -> list[dict[str, Any]]:
     return rows
 
 
-def shipped_speakers() -> list[dict[str, Any]]:
+def shipped_speakers() -> list[Row]:
     """Return the rows of `speaker list`; the description is the title of SOURCE.md."""
     import soundfile
 
@@ -68,7 +70,7 @@ def shipped_speakers() -> list[dict[str, Any]]:
     return rows
 
 
-def outputs() -> list[dict[str, Any]]:
+def outputs() -> list[Row]:
     """Return the rows of `output list`, those of other packages too. `name` begins the value for --output."""
     return [
         {"name": name, "description": DESCRIPTIONS.get(name, f"of package {entry.dist.name if entry.dist else '?'}")}
@@ -76,12 +78,12 @@ def outputs() -> list[dict[str, Any]]:
     ]
 
 
-def serial_ports() -> list[dict[str, Any]]:
+def serial_ports() -> list[Row]:
     """Return the rows of `port list`. `name` is the value for --port."""
     return ports_data()
 
 
-def sound_devices(direction: Literal["recording", "playing"]) -> list[dict[str, Any]]:
+def sound_devices(direction: Literal["recording", "playing"]) -> list[Row]:
     """Return the sound devices of `port list`, whose descriptions name the option for each; block for half a second.
 
     Raises ConfigError without PortAudio.

@@ -24,6 +24,7 @@ from sfms_robot.app.listen.knobs import LiveKnobs, turned
 from sfms_robot.app.listen.report import (
     Drove,
     OutletObserver,
+    Report,
     event_watch,
     figures_so_far,
     limitation,
@@ -84,7 +85,6 @@ def drive_head(
     interrupt: Interrupt,
     *,
     duration_s: float | None = None,
-    signals: bool = True,
     log: RunLog | None = None,
 ) -> Drove:
     """Switch torque on, run the loop, come to rest, switch torque off. Blocks until then.
@@ -94,14 +94,13 @@ def drive_head(
 
     Args:
         duration_s: None without an end.
-        signals: Ctrl-C and the like set `interrupt`; main thread only.
         log: is filled; other threads may read it meanwhile.
     """
     log = run_log(opened) if log is None else log
     real = not opened.options.fast
     outcome, error = "failed", None
     watched = parts.halt.watched(opened.bus) if real else nullcontext()
-    with signals_to(interrupt) if signals else nullcontext(), watched, realtime_priority(wanted=real) as priority:
+    with watched, realtime_priority(wanted=real) as priority:
         interrupt.arm(opened.bus)
         began_s = time.monotonic()
         try:
@@ -182,9 +181,9 @@ def run(
     observers: Sequence[Observer] = (),
     timeline: Timeline | None = None,
     controls: RunControls | None = None,
-    more: Callable[[], Mapping[str, Any]] = dict,
+    more: Document = dict,
     signals: bool = True,
-) -> dict[str, Any]:
+) -> Report:
     """Listen until the duration is over or the run is interrupted. Blocks until then, and returns the report.
 
     The listener loads in its own process while the head is opened. After torque came on nothing is raised any more:
@@ -230,9 +229,8 @@ def run(
             from sfms_robot.outputs.sender import Outputs
 
             outputs = stack.enter_context(closing(Outputs(sinks, joints)))
-            more = partial(_with_outputs, more, outputs)
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
-        figures = partial(_figures, opened, log, person, feed, knobs, more)
+        figures = partial(_figures, opened, log, person, feed, knobs, outputs, more)
         status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
         controls.document = status.document
         watchers: list[Observer] = [status, *observers]
@@ -256,8 +254,9 @@ def run(
         if options.fleet is not None:
             from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
 
-            reach, key = (FleetControls(halt, interrupt, knobs, controls.set_rates), fleet_key(options.fleet_key))
-            fleet = FleetHead(options.fleet, status.document, reach, options.router, key)
+            name, key = options.fleet, fleet_key(options.fleet_key)
+            reach = FleetControls(halt, interrupt, knobs, controls.set_rates, name, key)
+            fleet = FleetHead(name, status.document, reach, options.router)
             watchers.append(stack.enter_context(closing(fleet)))
         played: dict[str, Any] = {"timeline": timeline}
         if timeline is None:
@@ -267,12 +266,13 @@ def run(
             opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played,
             missing=(lambda: outputs.missing) if outputs else tuple,
         )  # fmt: skip
-        drove = drive_head(opened, parts, interrupt, duration_s=duration_s, signals=False, log=log)
+        drove = drive_head(opened, parts, interrupt, duration_s=duration_s, log=log)
         status.ended(log.states[-1][1])
         if outputs is not None:
             outputs.close()
         report = run_report(opened, drove, feed, facts["listener"], options.seed)
-        report |= {"source": dict(person.statistics()), "limitation": limited, "outputs": [], **more()}
+        report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
+        report["outputs"] = [] if outputs is None else outputs.statistics()
         report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
             recorder.close()
@@ -328,10 +328,6 @@ def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> li
                     "would listen to itself (choose another port)"
                 )
     return sinks
-
-
-def _with_outputs(more: Callable[[], Mapping[str, Any]], outputs: Outputs) -> dict[str, Any]:
-    return {**more(), "outputs": outputs.statistics()}
 
 
 def _open(
@@ -392,8 +388,9 @@ def _figures(
     person: Source,
     feed: PlanFeed,
     live: LiveKnobs,
-    more: Callable[[], Mapping[str, Any]],
-) -> dict[str, Any]:
+    outputs: Outputs | None,
+    more: Document,
+) -> Report:
     """Return the figures of the status document, at this moment."""
     return {
         **figures_so_far(log, opened.rate_hz, real=not opened.options.fast),
@@ -401,4 +398,5 @@ def _figures(
         "listener_state": dict(feed.statistics()),
         "intensity": live.values["intensity"],
         **more(),
+        **({} if outputs is None else {"outputs": outputs.statistics()}),
     }

@@ -45,8 +45,8 @@ def imported(tmp_path, name, content, **options):
     file = tmp_path / name
     file.write_text(json.dumps(content) if name.endswith("json") else yaml.safe_dump(content))
     done = import_head(file, tmp_path / "made", **options)
-    assert check(str(done.folder))["problems"] == []
-    return load_head(str(done.folder)), done.remarks
+    assert check(done["folder"])["problems"] == []
+    return load_head(done["folder"]), done["remarks"]
 
 
 def test_lerobot_ticks_become_degrees_around_its_half_turn(tmp_path):

@@ -93,7 +93,7 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
             chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
         there = replace(opened, bus=bus(opened.bus))
         parts = run_parts(there, Ending(how, interrupt), NobodyThere())
-        drove = drive_head(there, parts, interrupt, duration_s=0.4, signals=False)
+        drove = drive_head(there, parts, interrupt, duration_s=0.4)
         return drove, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
 
 

@@ -70,7 +70,7 @@ def test_a_slow_listener_is_named_while_it_is_slow_and_no_limit_is_broken(tick_t
     with open_head(HeadOptions(fast=True)) as opened:
         burden, person = Burden(opened.clock, tick_takes_s), open_source(DEFAULT_SPEAKER, "auto", 10.0)
         parts = run_parts(opened, person, SlowListener(), observers=[burden])
-        drove = drive_head(opened, parts, Interrupt(), duration_s=10.0, signals=False)
+        drove = drive_head(opened, parts, Interrupt(), duration_s=10.0)
     log = drove.log
     changes = [(at_s, state.name, state.why) for at_s, state in log.states]
     assert [name for _, name, _ in changes] == [

@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
-from sfms_robot.app.api.servos import Background, Driven, Report, head_name
+from sfms_robot.app.api.servos import Background, Driven, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs
+from sfms_robot.app.listen.report import Report
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.options import SIM, RunOptions, record_format_named
 from sfms_robot.app.session import RunControls, run
@@ -274,7 +275,7 @@ class Robot(Driven):
         by an error, which `stop` raises): see docs/safety.md."""
         return "stopped" if self._run is None else self._run.state
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> Report:
         """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
         if self._run is not None and self._run.report is not None:
             return {**self._run.report, "callbacks_detached": dict(self._events.detached)}

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import failure, run_report
+from sfms_robot.app.listen.report import Report, failure, run_report
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
@@ -33,8 +33,6 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD: Final = 1e-3  # of the goal sent; the servo itself is behind by its lag
 SLACK_RAD: Final = 1e-9  # so that the end of a range, computed twice, is inside it
 _LOOK_S: Final = 0.01
-
-Report = Mapping[str, Any]
 
 
 # --- a run in its own thread ----------------------------------------------------------------------------------------
@@ -309,7 +307,7 @@ class Servos(Driven):
     def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
         parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now])
-        drove = drive_head(opened, parts, now.interrupt, signals=False)
+        drove = drive_head(opened, parts, now.interrupt)
         return run_report(opened, drove, alone, "none", 0)
 
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
-from sfms_robot.app.listen.report import failure
+from sfms_robot.app.listen.report import Report, failure
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
 from sfms_robot.app.session import Panel
@@ -61,7 +61,7 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 
 def babble(
     options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0, panel: Panel | None = None
-) -> dict[str, Any]:
+) -> Report:
     """Move, and record the run in a folder. Block until then; return its report.
 
     Raises RobotError, the head at rest; ConfigError before it moves where the fit could not be written.
@@ -97,7 +97,7 @@ def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceT
 # --- fit --------------------------------------------------------------------------------------------------------------
 
 
-def fit_head(name: str, recording: Path) -> dict[str, Any]:
+def fit_head(name: str, recording: Path) -> Report:
     """Learn from a recording, write the overlay's fit layer, and report both. Raises ConfigError for a bad recording.
 
     Errors are rms in joint units on held-out frames, of the seen value against the commanded one: `before` with the
@@ -135,10 +135,10 @@ def fit_head(name: str, recording: Path) -> dict[str, Any]:
     return {**facts, "file": str(file), "practice": practice}
 
 
-def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[Report]:
+    rows: list[Report] = []
     for j, (joint, response) in enumerate(zip(head.joints, responses, strict=True)):
-        row: dict[str, Any] = {"joint": joint, "moved": None, "before": None, "after": None}
+        row: Report = {"joint": joint, "moved": None, "before": None, "after": None}
         if response is not None:
             seen = looks[:, j] - response.offset
             row |= {"moved": response.moved, "before": rms(seen - has[:, j]), "after": rms(seen - response(has[:, j]))}

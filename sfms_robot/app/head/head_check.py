@@ -13,16 +13,16 @@ that explains them while moving the virtual head's skin least); and the loss is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sfms_robot.app.head.fit import Tracker, skin_motion
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.listen.report import limitation
+from sfms_robot.app.listen.report import Report, limitation
 from sfms_robot.app.open_head import check_safety
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
 from sfms_robot.app.progress import tracked
@@ -62,9 +62,7 @@ _ANGLES = slice(0, 3)
 _EVERY = 5  # frames: faces of two neighbours hardly differ
 
 
-def check(
-    name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()
-) -> dict[str, Any]:
+def check(name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()) -> Report:
     """Check a head by shipped name or folder, on the bundled faces or those in a folder; return the report.
 
     A head with `problems` has no other values. `remarks`: what is allowed and probably not meant, and
@@ -79,9 +77,18 @@ def check(
     `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for a
     listener that is not one.
     """
-    report: dict[str, Any] = {"name": name, "problems": check_head(name), "joints": [], "blind_channels": []}
-    report["remarks"] = []
-    report |= {"dead_joints": [], "neck": None, "calibrate_first": False, "seconds": 0.0, "limitation": None}
+    report: Report = {
+        "name": name,
+        "problems": check_head(name),
+        "joints": [],
+        "blind_channels": [],
+        "remarks": [],
+        "dead_joints": [],
+        "neck": None,
+        "calibrate_first": False,
+        "seconds": 0.0,
+        "limitation": None,
+    }
     limited = limitation(listener) if listener is not None else None
     if report["problems"]:
         return report
@@ -123,7 +130,7 @@ def _angles(retargeter: HeadRetargeter, motion: Doubles) -> Doubles:
     return np.concatenate(parts)
 
 
-def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> list[dict[str, Any]]:
+def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> list[Report]:
     limits = JointLimits.of(head)
     rest = np.array([joint.rest_rad for joint in head.joints.values()])
     every = np.concatenate(clips)
@@ -182,7 +189,7 @@ def _axes_of(head: Head, neck: Neck, joint: str) -> Sequence[str]:
     )
 
 
-def _neck(neck: Neck, clips: Sequence[Floats]) -> dict[str, Any]:
+def _neck(neck: Neck, clips: Sequence[Floats]) -> Report:
     poses = np.concatenate([clip[:, : len(POSE_CHANNELS)] for clip in clips]).astype(np.float64)
     shown = np.array([channel in neck.axes for channel in POSE_CHANNELS])
     moved = np.abs(poses).max(axis=1) > 0  # clips without head motion do not count
@@ -204,7 +211,7 @@ def _reach(neck: Neck, axis: str) -> tuple[float, float]:
 # --- the picture ----------------------------------------------------------------------------------------------------
 
 
-def plot(checked: Mapping[str, Any], png: Path) -> None:
+def plot(checked: Report, png: Path) -> None:
     """Draw the check of a sound head: ranges, the part that recorded faces use, and the speed and jerk they demand.
 
     Raises ConfigError where the file cannot be written, MissingExtra without matplotlib.
@@ -232,7 +239,7 @@ def plot(checked: Mapping[str, Any], png: Path) -> None:
 # --- fidelity ---------------------------------------------------------------------------------------------------------
 
 
-def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, Any]:
+def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
     """Score every shipped head (or those named) on every recorded face, and on all together. Raises ConfigError.
 
     A row has shares 0..1 of expression and pose; None where the recording has no such motion.
@@ -241,39 +248,32 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> dict[str, A
     faces: dict[str, list[Floats]] = {}
     for face, clip in named_faces(data):
         faces.setdefault(face, []).append(clip)
-    return {"version": 1, "rows": [row for name in tracked(names, "showing faces") for row in _fidelity(name, faces)]}
-
-
-def _fidelity(name: str, faces: dict[str, list[Floats]]) -> list[dict[str, Any]]:
-    """Return one row per face, then one for all of them."""
-    head = load_head(name)
-    neck, tracker, skin = HeadRetargeter(head).neck, Tracker(head), skin_motion()
+    rows: list[Report] = []
+    skin = skin_motion()
 
     def energy(shapes: Doubles) -> float:
         return float(np.einsum("ni,ij,nj->", shapes, skin, shapes, optimize=True))
 
-    sums: dict[str, Doubles] = {}  # seconds, expression lost and shown, pose lost and shown
-    for face, clips in faces.items():
-        motion = np.concatenate(clips)
-        wanted = motion[::_EVERY, SHAPES].astype(np.float64)
-        turns = np.zeros((len(motion), len(POSE_CHANNELS)))
-        turns[:, _ANGLES] = motion[:, _ANGLES]
-        missing = turns if neck is None else neck.solve(turns).residual_rad  # without a neck, all of it
-        lost = tracker.face(asked(head, wanted)) - wanted
-        sums[face] = np.array(
-            [len(motion) * FRAME_S, energy(lost), energy(wanted), (missing**2).sum(), (turns**2).sum()]
-        )
-    sums["all"] = np.sum(list(sums.values()), axis=0)
-    return [
-        {
-            "head": head.name,
-            "face": face,
-            "seconds": round(total[0], 1),
-            "expression": _share(*total[1:3]),
-            "pose": _share(*total[3:]),
-        }
-        for face, total in ((face, total.tolist()) for face, total in sums.items())
-    ]
+    for head in map(load_head, tracked(names, "showing faces")):
+        neck, tracker = HeadRetargeter(head).neck, Tracker(head)
+        sums: dict[str, Doubles] = {}  # seconds, expression lost and shown, pose lost and shown
+        for face, clips in faces.items():
+            motion = np.concatenate(clips)
+            wanted = motion[::_EVERY, SHAPES].astype(np.float64)
+            turns = np.zeros((len(motion), len(POSE_CHANNELS)))
+            turns[:, _ANGLES] = motion[:, _ANGLES]
+            missing = turns if neck is None else neck.solve(turns).residual_rad  # without a neck, all of it
+            lost = tracker.face(asked(head, wanted)) - wanted
+            sums[face] = np.array(
+                [len(motion) * FRAME_S, energy(lost), energy(wanted), (missing**2).sum(), (turns**2).sum()]
+            )
+        sums["all"] = np.sum(list(sums.values()), axis=0)
+        for face, total in sums.items():
+            seconds, *shares = total.tolist()
+            expression, pose = _share(*shares[:2]), _share(*shares[2:])
+            row = {"head": head.name, "face": face, "seconds": round(seconds, 1)}
+            rows.append({**row, "expression": expression, "pose": pose})
+    return {"version": 1, "rows": rows}
 
 
 def _share(lost: float, wanted: float) -> float | None:

@@ -12,18 +12,17 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import yaml
-from pydantic import BaseModel, Field, RootModel
+from pydantic import BaseModel, RootModel
 
 from sfms_robot.app.output_paths import made_folder
 from sfms_robot.config.base import parse, read
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files
 from sfms_robot.config.head import Head
-from sfms_robot.data import find
+from sfms_robot.data import head_file
 from sfms_robot.errors import ConfigError
 
 LIMITS: Final = {"speed_deg_s": 150, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90_000}  # of a slow neck
@@ -37,30 +36,15 @@ _CHANNELS: Final = {  # the words of a joint's name that stand for a channel; ax
 _PYPOT_MODELS: Final = {"ax-12": "ax-12a", "ax-18": "ax-18a"}  # by pypot's names; MX depend on the protocol
 _REACHY: Final = "reachy_mini"
 
-Draft = tuple[dict[str, Any], list[str]]  # the plain data of a head.yaml, and the remarks
+Plain = dict[str, Any]
+Draft = tuple[Plain, list[str]]  # the plain data of a head.yaml, and the remarks
 
 
-@dataclass
-class ImportedHead:
-    """A head folder and what its source could not say.
-
-    Attributes:
-        source: what the file was read as.
-        remarks: what was left out, assumed or has to be checked, one line each.
-    """
-
-    folder: Path
-    source: str
-    joints: list[str]
-    remarks: list[str]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for `--json`."""
-        return {"folder": str(self.folder), "read_as": self.source, "joints": self.joints, "remarks": self.remarks}
-
-
-def import_head(file: Path, folder: Path | None = None, model: str | None = None) -> ImportedHead:
+def import_head(file: Path, folder: Path | None = None, model: str | None = None) -> Plain:
     """Write a head folder from the file of another program. The servos are neither asked nor moved.
+
+    Returns the folder, what the file was `read_as`, the joints, and `remarks`: what was left out, assumed or has to be
+    checked, one line each.
 
     Args:
         folder: a new folder; None: one of the file's name in the current folder.
@@ -78,7 +62,7 @@ def import_head(file: Path, folder: Path | None = None, model: str | None = None
     lines = [f"# From {file.name}, read as {source}.", *(f"# {remark}" for remark in remarks)]
     text = yaml.safe_dump(head, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
     (made_folder(folder, "--to") / "head.yaml").write_text("\n".join([*lines, text]), encoding="utf-8")
-    return ImportedHead(folder, source, list(head["joints"]), remarks)
+    return {"version": 1, "folder": str(folder), "read_as": source, "joints": list(head["joints"]), "remarks": remarks}
 
 
 def _plain(file: Path) -> Any:
@@ -132,7 +116,8 @@ def _from_lerobot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
         remarks.append("model: the file names none; sts3215 is assumed (another: --model)")
     table = load_firmware_map(model)
     if table.family not in ("dynamixel", "feetech") or table.protocol is None:
-        raise ConfigError.at(file, "--model", model, "is a model that LeRobot does not drive", _servo_models())
+        driven = [each.stem for each in map_files() if each.parent.name in ("dynamixel", "feetech")]
+        raise ConfigError.at(file, "--model", model, "is a model that LeRobot does not drive", driven)
     feetech = table.family == "feetech"
     family = "feetech" if feetech else f"dynamixel{table.protocol}"
     # LeRobot's homing makes the middle of the joint, where it was held by hand, half a turn: 2047 of 4096.
@@ -149,10 +134,6 @@ def _from_lerobot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
     return _finished(
         name, "from a calibration of LeRobot", {"main": {"family": family, "baud": _BAUD}}, joints, remarks
     )
-
-
-def _servo_models() -> list[str]:
-    return [file.stem for file in map_files() if file.parent.name in ("dynamixel", "feetech")]
 
 
 # --- pypot ----------------------------------------------------------------------------------------------------------
@@ -182,15 +163,15 @@ class PypotRobot(BaseModel):
     """A robot of pypot's: `software/NAME/configuration/NAME.json` of Poppy's projects."""
 
     controllers: dict[str, PypotController]
-    motorgroups: dict[str, list[str]] = Field(default_factory=dict)
+    motorgroups: dict[str, list[str]] = {}
     motors: dict[str, PypotMotor]
 
 
 def _from_pypot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
     robot = parse(PypotRobot, raw, file)
     remarks: list[str] = []
-    buses: dict[str, Any] = {}
-    joints: dict[str, Any] = {}
+    buses: Plain = {}
+    joints: Plain = {}
     attached: set[str] = set()
     for title, controller in robot.controllers.items():
         bus = _name(title, remarks)
@@ -269,7 +250,7 @@ def _from_reachy(raw: Any, file: Path, name: str, model: str | None) -> Draft:
     """Return the shipped Reachy Mini with the ids, limits, offsets and gains of the file."""
     hardware = parse(ReachyHardware, raw, file)
     motors = {title: motor for each in hardware.motors for title, motor in each.items()}
-    shipped = read(find("heads", _REACHY, "head.yaml") / "head.yaml")
+    shipped = read(head_file(_REACHY))
     remarks = [f"{title}: left out, no joint of Reachy Mini" for title in motors if title not in shipped["joints"]]
     joints = {}
     for title, joint in shipped["joints"].items():
@@ -308,7 +289,7 @@ def _from_reachy(raw: Any, file: Path, name: str, model: str | None) -> Draft:
 # --- What the formats share -----------------------------------------------------------------------------------------
 
 
-def _joint(servo: int, table: FirmwareMap, zero: int, sign: int, ticks: tuple[int, int]) -> dict[str, Any]:
+def _joint(servo: int, table: FirmwareMap, zero: int, sign: int, ticks: tuple[int, int]) -> Plain:
     """Return the place, direction and range of a joint; it rests at zero, or at the end of its range next to it."""
     low, high = (sign * (tick - zero) * 360 / table.ticks_per_revolution for tick in ticks[::sign])
     joint = {"id": servo, "model": table.model, "zero_ticks": zero, "min_deg": round(low, 2), "max_deg": round(high, 2)}
@@ -327,7 +308,7 @@ def _name(given: str, remarks: list[str]) -> str:
     return name
 
 
-def _finished(name: str, description: str, buses: dict[str, Any], joints: dict[str, Any], remarks: list[str]) -> Draft:
+def _finished(name: str, description: str, buses: Plain, joints: Plain, remarks: list[str]) -> Draft:
     """Return the head with a drive for each joint whose name stands for one channel that no other joint's does."""
     for channel, known in _CHANNELS.items():
         named = [joint for joint in joints if _stands_for(known, joint)]

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.app.listen.report import OUTCOME, failure
+from sfms_robot.app.listen.report import OUTCOME, Report, failure
 from sfms_robot.app.options import HeadOptions, RunOptions
 from sfms_robot.app.session import Panel, run
 from sfms_robot.config import Head, load_head
@@ -88,9 +88,7 @@ def parse_face(words: Sequence[str]) -> Floats:
     return motion
 
 
-def pose_head(
-    options: HeadOptions, words: Sequence[str], hold_s: float = 2.0, panel: Panel | None = None
-) -> dict[str, Any]:
+def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0, panel: Panel | None = None) -> Report:
     """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
     Blocks until then. Raises any other RobotError, the head at rest.
@@ -130,7 +128,7 @@ class FaceTrack:
         listener: str = "none",
         record: Path | None = None,
         observers: Sequence[Observer] = (),
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Run once with this track in place of a person and a listener; return the report. `listener`: its name."""
         alone = NobodyThere()
         chosen = RunOptions(

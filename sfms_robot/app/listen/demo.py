@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.listen.page_session import page_session
+from sfms_robot.app.listen.report import Report
 from sfms_robot.app.options import RunOptions, open_browser
 from sfms_robot.config import load_head
 from sfms_robot.data import speaker_names
@@ -28,7 +29,7 @@ _KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "se
 
 def demo(
     options: RunOptions, folder: Path | None = None, panel: session.Panel | None = None, page: PageProcess | None = None
-) -> dict[str, Any]:
+) -> Report:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
     Blocks for the length of the run and some seconds; with a page until the last visitor leaves it: another bundled
@@ -83,7 +84,7 @@ def _with_voice(options: RunOptions) -> RunOptions:
     return replace(options, audio=DEFAULT_SPEAKER, face="none")
 
 
-def compare_seeds(options: RunOptions, seeds: int, each: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+def compare_seeds(options: RunOptions, seeds: int, each: Callable[[Report], None]) -> Report:
     """Run seeds 0 to `seeds` - 1 one after the other, without recording; call `each` with each. Raises RobotError."""
     rows = []
     for seed in range(seeds):
@@ -114,7 +115,7 @@ def free_folder(folder: Path) -> Path:
     return next(each for each in chain([folder], numbered) if not each.exists())
 
 
-def _summary(options: RunOptions, report: dict[str, Any]) -> dict[str, Any]:
+def _summary(options: RunOptions, report: Report) -> Report:
     """Return what a person in front of the head would have seen."""
     head = load_head(options.head, servos=False)
     retargeter = HeadRetargeter(head)

@@ -23,7 +23,7 @@ from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.head.pose import EXPRESSIONS
 from sfms_robot.app.listen.page_observer import PageObserver, PageRecorder, page_facts, people_per_minute
-from sfms_robot.app.listen.report import run_facts
+from sfms_robot.app.listen.report import Report, run_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
@@ -75,7 +75,7 @@ class PageSession:
 
     def run(
         self, panel: session.Panel | None = None, feed: NamedFeed | None = None, observers: Sequence[Observer] = ()
-    ) -> dict[str, Any]:
+    ) -> Report:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 
         `feed`: a listener of these options that loads already.

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 try:
     import termios
+    import tty
 except ImportError:  # Windows
     termios = None  # type: ignore[assignment]
 
@@ -60,7 +61,7 @@ _HELP: Final = (
 _NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
 _ESCAPE: Final = "\x1b"
 _LOOK_S: Final = 0.2  # between two looks at whether this program has come to the foreground
-_LOCAL, _CONTROL = 3, 6  # places in the list of `tcgetattr`
+_LOCAL: Final = 3  # place in the list of `tcgetattr`
 
 
 @contextmanager
@@ -326,11 +327,7 @@ class Keyboard:
             found = termios.tcgetattr(self._fd)
             if found[_LOCAL] & termios.ICANON:
                 self._usual = found
-                control = list(found[_CONTROL])
-                control[termios.VMIN], control[termios.VTIME] = 1, 0
-                single = [*found[:_CONTROL], control]
-                single[_LOCAL] &= ~(termios.ECHO | termios.ICANON)
-                termios.tcsetattr(self._fd, termios.TCSANOW, single)
+                tty.setcbreak(self._fd, termios.TCSANOW)
             return True
 
     def give_back(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -28,6 +28,8 @@ from sfms_robot.runtime.planned_events import EventWatch
 if TYPE_CHECKING:
     from sfms_robot.app.open_head import OpenHead
     from sfms_robot.app.options import RunOptions
+
+Report = dict[str, Any]  # plain data, as --json prints it
 
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 # The head, its port and how the drive ended: keys of every report.
@@ -53,7 +55,7 @@ class Drove:
         return 0 if self.error is None else getattr(self.error, "exit_code", 1)
 
 
-def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> dict[str, Any]:
+def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> Report:
     """Return version 1 of the report. In virtual time wall-clock figures are null."""
     log = drove.log
     heard = dict(feed.statistics())
@@ -94,14 +96,14 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
     }
 
 
-def failure(report: Mapping[str, Any]) -> RobotError | None:
+def failure(report: Report) -> RobotError | None:
     """Return the error that ended a run, by its report; None for a run that was not ended by one."""
     if report["exit"] != "failed":
         return None
     return _KINDS.get(report["exit_code"], RobotError)(report["error"])
 
 
-def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]:
+def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> Report:
     """Return the figures of the report that are known while it runs, under the report's names. From any thread.
 
     `real` False means virtual time.
@@ -116,7 +118,7 @@ def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> dict[str, Any]
     }
 
 
-def _latency(log: RunLog, real: bool) -> dict[str, Any]:
+def _latency(log: RunLog, real: bool) -> Report:
     return {
         "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
         "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},

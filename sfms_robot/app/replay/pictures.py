@@ -90,12 +90,10 @@ _SEEN_ONLY: Final = ("jaw open", "tilt")  # these are named where they are seen,
 
 def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> dict[str, Any]:
     """Draw the pictures that are wanted; return a summary of the recording. Raises ConfigError, MissingExtra."""
-    for png, option in ((plot_png, "--plot"), (sheet_png, "--sheet")):
-        if png is not None:
-            checked_png(png, option)
+    pictures = (plot_png, "--plot", plot), (sheet_png, "--sheet", sheet)
+    wanted = [(checked_png(png, option), draw) for png, option, draw in pictures if png is not None]
     recording = read_recording(folder)
-    drawn = [(png, draw) for png, draw in ((plot_png, plot), (sheet_png, sheet)) if png is not None]
-    for png, draw in tracked(drawn, "drawing"):
+    for png, draw in tracked(wanted, "drawing"):
         draw(recording, png)
     return summary(recording)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.page_session import stay_for_visitors
-from sfms_robot.app.listen.report import OUTCOME
+from sfms_robot.app.listen.report import OUTCOME, Report
 from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.app.session import Panel
@@ -47,7 +47,7 @@ def play_back(
     port: str = SIM,
     fast: bool = False,
     yes: bool = False,
-) -> dict[str, Any]:
+) -> Report:
     """Drive a head as long as the recording lasts, also one that was cut off. Block until then; return a report.
 
     `head` None: the recorded one, by its shipped name. Raises RobotError before torque came on; after that the head is
@@ -115,7 +115,7 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
         )
 
 
-def _facts(recording: RunRecording) -> dict[str, Any]:
+def _facts(recording: RunRecording) -> Report:
     about = recording.about
     head = load_head(about["head"], servos=False)
     if tuple(head.joints) != recording.joints:

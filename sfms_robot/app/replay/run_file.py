@@ -18,7 +18,7 @@ from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
-from sfms_robot.app.listen.report import LONG
+from sfms_robot.app.listen.report import LONG, Report
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
@@ -147,9 +147,9 @@ def read_recording(folder: Path | str) -> RunRecording:
     return _arrays(rows, about, joints, whole)
 
 
-def summary(recording: RunRecording) -> dict[str, Any]:
+def summary(recording: RunRecording) -> Report:
     """Return a summary of a recording, for the command line."""
-    facts: dict[str, Any] = {key: value for key, value in recording.about.items() if key not in LONG}
+    facts: Report = {key: value for key, value in recording.about.items() if key not in LONG}
     if facts.get("seed", "").isdecimal():  # facts are text
         facts["seed"] = whole_number(facts["seed"])
     warmth_C = recording.servos.get("temperature_C", np.full(1, np.nan))

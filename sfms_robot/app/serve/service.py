@@ -165,21 +165,22 @@ class WorkerPool:
                 self._send(stream, plan)
             return
         with self._changed:
-            if kind == "answer":
-                _, reply = worker.requests.pop(value[0])
-            elif kind == "clients":
-                worker.clients = value
-            elif kind == "figures":
-                worker.counted, worker.figures = value
-            elif kind == "loaded":
-                self.hop = self.hop or value  # of the first: it measured while nothing else was at work
-                worker.child.send(self.hop)
-            elif kind == "ready":
-                worker.capacity = value
-            elif kind == "error":
-                self.problem = self.problem or value
-            elif kind == "ended":
-                self._replace(worker, value)
+            match kind:
+                case "answer":
+                    _, reply = worker.requests.pop(value[0])
+                case "clients":
+                    worker.clients = value
+                case "figures":
+                    worker.counted, worker.figures = value
+                case "loaded":
+                    self.hop = self.hop or value  # of the first: it measured while nothing else was at work
+                    worker.child.send(self.hop)
+                case "ready":
+                    worker.capacity = value
+                case "error":
+                    self.problem = self.problem or value
+                case "ended":
+                    self._replace(worker, value)
             self._changed.notify_all()
         if kind == "answer":
             reply(value[1])
