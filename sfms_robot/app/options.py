@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from sfms_robot.runtime.recorder import RecordFormat
     from sfms_robot.viewer.page_process import PageProcess
 
+Names = tuple[str, ...]
+
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
 RECORD_FORMATS: Final[tuple[RecordFormat, ...]] = ("json", "ros2")
@@ -51,7 +53,7 @@ class HeadOptions:
     port: str = SIM
     fast: bool = False
     yes: bool = False
-    without: tuple[str, ...] = ()
+    without: Names = ()
 
     @property
     def confirmed(self) -> bool:
@@ -74,8 +76,8 @@ class RunOptions(HeadOptions):
     duration_s: float | None = None
     seed: int = 0
     engine: EngineName = "auto"
-    intensity: tuple[str, ...] = ()
-    style: tuple[str, ...] = ()
+    intensity: Names = ()
+    style: Names = ()
     calmness: Calmness | None = None
     record: Path | None = None
     record_format: RecordFormat = "json"
@@ -87,8 +89,8 @@ class RunOptions(HeadOptions):
     fleet_key: Path | None = None
     zenoh: Path | None = None
     insecure: bool = False
-    packages: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
+    packages: Names = ()
+    outputs: Names = ()
 
     @property
     def confirmed(self) -> bool:

@@ -234,19 +234,25 @@ def run(
         status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
         controls.document = status.document
         watchers: list[Observer] = [status, *observers]
+
+        def watch(observer: Observer) -> None:
+            watchers.append(stack.enter_context(closing(observer)))
+
         if outputs is not None:
             log.reported = outputs.names
-            watchers += [outputs, stack.enter_context(closing(event_watch(outputs.event)))]
+            watchers.append(outputs)
+            watch(event_watch(outputs.event))
         recorder = None
         if options.record is not None:
             about = run_facts(opened.config, options)
             recorder = Recorder(
                 options.record, joints, "wait" if options.fast else "drop", about, record_format=options.record_format
             )
-            watchers.append(stack.enter_context(closing(recorder)))
+            watch(recorder)
         if panel is not None:
             stack.enter_context(panel(controls))
-        watchers += [stack.enter_context(closing(OutletObserver(outlet))) for outlet in person.outlets]
+        for outlet in person.outlets:
+            watch(OutletObserver(outlet))
         if server is not None:
             server.begin(status.document)
         if (manager := ServiceManager()).wanted:
@@ -256,8 +262,7 @@ def run(
 
             name, key = options.fleet, fleet_key(options.fleet_key)
             reach = FleetControls(halt, interrupt, knobs, controls.set_rates, name, key)
-            fleet = FleetHead(name, status.document, reach, options.router)
-            watchers.append(stack.enter_context(closing(fleet)))
+            watch(FleetHead(name, status.document, reach, options.router))
         played: dict[str, Any] = {"timeline": timeline}
         if timeline is None:
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}

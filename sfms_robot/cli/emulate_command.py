@@ -5,35 +5,35 @@ from __future__ import annotations
 import sys
 from typing import Literal
 
-import typer
+from typer import Option
 
 from sfms_robot.cli.show import print_json
 
 
 def emulate(
-    head: str | None = typer.Option(None, help="All servos of a shipped head, or of a folder with a head.yaml."),
-    servo: str | None = typer.Option(None, help="MODEL:IDS[,MODEL:IDS...], as in xl330-m288:1-9,ax-12a:20."),
-    link: str | None = typer.Option(None, help="Symbolic link to make; of a head with several buses, PATH-BUS each."),
-    timing: Literal["wire", "instant"] = typer.Option(
+    head: str | None = Option(None, help="All servos of a shipped head, or of a folder with a head.yaml."),
+    servo: str | None = Option(None, help="MODEL:IDS[,MODEL:IDS...], as in xl330-m288:1-9,ax-12a:20."),
+    link: str | None = Option(None, help="Symbolic link to make; of a head with several buses, PATH-BUS each."),
+    timing: Literal["wire", "instant"] = Option(
         "wire", help="Replies in the time that bytes and return delays take, or at once."
     ),
-    baud: int | None = typer.Option(None, min=1, help="Rate of the servos; default: the head's, or 1 Mbit/s."),
-    voltage: float | None = typer.Option(None, min=0.0, help="Supply; default: one the servos are content with."),
-    fault: list[str] = typer.Option(
+    baud: int | None = Option(None, min=1, help="Rate of the servos; default: the head's, or 1 Mbit/s."),
+    voltage: float | None = Option(None, min=0.0, help="Supply; default: one the servos are content with."),
+    fault: list[str] = Option(
         [], help="KIND[:IDS][@START[-END]][=VALUE], as in drop:3@2-4=0.5, or a FILE of such lines. Repeatable."
     ),
-    stored: list[str] = typer.Option(
+    stored: list[str] = Option(
         [], help="IDS:REGISTER=VALUE stored in servos before, as in 3:min_position_limit=1900. Repeatable."
     ),
-    start: list[str] = typer.Option(
+    start: list[str] = Option(
         [], help="IDS=TICKS: where servos are found, outside their limits or beyond one turn, too. Repeatable."
     ),
-    behind_silent: Literal["chain_break", "skip"] = typer.Option(
+    behind_silent: Literal["chain_break", "skip"] = Option(
         "chain_break", help="In a sync read, ids behind a silent one are silent too, or answer."
     ),
-    virtual: bool = typer.Option(False, help="Virtual time: answers only through the control socket."),
-    seed: int = typer.Option(0, min=0, help="Seed of the faults that are left to chance."),
-    json: bool = typer.Option(False, "--json", help="Print devices and servos as one JSON object when all is up."),
+    virtual: bool = Option(False, help="Virtual time: answers only through the control socket."),
+    seed: int = Option(0, min=0, help="Seed of the faults that are left to chance."),
+    json: bool = Option(False, "--json", help="Print devices and servos as one JSON object when all is up."),
 ) -> None:
     """Serve emulated servos until SIGTERM or Ctrl-C; prints the device to open, one line per bus."""
     from sfms_robot.app.servo.emulated_chains import described, emulators, until_stopped

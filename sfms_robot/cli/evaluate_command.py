@@ -348,8 +348,8 @@ def people(
 
 @app.command()
 def fidelity(
-    head: list[str] = Option([], "--head", metavar="NAME|DIR", help="May be given often; all shipped heads."),
-    data: Path | None = Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    head: list[str] = Option([], metavar="NAME|DIR", help="May be given often; all shipped heads."),
+    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
     json: bool = JSON,
 ) -> None:
     """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""

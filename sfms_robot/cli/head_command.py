@@ -74,7 +74,7 @@ def list_ports(json: bool = JSON) -> None:
 
 @app.command("list")
 def list_heads(
-    urdf: Path | None = Option(None, "--urdf", metavar="FILE.png", help="Draw them all."),
+    urdf: Path | None = Option(None, metavar="FILE.png", help="Draw them all."),
     json: bool = JSON,
 ) -> None:
     """Shipped heads, with joints and buses."""
@@ -91,8 +91,8 @@ def list_heads(
 @app.command("check")
 def check(
     name: str = NAME,
-    data: Path | None = Option(None, "--data", metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
-    plot: Path | None = Option(None, "--plot", metavar="FILE.png", help="Draw ranges and demands."),
+    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    plot: Path | None = Option(None, metavar="FILE.png", help="Draw ranges and demands."),
     listener: str | None = Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
     packages: list[str] = PACKAGES,
     json: bool = JSON,
@@ -160,9 +160,9 @@ def _print_check(checked: Result) -> None:
 @app.command("show")
 def show_head(
     name: str = NAME,
-    joint: str | None = Option(None, "--joint", metavar="JOINT", help="Only this joint."),
+    joint: str | None = Option(None, metavar="JOINT", help="Only this joint."),
     urdf: Path | None = Option(
-        None, "--urdf", metavar="FILE.png", help="Draw the robot, and list what its URDF's joints follow."
+        None, metavar="FILE.png", help="Draw the robot, and list what its URDF's joints follow."
     ),
     packages: list[str] = PACKAGES,
     json: bool = JSON,
@@ -202,8 +202,8 @@ def show_head(
 @app.command("calibrate")
 def calibrate(
     name: str = NAME,
-    port: str = Option(..., "--port", help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
-    joint: list[str] = Option([], "--joint", metavar="JOINT", help="Only this joint; may be repeated."),
+    port: str = Option(..., help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
+    joint: list[str] = Option([], metavar="JOINT", help="Only this joint; may be repeated."),
     again: bool = Option(False, "--again", help="Also joints that are measured already."),
     json: bool = JSON,
 ) -> None:
@@ -228,7 +228,7 @@ def pose(
     name: str = NAME,
     face: list[str] = Argument(..., metavar="EXPRESSION|CHANNEL=VALUE...", help="smile, blink, jawOpen=0.5 ..."),
     port: str = Option("sim", help="'sim' for emulated servos, a serial device, or NAME=DEVICE per bus."),
-    hold: float = Option(2.0, "--hold", min=0.0, max=60.0, metavar="S", help="Seconds for which the pose is held."),
+    hold: float = Option(2.0, min=0.0, max=60.0, metavar="S", help="Seconds for which the pose is held."),
     fast: bool = Option(False, help="Virtual time, on emulated servos."),
     yes: bool = YES,
     json: bool = JSON,
@@ -247,12 +247,12 @@ def pose(
 def fit(
     name: str = NAME,
     recording: Path | None = Option(
-        None, "--recording", metavar="DIR", help="run.mcap of the joints, and face.csv: the track of a face tracker."
+        None, metavar="DIR", help="run.mcap of the joints, and face.csv: the track of a face tracker."
     ),
     babble: bool = Option(False, "--babble", help="Move the face within its limits and record it."),
     port: str = Option("sim", help="For --babble: 'sim' (a virtual face), a device, or NAME=DEVICE per bus."),
-    record: Path | None = Option(None, "--record", metavar="DIR", help="Where --babble writes to."),
-    minutes: float = Option(2.0, "--minutes", min=0.1, max=60.0, help="Length of --babble."),
+    record: Path | None = Option(None, metavar="DIR", help="Where --babble writes to."),
+    minutes: float = Option(2.0, min=0.1, max=60.0, help="Length of --babble."),
     seed: int = Option(0, min=0, help="Of the random faces of --babble."),
     yes: bool = YES,
     json: bool = JSON,
@@ -302,7 +302,6 @@ def solve(
     name: str = NAME,
     poses: Path = Option(
         ...,
-        "--poses",
         metavar="FILE.csv",
         help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
     ),
@@ -326,8 +325,8 @@ def solve(
 @app.command("import")
 def import_file(
     file: Path = Argument(..., help="LeRobot's calibration JSON, Reachy Mini's hardware_config.yaml, or pypot's JSON."),
-    to: Path | None = Option(None, "--to", metavar="DIR", help="New folder; by default one of the file's name, here."),
-    model: str | None = Option(None, "--model", help="Of the servos, where the file does not name it (LeRobot)."),
+    to: Path | None = Option(None, metavar="DIR", help="New folder; by default one of the file's name, here."),
+    model: str | None = Option(None, help="Of the servos, where the file does not name it (LeRobot)."),
     json: bool = JSON,
 ) -> None:
     """Make a head folder from the file of other software, and list what has no place in it."""

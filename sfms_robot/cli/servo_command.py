@@ -33,11 +33,11 @@ YES = Option(False, "--yes", "-y", help="Do not ask before EEPROM is written.")
 class Wiring:
     """Where the servos of a command are. A field is an option of every command."""
 
-    port: str | None = Option(None, "--port", help="Serial device, or 'sim'. Default: the only one there is.")
-    baud: int | None = Option(None, "--baud", min=1, help="Look at this rate only. Default: every rate.")
-    family: Family = Option("dynamixel2", "--family", help="The protocol of the servos.")
-    head: str = Option("face28", "--head", help="The head whose servos --port sim emulates.")
-    model: str | None = Option(None, "--model", help="Take the servos for this model. Default: by their model number.")
+    port: str | None = Option(None, help="Serial device, or 'sim'. Default: the only one there is.")
+    baud: int | None = Option(None, min=1, help="Look at this rate only. Default: every rate.")
+    family: Family = Option("dynamixel2", help="The protocol of the servos.")
+    head: str = Option("face28", help="The head whose servos --port sim emulates.")
+    model: str | None = Option(None, help="Take the servos for this model. Default: by their model number.")
     json: bool = JSON
 
     def open(self) -> AbstractContextManager[Wire]:
@@ -54,7 +54,7 @@ class Wiring:
 @with_shared_options
 def scan(
     on: Wiring,
-    ids: str | None = Option(None, "--ids", help="Ask these one by one, as 1-9,12. Default: all."),
+    ids: str | None = Option(None, help="Ask these one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
     from sfms_robot.app.servo.single_servo import scan_all
@@ -105,7 +105,7 @@ def monitor(
     on: Wiring,
     ids: str | None = Argument(None, metavar="ID", help="1-9,12. Default: all."),
     samples: int | None = Option(None, min=1, help="End after so many samples. Default: Ctrl-C ends."),
-    rate: float = Option(5.0, "--rate", min=0.1, max=50.0, help="Samples per second."),
+    rate: float = Option(5.0, min=0.1, max=50.0, help="Samples per second."),
 ) -> None:
     """Show position, load, voltage, temperature and faults, live. Reads only."""
     from sfms_robot.app.servo.single_servo import samples as looks
@@ -198,8 +198,8 @@ def write(
 def move(
     on: Wiring,
     servo: int = ONE_ID,
-    to: str | None = Option(None, "--to", help="Ticks, or degrees of its shaft: 180deg."),
-    by: str | None = Option(None, "--by", help="From its present position: ticks, or -5deg."),
+    to: str | None = Option(None, help="Ticks, or degrees of its shaft: 180deg."),
+    by: str | None = Option(None, help="From its present position: ticks, or -5deg."),
 ) -> None:
     """Move one servo slowly, and leave torque and profile as they were."""
     from sfms_robot.app.servo.move import move as go
@@ -209,8 +209,8 @@ def move(
 
 @app.command()
 def release(
-    head: str = Option("face28", "--head", help="Head whose servos are released."),
-    port: str = Option("auto", "--port", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim."),
+    head: str = Option("face28", help="Head whose servos are released."),
+    port: str = Option("auto", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim."),
     everything: bool = Option(False, "--all", help="Every id on the wires, at the rates of the head."),
     yes: bool = Option(False, "--yes", "-y", help="Do not ask before --all."),
     json: bool = JSON,
@@ -234,7 +234,7 @@ def release(
 def dump(
     on: Wiring,
     file: Path = Argument(..., help="Is written; must not exist yet."),
-    ids: str | None = Option(None, "--ids", help="1-9,12. Default: all."),
+    ids: str | None = Option(None, help="1-9,12. Default: all."),
 ) -> None:
     """Write all registers of servos to a YAML file."""
     from sfms_robot.app.servo.single_servo import check_new, save_dump
@@ -254,7 +254,7 @@ def restore(
     on: Wiring,
     file: Path = Argument(..., help="As `servo dump` wrote it."),
     source: int | None = Option(None, "--from", help="Id in the file. Default: each servo of the file."),
-    into: int | None = Option(None, "--into", help="Id on the wire, with --from. Default: the same."),
+    into: int | None = Option(None, help="Id on the wire, with --from. Default: the same."),
     identity: bool = Option(False, "--identity", help="Give it id and rate of the file as well."),
     yes: bool = YES,
 ) -> None:

@@ -312,7 +312,7 @@ def export(
     out: Path | None = Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
     int8: bool = Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
     weight_bits: int | None = Option(
-        None, "--weight-bits", metavar="8|16|32", help="Also write the weights, in so many bits. Default: leave them."
+        None, metavar="8|16|32", help="Also write the weights, in so many bits. Default: leave them."
     ),
     json: bool = JSON,
 ) -> None:

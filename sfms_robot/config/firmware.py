@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, computed_field
+from pydantic import Field, PositiveInt, computed_field
 
 from sfms_robot.config.base import Finite, Model, Name, Positive, load
 from sfms_robot.data import data_dir, user_dir
@@ -143,7 +143,7 @@ class FirmwareMap(Model):
     no_load_speed_deg_s: Positive | None = None  # None: not known
     watchdog: Literal["stops", "flags_only", "none"] = "none"  # what the servo does when its host falls silent
     position_mode: int | None = None  # value of role operating_mode for position control
-    baud_codes: dict[int, Annotated[int, Field(gt=0)]] = {}  # code in role baud_rate -> bit/s
+    baud_codes: dict[int, PositiveInt] = {}  # code in role baud_rate -> bit/s
     faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word
     status_faults: dict[Bit, str] = {}  # bit of the error byte of every status packet
     channels: Annotated[int, Field(gt=0, le=255)] | None = None

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field, StrictInt, ValidationInfo, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, PositiveInt, StrictInt, ValidationInfo, WithJsonSchema, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
 from sfms_robot.config.firmware import model_name
@@ -315,7 +315,7 @@ class BusConfig(Model):
     """
 
     family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]
-    baud: Annotated[int, Field(gt=0)]
+    baud: PositiveInt
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     read_deadline_ms: Annotated[float, Field(gt=0, le=100)] = 3.0
     fast_read: Literal["auto", "on", "off"] = "auto"

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
 
 from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, parse, read
 from sfms_robot.config.hop import default_hop
@@ -144,7 +144,7 @@ class Scores(Model):
     width: Count = 32
     layers: Count = 2
     heads: Count = 4
-    sweeps: Annotated[int, Field(ge=0)] = 2
+    sweeps: NonNegativeInt = 2
 
     def contradictions(self) -> Iterator[str]:
         yield from uneven_heads(self.heads, width=self.width)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 
 from sfms_robot.config.base import Model, Name, NonNegative, Positive, Share, parse, read
 from sfms_robot.config.listener import Arig, Count, Levels, Sfms, uneven_heads
@@ -36,10 +36,10 @@ class Phase(Model):
     batch: Count
     learning_rate: Positive
     weight_decay: NonNegative = 0.01
-    warm_up_steps: Annotated[int, Field(ge=0)] = 100
+    warm_up_steps: NonNegativeInt = 100
     clip_norm: Positive = 1.0
     precision: Literal["fp32", "bf16"] = "fp32"
-    evaluate_every: Annotated[int, Field(ge=0)] = 200
+    evaluate_every: NonNegativeInt = 200
     patience: Count | None = None
     checkpoint_every: Count = 500
     checkpoint_minutes: Positive = 5.0
@@ -108,7 +108,7 @@ class PredictorTraining(Phase):
     gain_db: NonNegative = 6.0
     group_weights: dict[Name, Positive] = {}
     event_windows: Share = 0.0
-    calibration_rounds: Annotated[int, Field(ge=0)] = 2
+    calibration_rounds: NonNegativeInt = 2
 
 
 class Training(Model):

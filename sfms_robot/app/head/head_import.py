@@ -228,8 +228,6 @@ class ReachyMotor(BaseModel):
     offset: int = 0
     lower_limit: int
     upper_limit: int
-    return_delay_time: int = 0
-    shutdown_error: int = 52
     pid: tuple[int, int, int] = (400, 0, 0)
 
 
