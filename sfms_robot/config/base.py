@@ -66,7 +66,7 @@ class Model(BaseModel):
         return self
 
     def contradictions(self) -> Iterable[str]:
-        """Yield what the values of this section, each valid by itself, get wrong together; the first is reported."""
+        """Yield the contradictions between the values of this section. The first one is its error."""
         return ()
 
 

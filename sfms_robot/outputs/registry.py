@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Output
 
 GROUP: Final = "sfms_robot.outputs"
+_ADDRESS: Final = re.compile(r"(\[(?P<bracketed>[^][]+)\]|(?P<name>[^][:/@ ]*))(:(?P<port>\d+))?")
 
 
 KINDS: Final[Mapping[str, EntryPoint]] = {
@@ -96,13 +97,8 @@ def parse_address(kind: str, text: str, usual_port: int) -> tuple[str, int]:
 
     Loopback where no host is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
     """
-    name, colon, digits = text.rpartition(":")
-    if text.endswith("]") or not (colon or text.isdigit()):  # no port
-        name, digits = text, ""
-    bracketed = name.startswith("[") and name.endswith("]")
-    port = port_number(digits, 1) if digits else usual_port
-    bare = name[1:-1] if bracketed else name
-    odd = not bare if bracketed else any(mark in name for mark in ":[]/@ ") or (colon and not digits)
-    if port is None or odd or not bare.isprintable():
+    found = _ADDRESS.fullmatch(f":{text}" if text.isdigit() else text)
+    port = found and (port_number(found["port"], 1) if found["port"] else usual_port)
+    if found is None or port is None or not text.isprintable():
         raise ConfigError(f"--output {kind}:{text}: expected HOST:PORT, HOST or :PORT (IPv6 in brackets), got {text!r}")
-    return bare or LOOPBACK, port
+    return found["bracketed"] or found["name"] or LOOPBACK, port

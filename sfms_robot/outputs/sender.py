@@ -280,17 +280,17 @@ class OutputThread(Observer):
 
 
 class Outputs(Observer):
-    """The outputs of a run. Starts to connect to them all."""
+    """The outputs of a run. Starts to connect to them all.
+
+    Attributes:
+        names: KIND:ADDRESS of each.
+    """
 
     def __init__(self, outputs: Sequence[Output], joints: Sequence[str] = ()) -> None:
         self.threads = [OutputThread(output, joints) for output in outputs]
+        self.names = tuple(each.sender.name for each in self.threads)
         for thread in self.threads:
             thread.start()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """KIND:ADDRESS of each."""
-        return tuple(each.sender.name for each in self.threads)
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -277,6 +277,7 @@ class JointProbe:
 
     Attributes:
         tells: whether its servo reports its position.
+        ticks_per_deg: of the joint, without direction.
     """
 
     def __init__(self, name: str, joint: Joint, bus: Bus, clock: Clock) -> None:
@@ -284,12 +285,8 @@ class JointProbe:
         self.tells = "position" in bus.capabilities[name]
         self._joint, self._bus, self._clock = joint, bus, clock
         self._calibration = calibration_of({name: joint})
+        self.ticks_per_deg = math.radians(abs(float(self._calibration.ticks_per_rad[0])))
         self._goal_rad: float | None = None  # with torque, where it is held
-
-    @property
-    def ticks_per_deg(self) -> float:
-        """Ticks per degree of the joint, without direction."""
-        return math.radians(abs(float(self._calibration.ticks_per_rad[0])))
 
     def ticks(self) -> int:
         """Return its position; of a servo that reports none, its goal. Raises ServoError."""

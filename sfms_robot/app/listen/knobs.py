@@ -14,7 +14,6 @@ from sfms_robot.retarget.channel_mapping import Knobs
 
 STEP: Final = 0.1  # of a key
 MOST: Final = 2.0
-KNOB_KINDS: Final = ("intensity", "style")
 ADDRESSED: Final[tuple[str, ...]] = get_args(Calmness.model_fields["addressed"].annotation)
 
 
@@ -61,21 +60,23 @@ class LiveKnobs:
         self._face = Face(head)
         self._lock = RLock()
         self.values: dict[str, dict[str, float]] = {
-            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()} for kind in KNOB_KINDS
+            kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}
+            for kind in ("intensity", "style")
         }
         self.now: Knobs = self._face.knobs()
         self.turn(intensity, style)
 
     def turn(self, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
         """Set values of regions. Raises InputError, with nothing changed, for an unknown region or one outside 0..2."""
-        for kind, given in zip(KNOB_KINDS, (intensity, style), strict=True):
-            for region, value in given.items():
+        given = {"intensity": intensity, "style": style}
+        for kind, regions in given.items():
+            for region, value in regions.items():
                 self[region]
                 if not 0 <= value <= MOST:
                     raise InputError(f"{kind} of {region} = {value:g} is not in 0..2")
         with self._lock:
-            both = [{**self.values[kind], **given} for kind, given in zip(KNOB_KINDS, (intensity, style), strict=True)]
-            self.values, self.now = dict(zip(KNOB_KINDS, both, strict=True)), self._face.knobs(*both)
+            values = {kind: {**self.values[kind], **regions} for kind, regions in given.items()}
+            self.values, self.now = values, self._face.knobs(**values)
 
     def turn_all(self, by: float) -> None:
         """Change the intensity of every region by `by`; none leaves 0..2."""

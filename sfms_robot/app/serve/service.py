@@ -78,6 +78,7 @@ class WorkerPool:
     Attributes:
         hop: frames from one plan to the next, the same for all.
         capacities: costs of batches in each process, measured while all were at work.
+        most: heads that are answered within the deadline.
         problem: why it cannot continue; None as long as it can.
 
     Raises ConfigError for an unknown listener or hop, ModelError for one that cannot be loaded.
@@ -101,11 +102,7 @@ class WorkerPool:
             self.close()
             raise
         self.capacities = [each.capacity for each in self._workers if each.capacity is not None]
-
-    @property
-    def most(self) -> int:
-        """Return the number of heads that are answered within the deadline."""
-        return sum(each.most(DEADLINE_S) for each in self.capacities)
+        self.most = sum(each.most(DEADLINE_S) for each in self.capacities)
 
     def receive(self, stream: str, message: bytes) -> None:
         """Pass on a message of a stream. From any thread; never blocks."""

@@ -265,7 +265,7 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
             check_device(device)
             line = SerialPort(device, baud or first, clock)
         stack.callback(line.close)
-        yield Wire(line, family, clock, baud or first, baud is not None, model, place)
+        yield Wire(line, family, clock, baud or first, fixed=baud is not None, model=model, place=place)
 
 
 def check_baud(family: str, baud: int | None) -> None:
