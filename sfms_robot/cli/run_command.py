@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack, closing, suppress
+from functools import partial
 from pathlib import Path
 
 from typer import Argument, Option
@@ -15,11 +16,14 @@ from sfms_robot.errors import ConfigError
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
 DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods, beside a mean of 4.4
-HEAD, PERSON, LISTENER, OUTPUT, SAFETY = "Head and servos", "Person", "Listener", "Output", "Safety"
-OUTPUTS = Option(
+OF_HEAD = partial(Option, rich_help_panel="Head and servos")
+OF_PERSON = partial(Option, rich_help_panel="Person")
+OF_LISTENER = partial(Option, rich_help_panel="Listener")
+OF_OUTPUT = partial(Option, rich_help_panel="Output")
+OF_SAFETY = partial(Option, rich_help_panel="Safety")
+OUTPUTS = OF_OUTPUT(
     [],
     metavar="KIND[:ADDRESS]",
-    rich_help_panel=OUTPUT,
     help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
 )
 OPTIONAL = {
@@ -30,165 +34,125 @@ OPTIONAL = {
 
 
 def run(
-    head: str = Option(
+    head: str = OF_HEAD(
         "face28",
         autocompletion=head_names,
-        rich_help_panel=HEAD,
         help="Shipped head, or a folder with a head.yaml; 'none': no servos, --output alone.",
     ),
-    port: str = Option(
+    port: str = OF_HEAD(
         "sim",
-        rich_help_panel=HEAD,
         help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
     ),
     packages: list[str] = PACKAGES,
-    intensity: list[str] = Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of a region's motion, 0 to 2; may be repeated."
-    ),
-    style: list[str] = Option(
-        [], metavar="REGION=V", rich_help_panel=HEAD, help="Scale of its small motions, 0 to 2; may be repeated."
-    ),
-    audio: str = Option(
+    intensity: list[str] = OF_HEAD([], metavar="REGION=V", help="Scale of a region's motion, 0 to 2; may be repeated."),
+    style: list[str] = OF_HEAD([], metavar="REGION=V", help="Scale of its small motions, 0 to 2; may be repeated."),
+    audio: str = OF_PERSON(
         "default",
         autocompletion=speaker_names,
-        rich_help_panel=PERSON,
         metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|ros2:TOPIC|none",
         help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
         "yours, the visitor of the page, ROS 2, 'none'. Default: the microphone, with emulated servos a speaker.",
     ),
-    face: str = Option(
+    face: str = OF_PERSON(
         "auto",
-        rich_help_panel=PERSON,
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|ros2:FACE_ID|FILE.csv|none|auto",
         help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, the "
         "visitor of the page, ROS 2, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the speaker's, else none.",
     ),
-    agent_audio: str = Option(
+    agent_audio: str = OF_PERSON(
         "none",
         autocompletion=speaker_names,
-        rich_help_panel=PERSON,
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
         help="The robot's own speech: a sound file, a device that records the loudspeaker, a shipped speaker, a "
         "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
     ),
-    play: str | None = Option(
+    play: str | None = OF_PERSON(
         None,
         metavar="[DEVICE]",
-        rich_help_panel=PERSON,
         help="Play what the robot says, on a device (by number, name or part of it: `port list`; alone: the default).",
     ),
-    duration: float | None = Option(
-        None, min=0.04, rich_help_panel=PERSON, help="Seconds; default: as long as the recording."
-    ),
-    listener: str = Option(
+    duration: float | None = OF_PERSON(None, min=0.04, help="Seconds; default: as long as the recording."),
+    listener: str = OF_LISTENER(
         "sfms-small",
         autocompletion=listener_names,
-        rich_help_panel=LISTENER,
         help="Shipped listener, a folder with config.yaml and weights, or zenoh/NAME on a machine that serves it.",
     ),
-    calmness: list[str] = Option(
+    calmness: list[str] = OF_LISTENER(
         [],
         metavar="KIND=PER_MINUTE",
-        rich_help_panel=LISTENER,
         help="Events per minute, as nod=2.2; may be repeated. Default: the rates of people.",
     ),
-    addressed: str = Option(
+    addressed: str = OF_LISTENER(
         "sense",
         metavar="sense|assume|never",
-        rich_help_panel=LISTENER,
         help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
     ),
-    engine: str = Option(
+    engine: str = OF_LISTENER(
         "auto",
         metavar="auto|onnx|torch",
-        rich_help_panel=LISTENER,
         help="Engine of the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
     ),
-    seed: int = Option(
+    seed: int = OF_LISTENER(
         0,
         min=0,
         max=MAX_SEED,
-        rich_help_panel=LISTENER,
         help="Two seeds listen differently, one seed repeats (with --fast).",
     ),
-    fast: bool = Option(
-        False, "--fast", rich_help_panel=LISTENER, help="Virtual time: as fast as it goes, bit-identical per --seed."
-    ),
+    fast: bool = OF_LISTENER(False, "--fast", help="Virtual time: as fast as it goes, bit-identical per --seed."),
     output: list[str] = OUTPUTS,
-    record: Path | None = Option(
-        None, metavar="DIR", rich_help_panel=OUTPUT, help="Folder to write the run to, for `sfms-robot replay`."
-    ),
-    record_format: str = Option(
+    record: Path | None = OF_OUTPUT(None, metavar="DIR", help="Folder to write the run to, for `sfms-robot replay`."),
+    record_format: str = OF_OUTPUT(
         "json",
         metavar="json|ros2",
-        rich_help_panel=OUTPUT,
         help="Messages of the recording (MCAP): JSON, for Foxglove; those of ROS 2, for its tools and PlotJuggler too.",
     ),
-    overwrite: bool = Option(
-        False, "--overwrite", rich_help_panel=OUTPUT, help="Replace the recording that --record's folder holds."
-    ),
+    overwrite: bool = OF_OUTPUT(False, "--overwrite", help="Replace the recording that --record's folder holds."),
     json: bool = JSON,
-    check: bool = Option(
-        False, "--check", rich_help_panel=PERSON, help="Judge the sound of --audio for 3 s; no servo moves."
-    ),
-    status: str | None = Option(
+    check: bool = OF_PERSON(False, "--check", help="Judge the sound of --audio for 3 s; no servo moves."),
+    status: str | None = OF_OUTPUT(
         None,
         metavar="[PORT]",
-        rich_help_panel=OUTPUT,
         help="Serve the status as JSON on http://127.0.0.1:PORT/ (0: any free port; alone: 8775 or the next free).",
     ),
-    view: str | None = Option(
+    view: str | None = OF_OUTPUT(
         None,
         metavar="[[HOST:]PORT]",
-        rich_help_panel=OUTPUT,
         help="Serve a page that shows the run, and works it (alone: 127.0.0.1:8780, or the next port that is free).",
     ),
-    view_cert: Path | None = Option(
-        None, metavar="FILE", rich_help_panel=OUTPUT, help="Serve it by https, which a phone's microphone needs: PEM."
+    view_cert: Path | None = OF_OUTPUT(
+        None, metavar="FILE", help="Serve it by https, which a phone's microphone needs: PEM."
     ),
-    view_key: Path | None = Option(
-        None, metavar="FILE", rich_help_panel=OUTPUT, help="The key of that certificate: PEM."
-    ),
-    fleet: str | None = Option(
+    view_key: Path | None = OF_OUTPUT(None, metavar="FILE", help="The key of that certificate: PEM."),
+    fleet: str | None = OF_OUTPUT(
         None,
         metavar="NAME",
-        rich_help_panel=OUTPUT,
         help="Join a fleet as NAME, which sees the run and may halt it: docs/guide/remote.md.",
     ),
-    zenoh: Path | None = Option(
+    zenoh: Path | None = OF_OUTPUT(
         None,
         metavar="FILE",
-        rich_help_panel=OUTPUT,
         help="zenoh's configuration (JSON5), for --fleet, --listener zenoh/NAME and ros2. Default: tcp/127.0.0.1:7447.",
     ),
-    insecure: bool = Option(
-        False, "--insecure", rich_help_panel=OUTPUT, help="Allow endpoints of --zenoh beyond loopback without TLS."
-    ),
-    fleet_key: Path | None = Option(
+    insecure: bool = OF_OUTPUT(False, "--insecure", help="Allow endpoints of --zenoh beyond loopback without TLS."),
+    fleet_key: Path | None = OF_OUTPUT(
         None,
         metavar="FILE",
-        rich_help_panel=OUTPUT,
         help="Key of the fleet, needed to resume or end the run; made if there is none yet.",
     ),
-    dry_run: bool = Option(
-        False, "--dry-run", rich_help_panel=SAFETY, help="Open and read the servos, never switch torque on."
-    ),
-    yes: bool = Option(
+    dry_run: bool = OF_SAFETY(False, "--dry-run", help="Open and read the servos, never switch torque on."),
+    yes: bool = OF_SAFETY(
         False,
         "--yes",
-        rich_help_panel=SAFETY,
         help="Hobby servos may jump when they come on: they report no position to begin from.",
     ),
-    halt_on: str | None = Option(
+    halt_on: str | None = OF_SAFETY(
         None,
         metavar="FILE|/dev/gpiochipN:LINE",
-        rich_help_panel=SAFETY,
         help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
     ),
-    without: list[str] = Option(
+    without: list[str] = OF_SAFETY(
         [],
         metavar="JOINT",
-        rich_help_panel=SAFETY,
         help="Leave a joint's servo alone (broken, or not there); may be repeated.",
     ),
 ) -> None:
