@@ -25,9 +25,10 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
@@ -278,32 +279,29 @@ class FleetHead(Observer):
 # --- the other side -------------------------------------------------------------------------------------------------
 
 
-class Fleet:
-    """A connection to the router that joins the heads. Opens in `__enter__`, which waits for `AWAY_S` at most.
-
-    Attributes:
-        malformed: count of messages that hold no document.
+@contextmanager
+def open_fleet(zenoh: Path | None = None, insecure: bool = False, key: Path | None = None) -> Iterator[Fleet]:
+    """Connect to the router that joins the heads, while inside. Blocks for `AWAY_S` at most.
 
     Raises PortError when no router answers, ConfigError, MissingExtra.
     """
+    router = Router(zenoh, insecure)
+    with closing(Connection(session_config("call", router))) as connection:
+        if (session := connection.wait(AWAY_S)) is None:
+            raise PortError(f"no answer at {router}: is `sfms-robot serve`, or another zenoh router, running?")
+        yield Fleet(session, key)
 
-    def __init__(self, zenoh: Path | None = None, insecure: bool = False, key: Path | None = None) -> None:
-        self._router, self._key = Router(zenoh, insecure), key
+
+class Fleet:
+    """The heads behind a router (`open_fleet`). `key`: file of the fleet's key (`fleet_key`).
+
+    Attributes:
+        malformed: count of messages that hold no document.
+    """
+
+    def __init__(self, session: Any, key: Path | None = None) -> None:
+        self._session, self._key = session, key
         self.malformed = 0
-        self._connection: Connection | None = None
-        self._session: Any = None
-
-    def __enter__(self) -> Self:
-        self._connection = Connection(session_config("call", self._router))
-        self._session = self._connection.wait(AWAY_S)
-        if self._session is None:
-            self._connection.close()
-            raise PortError(f"no answer at {self._router}: is `sfms-robot serve`, or another zenoh router, running?")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._connection is not None:
-            self._connection.close()
 
     def states(self) -> list[Document]:
         """Return the status document of every head that answers, by name. Blocks for `ASK_S` at most."""

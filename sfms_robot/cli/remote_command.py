@@ -34,9 +34,9 @@ def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSEC
             flag = "--zenoh" if zenoh is not None else "--json" if json else "--insecure"
             raise ConfigError(f"fleet {flag}: stands behind the command: fleet {context.invoked_subcommand} {flag} ...")
         return
-    from sfms_robot.app.fleet import Fleet, tile
+    from sfms_robot.app.fleet import open_fleet, tile
 
-    with Fleet(zenoh, insecure) as found:
+    with open_fleet(zenoh, insecure) as found:
         tiles = [tile(str(each.get("name")), each) for each in found.states()]
     show({"heads": tiles, "malformed": found.malformed}, json)
     if not tiles:
@@ -46,9 +46,9 @@ def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSEC
 @app.command()
 def halt(heads: list[str] = _HEADS, zenoh: Path | None = _ZENOH, insecure: bool = _INSECURE, json: bool = JSON) -> None:
     """Halt heads, by default all of them. They stay halted until they are resumed."""
-    from sfms_robot.app.fleet import Fleet
+    from sfms_robot.app.fleet import open_fleet
 
-    with Fleet(zenoh, insecure) as found:
+    with open_fleet(zenoh, insecure) as found:
         _show_answers(found.halt(heads or [], f"{getpass.getuser()} by fleet"), heads or [], json)
 
 
@@ -61,9 +61,9 @@ def resume(
     json: bool = JSON,
 ) -> None:
     """Let halted heads continue: be sure that no hand is inside one."""
-    from sfms_robot.app.fleet import Fleet
+    from sfms_robot.app.fleet import open_fleet
 
-    with Fleet(zenoh, insecure, key) as found:
+    with open_fleet(zenoh, insecure, key) as found:
         _show_answers(found.resume(heads or []), heads or [], json)
 
 
@@ -76,9 +76,13 @@ def page(
     json: bool = JSON,
 ) -> None:
     """Serve a page with a tile per head and a button that halts all, until Ctrl-C or SIGTERM."""
-    from sfms_robot.app.fleet import Fleet, fleet_page
+    from sfms_robot.app.fleet import fleet_page, open_fleet
 
-    with Fleet(zenoh, insecure, key) as found, closing(fleet_page(found, port)) as served, suppress(KeyboardInterrupt):
+    with (
+        open_fleet(zenoh, insecure, key) as found,
+        closing(fleet_page(found, port)) as served,
+        suppress(KeyboardInterrupt),
+    ):
         if json:
             print_json({"version": 1, "url": served.url})
         else:

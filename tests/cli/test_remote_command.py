@@ -9,7 +9,7 @@ from urllib.request import urlopen
 import pytest
 from ended import PROGRAM
 
-from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key
+from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, open_fleet
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router, close_session, serve_session, session_config
 from sfms_robot.runtime.halt import HaltLatch
@@ -36,7 +36,7 @@ def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(route
     latch, interrupt = HaltLatch(), Interrupt()
     controls = FleetControls(latch, interrupt, None, None, "hall", fleet_key(mine))
     head = FleetHead("hall", lambda: {"state": "halted"}, controls, router)
-    with closing(head), Fleet(router.file) as fleet:
+    with closing(head), open_fleet(router.file) as fleet:
         while not fleet.states():
             pass  # until it is connected
         halted = command_line("fleet", "halt", "--zenoh", router.file, "--json").told

@@ -5,7 +5,7 @@ from contextlib import closing
 import pytest
 from chromium import Page, missing
 
-from sfms_robot.app.fleet import Fleet, FleetControls, FleetHead, fleet_key, fleet_page
+from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_page, open_fleet
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
@@ -41,7 +41,7 @@ def fleet(router, tmp_path):
     """Two heads, their page, and the browser that looks at it."""
     heads = {name: Head(name, router) for name in NAMES}
     try:
-        with Fleet(router.file) as asked, closing(fleet_page(asked, 0)) as page, Page(tmp_path / "chromium") as browser:
+        with open_fleet(router.file) as met, closing(fleet_page(met, 0)) as page, Page(tmp_path / "chrome") as browser:
             browser.driver.get(page.url)
             browser.ask("(said.textContent = nobody)")  # as of a page that was there before the heads
             browser.until(f"{TILES}.length == {len(NAMES)}")
