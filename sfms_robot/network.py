@@ -72,11 +72,11 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
-def session_config(role: Role, router: Router = LOCAL, endpoint: str | None = None) -> zenoh.Config:
-    """Return how a session connects: as the router's file says, else on loopback, else at `endpoint`.
+def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
+    """Return how a session connects: as the router's file says, else on loopback.
 
-    Raises ConfigError for a file or an endpoint that zenoh does not take, or that anyone on the network could use;
-    MissingExtra without zenoh.
+    Raises ConfigError for a file that zenoh does not take, or that anyone on the network could use; MissingExtra
+    without zenoh.
     """
     check_zenoh()
     import zenoh
@@ -91,24 +91,20 @@ def session_config(role: Role, router: Router = LOCAL, endpoint: str | None = No
         if not router.insecure:
             _check_secure(given, file)
         return given
-    where = [endpoint or LOOPBACK]
     settings: dict[str, Any] = {
         "mode": "router" if role == "serve" else "client",
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
         "connect/retry": RETRY,
         "transport/link/tx/queue/size/real_time": QUEUE,
-        "listen/endpoints": where if role == "serve" else [],
-        "connect/endpoints": [] if role == "serve" else where,
+        "listen/endpoints": [LOOPBACK] if role == "serve" else [],
+        "connect/endpoints": [] if role == "serve" else [LOOPBACK],
     }
     if role == "call":
         settings["connect/timeout_ms"] = -1  # for ever; `Connection` waits in a thread
     config = zenoh.Config()
     for key, value in settings.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except Exception as error:
-            raise ConfigError(f"zenoh endpoint {endpoint!r}: {_first_line(error)}") from error
+        config.insert_json5(key, json.dumps(value))
     return config
 
 

@@ -23,7 +23,9 @@ def client(folder, endpoint):
 
 @contextmanager
 def serving(endpoint):
-    served = serve_session(session_config("serve", endpoint=endpoint))
+    config = session_config("serve")
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    served = serve_session(config)
     yield
     close_session(served)
 

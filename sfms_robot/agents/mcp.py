@@ -26,7 +26,6 @@ with optional("sfms-robot mcp"):
     from mcp.server import MCPServer
     from mcp.server.mcpserver.exceptions import ToolError
 
-URL: Final = "ws://127.0.0.1:8780"
 LIMIT_S: Final = 5.0  # to connect, and for an answer
 PICTURES: Final = 5  # 0.2 s: an error of the run comes before them
 MOST_PICTURES: Final = 50  # to wait for a state
@@ -46,7 +45,7 @@ class HeadPage:
     Raises ConfigError for an address that cannot be one.
     """
 
-    def __init__(self, url: str = URL, token: str = "") -> None:
+    def __init__(self, url: str, token: str = "") -> None:
         schemes = {"ws": "ws", "http": "ws", "wss": "wss", "https": "wss"}
         try:
             parts = urlsplit(url)
@@ -169,7 +168,7 @@ def server(page: HeadPage) -> MCPServer:
     return made
 
 
-def serve(url: str = URL, token: str = "") -> None:
+def serve(url: str, token: str) -> None:
     """Serve the tools on stdin and stdout until stdin ends, in the main thread.
 
     Ctrl-C and SIGTERM end the process. Raises ConfigError for an address that cannot be one.
