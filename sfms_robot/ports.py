@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sfms_robot.frames import Doubles, Floats, ListenerEvent, Plan, Reading, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
+Facts = Mapping[str, Any]  # figures and states for a report, by name
 STOP_S: Final = 0.5  # that `Bus.stop` takes at most
 
 
@@ -40,7 +41,7 @@ class Sense(Protocol):
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`; earlier data is dropped."""
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return losses and clock offsets for the report."""
 
     def close(self) -> None: ...
@@ -100,7 +101,7 @@ class Source(Protocol):
         """Take the summed speed of the head's joints, at every tick: the microphone picks up their motors."""
         return None
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return losses for the report."""
         return {}
 
@@ -139,7 +140,7 @@ class PlanFeed(Protocol):
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Return plans that became visible by `now_s`, oldest first. Never blocks."""
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return figures for the report.
 
         `state` in words, `restarts`, `skipped_frames` (the listener was too slow), `step_ms` p50 and p99; `hop` and
@@ -240,7 +241,7 @@ class Bus(Protocol):
     def close(self) -> None:
         """Close the ports. Idempotent."""
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return counters for the report: writes, reads, errors, retries, reconnects, silent ids, faults.
 
         And `torque_unconfirmed`: joints whose torque was not confirmed off by the last `torque_off` or `stop`.
@@ -351,7 +352,7 @@ class Output(Protocol):
         """Send a frame; `now_s`: of `time.monotonic`. Raises OutputError, OSError when the peer is lost."""
         ...
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return figures for the report. From any thread."""
         return {}
 

@@ -53,7 +53,6 @@ TAKEN: Final = ("listen",)  # names whose keys mean something else
 TELL_S: Final = 1.0
 ASK_S: Final = 2.0  # that heads have to answer
 GONE_S: Final = 3.0  # a head without news for so long is away
-PORT: Final = 8776
 PAGE: Final = Path(__file__).with_name("fleet_page.html")
 _LONGEST: Final = 4096
 _LONGEST_NAME: Final = 80
@@ -369,7 +368,7 @@ def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
     }
 
 
-def fleet_page(fleet: Fleet, port: int = PORT) -> LocalServer:
+def fleet_page(fleet: Fleet, port: int) -> LocalServer:
     """Serve a tile per head and a button that halts all, on loopback, until `close`. Raises PortError.
 
     GET /: the page. GET /heads: {"heads": [tile, ...]}. POST /halt, /resume: {"heads": [name, ...]}, none: all.

@@ -20,8 +20,8 @@ import math
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from sfms_robot.endpoint import address_text
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, POSE, SHAPES, Doubles, Floats
 from sfms_robot.outputs.registry import parse_address
-from sfms_robot.ports import Output, OutputFrame
+from sfms_robot.ports import Facts, Output, OutputFrame
 from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, directions
 
 VMC_PORT: Final = 39539  # what the protocol gives receivers
@@ -79,7 +79,7 @@ class UdpOutput(Output):
         """Return what is sent of a frame."""
         raise NotImplementedError
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the bytes that were sent."""
         return {"bytes": self._bytes}
 

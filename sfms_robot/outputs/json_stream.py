@@ -23,10 +23,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
 from contextlib import suppress
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Final
 
 import orjson
 from websockets.asyncio.server import ServerConnection, broadcast, serve
@@ -36,7 +35,7 @@ from websockets.http11 import Request, Response
 from sfms_robot.endpoint import LOOPBACK, ServerThread, address_text, host_problem, listen, origin_problem, port_number
 from sfms_robot.errors import NOTE, ConfigError
 from sfms_robot.frames import BLENDSHAPES, POSE, POSE_CHANNELS, SHAPES
-from sfms_robot.ports import Output, OutputFrame
+from sfms_robot.ports import Facts, Output, OutputFrame
 
 PORT: Final = 8782
 MOST_CLIENTS: Final = 32
@@ -116,7 +115,7 @@ class JsonStream(ServerThread, Output):
             with suppress(RuntimeError):  # closed
                 self._loop.call_soon_threadsafe(self._send, message)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return connected clients, refused ones, and frames that slow ones missed."""
         return {"clients": len(self._clients), **self._counts}
 

@@ -24,7 +24,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import orjson
@@ -32,7 +32,7 @@ import orjson
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNELS, POSE, Doubles, Floats
 from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
-from sfms_robot.ports import ChannelLimit, OutputFrame
+from sfms_robot.ports import ChannelLimit, Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
 
@@ -243,7 +243,7 @@ class ReachyMini(ReachyDaemon):
         elif now_s - self._together_s > _APART_S:
             raise OutputError(f"does not follow: {_DRIVEN}")
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the frames that a slow peer missed, and how the reported pitch followed over the last 30 s."""
         return {**super().statistics(), **following(list(self._sent), list(self._reported))}
 

@@ -17,11 +17,11 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Final
 
 from sfms_robot.errors import OutputError, PacketError, PortError
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain
-from sfms_robot.ports import Output, OutputFrame
+from sfms_robot.ports import Facts, Output, OutputFrame
 from sfms_robot.signals.ros2_messages import (
     POINT,
     STRING,
@@ -105,7 +105,7 @@ class Ros2Output(Output):
         for topic, message in messages:
             node.publish(topic, to_cdr(SENT[topic], message), round(time_s * 1e9))
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return counts of messages, since the last connection."""
         return {} if self._node is None else dict(self._node.counts)
 

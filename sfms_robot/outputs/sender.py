@@ -22,14 +22,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats, ListenerEvent
 from sfms_robot.motion.limits import JerkLimiter, JointLimits, LimiterState, difference
-from sfms_robot.ports import ChannelLimit, Observer, Output, OutputFrame, Tick
+from sfms_robot.ports import ChannelLimit, Facts, Observer, Output, OutputFrame, Tick
 from sfms_robot.signals.minimum_jerk import ease
 
 EASE_S: Final = 1.0
@@ -157,7 +157,7 @@ class OutputSender:
         else:
             self._sent(now_s)
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Facts:
         """Return state, peer, frames, frames a second and losses, and what the output counts. From any thread."""
         state = "lost" if self.lost else "connecting" if self.shown is None else "sending"
         return {
@@ -174,7 +174,7 @@ class OutputSender:
         """Disconnect the output."""
         self._asked(self.output.close)
 
-    def _asked(self, method: Callable[[], Mapping[str, Any] | None]) -> Mapping[str, Any]:
+    def _asked(self, method: Callable[[], Facts | None]) -> Facts:
         """Return what a method of the output gives, nothing where it raises."""
         try:
             return method() or {}
@@ -306,7 +306,7 @@ class Outputs(Observer):
         for thread in self.threads:
             thread.event(event)
 
-    def statistics(self) -> list[dict[str, Any]]:
+    def statistics(self) -> list[Facts]:
         """Return the figures of each output, as `OutputSender.statistics`."""
         return [thread.sender.statistics() for thread in self.threads]
 

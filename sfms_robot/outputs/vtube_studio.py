@@ -22,7 +22,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from sfms_robot.data import user_dir
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats
 from sfms_robot.outputs.websocket_peer import Message, WebSocketOutput, WebSocketPeer
-from sfms_robot.ports import OutputFrame
+from sfms_robot.ports import Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
 PORT: Final = 8001
@@ -136,7 +136,7 @@ class VtubeStudio(WebSocketOutput):
             self._asked_s = None
             self._answered(str(message.get("messageType")), data if isinstance(data, dict) else {})
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the frames that a slow VTube Studio missed, and whether its user gave access."""
         return {**super().statistics(), "access": self._access}
 

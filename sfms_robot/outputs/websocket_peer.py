@@ -25,7 +25,7 @@ from websockets.uri import parse_uri
 from sfms_robot.endpoint import address_text
 from sfms_robot.errors import OutputError
 from sfms_robot.outputs.registry import parse_address
-from sfms_robot.ports import Output, OutputFrame
+from sfms_robot.ports import Facts, Output, OutputFrame
 
 Message = Mapping[str, Any]
 
@@ -259,7 +259,7 @@ class WebSocketOutput(Output):
             self.shown(frame, now_s)
         self._note_slow(link)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the frames that a slow peer missed."""
         link = self.link
         return {"dropped": self._dropped + (link.dropped if link else 0)}

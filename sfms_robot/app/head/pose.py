@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from sfms_robot.app.session import Panel, run
 from sfms_robot.config import Head, load_head
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Observer, Source, Tick
+from sfms_robot.ports import Facts, Observer, Source, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import EASE_S
@@ -176,7 +176,7 @@ class NobodyThere(Source):
     def poll(self, now_s: float) -> Sequence[Plan]:
         return ()
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return IDLE_FEED
 
 

@@ -16,12 +16,12 @@ import numpy as np
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
-from numpy.typing import NDArray
 
 from sfms_robot.app.listen.report import LONG, Report
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
+from sfms_robot.ranges import Bools
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.recorder import ROS2_TOPICS, RUN_FILE, parts_of
 from sfms_robot.signals.ros2_messages import STRING, from_cdr
@@ -60,7 +60,7 @@ class RunRecording:
     motion: Floats
     goals_rad: Floats
     present_rad: Floats
-    faults: NDArray[np.bool_]
+    faults: Bools
     heard_s: Doubles
     audio: Floats
     agent_audio: Floats | None
@@ -91,7 +91,7 @@ class RunRecording:
         return bool(np.any(self.energy_db > _FLOOR_DB))
 
     @property
-    def talking(self) -> NDArray[np.bool_]:
+    def talking(self) -> Bools:
         """(M,) True in a phrase of the speaker: loud against their own level, pauses under 0.2 s closed."""
         if not self.has_voice:
             return np.zeros(len(self.heard_s), dtype=np.bool_)
@@ -102,12 +102,12 @@ class RunRecording:
                 loud[end : start + 1] = True
         return loud
 
-    def talks_at(self, times_s: Doubles) -> NDArray[np.bool_]:
+    def talks_at(self, times_s: Doubles) -> Bools:
         """Return (N,) whether the speaker is in a phrase at the instants."""
         if not len(self.heard_s):
             return np.zeros(len(times_s), dtype=np.bool_)
         frame = np.searchsorted(self.heard_s, np.asarray(times_s) - 1e-9)
-        out: NDArray[np.bool_] = self.talking[np.minimum(frame, len(self.heard_s) - 1)]
+        out: Bools = self.talking[np.minimum(frame, len(self.heard_s) - 1)]
         return out
 
     @property
