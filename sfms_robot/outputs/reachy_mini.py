@@ -29,6 +29,7 @@ from typing import Final
 import numpy as np
 import orjson
 
+from sfms_robot.config.head import other_side
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNELS, POSE, Doubles, Floats
 from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
@@ -55,8 +56,7 @@ ANTENNA: Final[Mapping[str, float]] = {
     "mouthSmileLeft": 0.15, "mouthSmileRight": 0.15, "mouthFrownLeft": -0.15, "mouthFrownRight": -0.15,
 }  # fmt: skip
 _RIGHT: Final = np.array([ANTENNA.get(name, 0.0) for name in CHANNELS])
-_MIRRORED: Final = [name.replace("Left", "*").replace("Right", "Left").replace("*", "Right") for name in CHANNELS]
-_WEIGHTS: Final = np.stack([_RIGHT, _RIGHT[[CHANNELS.index(name) for name in _MIRRORED]]])  # (2, 58)
+_WEIGHTS: Final = np.stack([_RIGHT, _RIGHT[[CHANNELS.index(other_side(name)) for name in CHANNELS]]])  # (2, 58)
 _REST_RAD: Final = np.radians([-10.0, 10.0])
 _RAISED_RAD: Final = np.radians([40.0, -40.0])
 

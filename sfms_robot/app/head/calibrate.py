@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -134,8 +133,15 @@ def calibrate_on(
                 if identity is None:
                     raise BusError(f"no answer from id {config.id} on bus {config.bus!r}")
                 by_hand = guide.asks_how(family_named(head.buses[config.bus].family).board)
-                alone = partial(probe, stored=identity.stored, unconfirmed=outcome.torque_unconfirmed)
-                with alone(head, joint, where[config.bus], clock, doctor=guide.doctor) as at:
+                with probe(
+                    head,
+                    joint,
+                    where[config.bus],
+                    clock,
+                    stored=identity.stored,
+                    unconfirmed=outcome.torque_unconfirmed,
+                    doctor=guide.doctor,
+                ) as at:
                     found = guide.measure_until_right(config, identity, at, by_hand)
             except (BusError, ServoError) as reason:
                 outcome.skipped[joint] = str(reason)
