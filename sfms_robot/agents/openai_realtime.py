@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 import json
 import time
 from collections.abc import AsyncIterable, Callable, Mapping
@@ -108,7 +107,7 @@ class RealtimeHead:
         """Return the bytes of base64; none for other text, and for a piece that is not of 16-bit samples."""
         try:
             pcm = base64.b64decode(text, validate=True) if isinstance(text, str) else None
-        except (binascii.Error, ValueError):
+        except ValueError:
             pcm = None
         if pcm is None or len(pcm) % 2:
             got = f"{len(pcm)} bytes" if pcm is not None else repr(text)[:40]
@@ -189,7 +188,7 @@ async def converse(
         raise PortError(f"{place}: HTTP {status}: {why}") from None
     except ConnectionClosed as error:
         raise PortError(f"{place}: the server broke off: {error.rcvd or 'without a reason'}") from None
-    except (OSError, TimeoutError, WebSocketException) as error:
+    except (OSError, WebSocketException) as error:
         raise PortError(f"{place}: cannot connect: {str(error) or type(error).__name__}") from None
 
 

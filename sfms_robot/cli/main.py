@@ -150,7 +150,8 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
     """Run the command; return its exit code, and the error that was printed on stderr, None without one."""
     try:
         command = typer.main.get_command(app)
-        with command.make_context(NAME, words) as context, optional(_typed(words)):
+        typed = takewhile(lambda word: not word.startswith("-"), words[:2])
+        with command.make_context(NAME, words) as context, optional(" ".join([NAME, *typed])):
             command.invoke(context)
         sys.stdout.flush()
     except typer.Exit as ended:
@@ -191,11 +192,6 @@ def _completed(words: Sequence[str]) -> list[str]:
         if word in run_command.OPTIONAL and following.startswith("-"):
             completed.append(run_command.OPTIONAL[word])
     return completed
-
-
-def _typed(words: Sequence[str]) -> str:
-    """Return the command that `words` begin with, as the user typed it."""
-    return " ".join([NAME, *takewhile(lambda word: not word.startswith("-"), words[:2])])
 
 
 def _flagged(path: str, words: Sequence[str]) -> str:

@@ -102,7 +102,7 @@ def check(name: str, data: Path | None = None, listener: str | None = None, pack
         return report | {"problems": [str(error)]}
     clips = [clip for _, clip in named_faces(data)]
     return report | {
-        "joints": _rows(head, retargeter, [_angles(retargeter, _at_ticks(clip)) for clip in clips]),
+        "joints": _rows(head, retargeter, [_angles(retargeter, clip) for clip in clips]),
         "blind_channels": retargeter.blind_channels,
         "dead_joints": retargeter.dead_joints,
         "neck": _neck(retargeter.neck, clips) if retargeter.neck else None,
@@ -113,16 +113,11 @@ def check(name: str, data: Path | None = None, listener: str | None = None, pack
     }
 
 
-def _at_ticks(clip: Floats) -> Doubles:
-    """Return a clip (T, 58) at the tick rate, as a curve without kinks; expressions stay within 0..1."""
+def _angles(retargeter: HeadRetargeter, clip: Floats) -> Doubles:
+    """Return angles (N, J) at the tick rate for a clip (T, 58), a curve without kinks, as if every frame were held."""
     times_s = np.arange(len(clip)) * FRAME_S
     ticks_s = np.arange(int((len(clip) - 1) * _TICK_HZ / FRAME_HZ) + 1) / _TICK_HZ
-    return np.asarray(CubicSpline(times_s, clip.astype(np.float64))(ticks_s))
-
-
-def _angles(retargeter: HeadRetargeter, motion: Doubles) -> Doubles:
-    """Return angles (N, J) for motion (N, 58), as if every frame were held."""
-    count = len(retargeter.joints)
+    motion, count = CubicSpline(times_s, clip.astype(np.float64))(ticks_s), len(retargeter.joints)
     parts = [
         retargeter.angles(np.broadcast_to(part[:, None], (len(part), count, part.shape[1])))
         for part in np.array_split(motion, max(1, len(motion) // _CHUNK))

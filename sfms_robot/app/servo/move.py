@@ -58,8 +58,9 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
         if not stays_on:
             goal = finish(startup.torque_on(), lambda pause_s: clock.wait_until(clock.now_s() + pause_s))
             stays_on = was_on
-        if speed is not None:
-            seen.put(speed, _slow(speed))
+        if speed is not None:  # twice that of the steps, so that the servo keeps up with them and does no more
+            per_unit = 6.0 if speed.unit == "rpm" else 1.0  # deg/s
+            seen.put(speed, min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale))))
         due_s = clock.now_s()
         while goal != target:
             goal += max(-step, min(step, target - goal))
@@ -123,12 +124,6 @@ def _torque_off(seen: FoundServo, torque: Field) -> None:
         raise
     except RobotError as error:
         raise TorqueError([f"id {seen.id}"]) from error
-
-
-def _slow(speed: Field) -> int:
-    """Return twice the speed of the steps, so that the servo keeps up with them and does no more."""
-    per_unit = 6.0 if speed.unit == "rpm" else 1.0  # deg/s
-    return min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale)))
 
 
 def _settled(seen: FoundServo, present: Field, target: int) -> int:
