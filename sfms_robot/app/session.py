@@ -258,11 +258,7 @@ def run(
         if (manager := ServiceManager()).wanted:
             watchers.append(NotifyingObserver(manager))
         if options.fleet is not None:
-            from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
-
-            name, key = options.fleet, fleet_key(options.fleet_key)
-            reach = FleetControls(halt, interrupt, knobs, controls.set_rates, name, key)
-            watch(FleetHead(name, status.document, reach, options.router))
+            watch(_fleet_head(options.fleet, options, controls))
         played: dict[str, Any] = {"timeline": timeline}
         if timeline is None:
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
@@ -309,6 +305,15 @@ def _check(options: RunOptions) -> None:
         check_folder(options.record, options.overwrite)
     elif options.record_format != "json":
         raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
+
+
+def _fleet_head(name: str, options: RunOptions, controls: RunControls) -> Observer:
+    """Return the observer that sends a run to its fleet, whose commands act on `controls`."""
+    from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
+
+    key = fleet_key(options.fleet_key)
+    reach = FleetControls(controls.halt, controls.interrupt, controls.knobs, controls.set_rates, name, key)
+    return FleetHead(name, controls.document, reach, options.router)
 
 
 def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> list[Output]:
