@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast, get_args
 
 from sfms_robot.app.output_paths import made_folder
 from sfms_robot.app.progress import bar
 from sfms_robot.config import load_head
 from sfms_robot.config.listener import load_listener
 from sfms_robot.data import data_dir, find, head_names, listener_names, speaker_names
-from sfms_robot.errors import ConfigError, optional
+from sfms_robot.errors import ConfigError, RobotError, optional
 from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, read_weights, write_tensors
 from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds
 from sfms_robot.servo.discovery import ports_data
@@ -78,20 +78,24 @@ def outputs() -> list[Row]:
     ]
 
 
-def serial_ports() -> list[Row]:
-    """Return the rows of `port list`. `name` is the value for --port."""
-    return ports_data()
+def ports() -> Row:
+    """Return the tables of `port list`; the name of a serial port is the value for --port. Blocks for a second.
 
-
-def sound_devices(direction: Literal["recording", "playing"]) -> list[Row]:
-    """Return the sound devices of `port list`, whose descriptions name the option for each; block for half a second.
-
-    Raises ConfigError without PortAudio.
+    The description of a sound device names the option for it. Without PortAudio, `microphone_problem` says so.
     """
+    found: Row = {"ports": ports_data(), "microphones": [], "loudspeakers": [], "microphone_problem": None}
+    try:
+        found |= {"microphones": _sound_devices(playing=False), "loudspeakers": _sound_devices(playing=True)}
+    except RobotError as error:
+        found["microphone_problem"] = str(error)
+    return found
+
+
+def _sound_devices(playing: bool) -> list[Row]:
     from sfms_robot.sources import sound_devices
 
     def option(monitor: bool) -> str:
-        return "--play " if direction == "playing" else "--agent-audio device:" if monitor else "--audio mic:"
+        return "--play " if playing else "--agent-audio device:" if monitor else "--audio mic:"
 
     return [
         {
@@ -102,7 +106,7 @@ def sound_devices(direction: Literal["recording", "playing"]) -> list[Row]:
             "rate_hz": round(device.rate_hz),
             "description": f"{option(device.monitor)}{device.name}",
         }
-        for device in sound_devices.sound_devices(direction == "playing")
+        for device in sound_devices.sound_devices(playing)
     ]
 
 

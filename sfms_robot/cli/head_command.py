@@ -7,12 +7,11 @@ import sys
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from typer import Argument, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, Result, cell, counted, print_rows, say, show
-from sfms_robot.errors import INTERRUPTED, ConfigError, RobotError, TorqueError
+from sfms_robot.errors import INTERRUPTED, ConfigError, TorqueError
 
 PACKAGES = Option(
     [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
@@ -61,15 +60,9 @@ def list_outputs(json: bool = JSON) -> None:
 @port.command("list")
 def list_ports(json: bool = JSON) -> None:
     """Serial ports that servos may hang on, with what speaks against using them; devices that record, or play."""
-    from sfms_robot.app.catalogue import serial_ports, sound_devices
+    from sfms_robot.app.catalogue import ports
 
-    found: dict[str, Any] = {"version": 1, "ports": serial_ports(), "microphones": [], "loudspeakers": []}
-    found["microphone_problem"] = None
-    try:
-        found |= {"microphones": sound_devices("recording"), "loudspeakers": sound_devices("playing")}
-    except RobotError as error:
-        found["microphone_problem"] = str(error)
-    show(found, json)
+    show({"version": 1, **ports()}, json)
 
 
 @app.command("list")
