@@ -173,9 +173,9 @@ def show_head(
             note="follows: joint of the head, joint of the URDF",
         )
         return
-    from sfms_robot.config.overlay import provenance, refusals
+    from sfms_robot.config.overlay import provenance
 
-    joints, refused = provenance(name), refusals(name)
+    joints, refused = provenance(name)
     if joint is not None:
         if joint not in joints:
             raise ConfigError.at(name, "--joint", joint, "is not a joint of this head", joints)

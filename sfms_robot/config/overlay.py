@@ -305,8 +305,8 @@ SHOWN: Final = (
 MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # given by a calibration
 
 
-def provenance(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
-    """Return the value and its origin per joint and key.
+def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[str]]:
+    """Return the value and its origin per joint and key; and a line for each measurement and fit that does not hold.
 
     Measurements count here whichever servos are plugged in now. Raises ConfigError for a head that is not sound.
     """
@@ -325,14 +325,8 @@ def provenance(name: str) -> dict[str, dict[str, tuple[Any, str]]]:
         if isinstance(drive := values["drive"], Model):
             values["drive"] = drive.model_dump(mode="json", exclude_defaults=True)
         found[joint] = {key: (values[key], origins[key]) for key in SHOWN}
-    return found
-
-
-def refusals(name: str) -> list[str]:
-    """Return one line for each measurement and fit that is there and does not hold."""
-    head = load_head(name)
-    layers = layered(head, load_overlay(head), head_hash(name))
-    return [f"{joint}: its calibration does not hold: {why}" for joint, why in layers.refused.items()] + [*layers.notes]
+    refused = [f"{joint}: its calibration does not hold: {why}" for joint, why in layers.refused.items()]
+    return found, [*refused, *layers.notes]
 
 
 def _origin(key: str, config: Joint, own: Mapping[str, Any], raw: Mapping[str, Any]) -> str:
