@@ -19,7 +19,7 @@ from sfms_robot.app.listen.report import Report
 from sfms_robot.app.open_head import prepare_head
 from sfms_robot.app.options import SIM, RunOptions, record_format_named
 from sfms_robot.app.session import RunControls, run
-from sfms_robot.config import Calmness, Head, load_head, parse
+from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName
@@ -124,7 +124,7 @@ class Robot(Driven):
             overwrite=overwrite,
             outputs=tuple(outputs),
         )
-        prepare_head(self._options)
+        prepared = prepare_head(self._options)
         check_outputs(self._options.outputs)
         self._listener = own
         self._person = (PushedVoice(), PushedSight()) if pushed else None
@@ -133,7 +133,7 @@ class Robot(Driven):
         self._source: Source | None = None if source is None else JudgedSource(source)
         self._hears = audio if source is None else type(source).__name__
         self._events = EventWatch()
-        self._controls = RunControls(load_head(self._options.head, servos=False), self._options)
+        self._controls = RunControls(prepared, self._options)
         self._controls.speech = self._speech
 
     def __enter__(self) -> Self:
