@@ -10,7 +10,7 @@ A plug-in that fails is a ConfigError of one line for the user who named it. For
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,6 +30,20 @@ log = logging.getLogger(__name__)
 def plugins(group: str) -> Mapping[str, EntryPoint]:
     """Return the installed entry points of a group by name, not yet imported."""
     return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def shipped(group: str, **kinds: str) -> Mapping[str, EntryPoint]:
+    """Return this package's own kinds of a group by name: `some_kind="module:callable"` is some-kind."""
+    named = {name.replace("_", "-"): place for name, place in kinds.items()}
+    return {name: EntryPoint(name, f"{group}.{place}", group) for name, place in named.items()}
+
+
+def known_kinds(
+    group: str, own: Mapping[str, EntryPoint], others: Iterable[EntryPoint] | None
+) -> Mapping[str, EntryPoint]:
+    """Return every kind of a group by name: its `own` go before the `others`, None for those that are installed."""
+    found = plugins(group) if others is None else {each.name: each for each in others}
+    return {**found, **own}
 
 
 def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from sfms_robot.endpoint import LOOPBACK, port_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import LOCAL, Router
-from sfms_robot.plugins import plug_in, plugins
+from sfms_robot.plugins import known_kinds, plug_in, shipped
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Output
@@ -22,12 +22,8 @@ if TYPE_CHECKING:  # numpy, which a look at a name does not need
 GROUP: Final = "sfms_robot.outputs"
 
 
-def _ours(**kinds: str) -> Mapping[str, EntryPoint]:
-    named = {name.replace("_", "-"): place for name, place in kinds.items()}
-    return {name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP) for name, place in named.items()}
-
-
-KINDS: Final[Mapping[str, EntryPoint]] = _ours(
+KINDS: Final = shipped(
+    GROUP,
     json="json_stream:JsonStream",
     vmc="avatars:VmcOutput",
     vmc_single="avatars:VmcSingleOutput",
@@ -59,8 +55,7 @@ def output_kinds(others: Iterable[EntryPoint] | None = None) -> Mapping[str, Ent
 
     `others`: those of other packages; None for the installed ones.
     """
-    found = plugins(GROUP) if others is None else {each.name: each for each in others}
-    return {**found, **KINDS}
+    return known_kinds(GROUP, KINDS, others)
 
 
 def check_outputs(values: Sequence[str], others: Iterable[EntryPoint] | None = None) -> None:
