@@ -193,7 +193,11 @@ class _UrdfReader:
         root, ordered = self._tree(links, joints)
         for joint in ordered.values():
             self._check_mimic(joint, ordered)
-        visuals = [v for link in self._root.findall("link") for v in self._visuals(link)]
+        visuals: list[Visual] = []
+        for link in self._root.findall("link"):
+            for visual in link.findall("visual"):
+                with self._left_out_if_wrong(link, visual, "not drawn"):
+                    visuals.append(self._visual(self._name(link), visual))
         if self._degrees:
             where, angles = next(iter(self._degrees.items()))
             count = f", in {len(self._degrees)} elements" if len(self._degrees) > 1 else ""
@@ -229,11 +233,11 @@ class _UrdfReader:
         lower, upper = (self._floats(limit, key, where, 1, (math.nan,))[0] for key in ("lower", "upper"))
         mimic = None
         if copied is not None:
-            multiplier, offset = (
-                self._floats(copied, key, where, 1, (value,))[0]
-                for key, value in (("multiplier", 1.0), ("offset", 0.0))
+            mimic = Mimic(
+                copied.get("joint", ""),
+                *self._floats(copied, "multiplier", where, 1, (1.0,)),
+                *self._floats(copied, "offset", where, 1, (0.0,)),
             )
-            mimic = Mimic(copied.get("joint", ""), multiplier, offset)
         return JointElement(
             name=name,
             kind=kind,
@@ -277,13 +281,6 @@ class _UrdfReader:
             if at.name in seen:
                 raise self._wrong("joint", joint.name, "mimics itself")
             seen.add(at.name)
-
-    def _visuals(self, link: Element) -> list[Visual]:
-        found: list[Visual] = []
-        for visual in link.findall("visual"):
-            with self._left_out_if_wrong(link, visual, "not drawn"):
-                found.append(self._visual(self._name(link), visual))
-        return found
 
     def _visual(self, name: str, visual: Element) -> Visual:
         geometry, where = visual.find("geometry"), f"link {name}"
