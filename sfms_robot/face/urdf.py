@@ -71,8 +71,6 @@ class JointElement:
     child: str
     place: Doubles
     axis: Doubles
-    lower: float
-    upper: float
     mimic: Mimic | None
 
     def motion(self, value: float) -> Doubles:
@@ -229,10 +227,10 @@ class _UrdfReader:
         length = float(np.linalg.norm(axis))
         if kind in MOVING and length < 1e-9:
             raise self._wrong("joint", name, "has an axis of length 0")
-        limit, copied = element.find("limit"), element.find("mimic")
-        lower, upper = (self._floats(limit, key, where, 1, (math.nan,))[0] for key in ("lower", "upper"))
+        for key in ("lower", "upper"):  # not used here; but whatever reads the file behind us takes them
+            self._floats(element.find("limit"), key, where, 1, (math.nan,))
         mimic = None
-        if copied is not None:
+        if (copied := element.find("mimic")) is not None:
             mimic = Mimic(
                 copied.get("joint", ""),
                 *self._floats(copied, "multiplier", where, 1, (1.0,)),
@@ -245,8 +243,6 @@ class _UrdfReader:
             child=ends[1],
             place=self._origin(element, where),
             axis=axis / max(length, 1e-9),
-            lower=lower,
-            upper=upper,
             mimic=mimic,
         )
 

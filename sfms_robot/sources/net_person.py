@@ -19,7 +19,7 @@ import secrets
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -159,7 +159,7 @@ class NetPerson:
     def __init__(self, flag: str, host: str, port: int, now: Clock = time.monotonic) -> None:
         self.now = now
         self._place = (host, port)
-        self._feeds: dict[str, NetVoice | NetSight | NetSpeech] = {}
+        self._feeds: dict[str, _NetPart] = {}
         self._feeders: dict[str, NetProgram] = {}
         self._clocks: dict[NetProgram, SenderClock] = {}
         self._heard_s: dict[str, float] = {}
@@ -180,7 +180,7 @@ class NetPerson:
 
     # --- from the run, in its threads ---
 
-    def join(self, name: str, part: NetVoice | NetSight | NetSpeech) -> None:
+    def join(self, name: str, part: _NetPart) -> None:
         """Give `part` what programs feed as `name`. Raises PortError when another one takes it already."""
         if name in self._feeds:
             raise PortError(f"{FLAGS[name]}: port {self.address[1]} is used by another run of this program")
@@ -310,7 +310,7 @@ class _NetPart(SourcePart):
     def __init__(self, argument: str | NetPerson) -> None:
         self.outlet = _person(FLAGS[self.feed], argument) if isinstance(argument, str) else argument
         super().__init__(self.outlet.now)
-        self.outlet.join(self.feed, cast(Any, self))
+        self.outlet.join(self.feed, self)
 
     def start(self, origin_s: float) -> None:
         self.outlet.start(origin_s)
