@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Value = TypeVar("Value")
 
 FRAME_HZ: Final = 25
 FRAME_S: Final = 1.0 / FRAME_HZ
 AUDIO_HZ: Final = 16_000
 FRAME_SAMPLES: Final = AUDIO_HZ // FRAME_HZ  # 640
+NO_SOUND: Final = np.zeros(0, np.float32)
+SILENCE: Final = np.zeros(FRAME_SAMPLES, np.float32)
+SILENCE.flags.writeable = False
 
 POSE_CHANNELS: Final = ("roll", "pitch", "yaw", "x", "y", "z")
 LATERAL_POSE: Final = ("roll", "yaw", "y")  # those of them that a mirror turns around

@@ -32,6 +32,12 @@ def plugins(group: str) -> Mapping[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
+def shipped(group: str, **kinds: str) -> Mapping[str, EntryPoint]:
+    """Return this package's own kinds of a group by name: `some_kind="module:callable"` is some-kind."""
+    named = {name.replace("_", "-"): place for name, place in kinds.items()}
+    return {name: EntryPoint(name, f"{group}.{place}", group) for name, place in named.items()}
+
+
 def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:
     """Import what an entry names and return it, or what it returns where there are `arguments`.
 

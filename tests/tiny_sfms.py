@@ -47,7 +47,7 @@ def told_listener(**changes) -> SfmsListener:
         },
     }
     listener = tiny_listener(**raw | changes)
-    if listener.engine.model.head:
+    if listener.engine.model.swaying:
         listener.engine.model.sway_mixture.copy_(0.003 * torch.eye(listener.engine.model.sway_mixture.shape[-1]))
         listener.engine.model.sway_spread.fill_(0.3)
     return listener

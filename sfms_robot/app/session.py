@@ -328,9 +328,9 @@ def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> li
         sink.look_at = partial(controls.puppet.look_at, seconds=LOOK_S)
     kind, argument = split_kind(options.face)
     if kind in ("vmc", "live-link"):
-        from sfms_robot.sources.live_face import USUAL_PORTS, parse_endpoint, parse_face_argument
+        from sfms_robot.sources.live_face import parse_endpoint, parse_face_argument
 
-        port = parse_endpoint(kind, parse_face_argument(kind, argument)[0], USUAL_PORTS[kind])[1]
+        port = parse_endpoint(kind, parse_face_argument(kind, argument)[0])[1]
         for sink in sinks:
             if sink.kind.startswith(("vmc", "live-link")) and leads_here(sink.peer, port):
                 raise ConfigError(

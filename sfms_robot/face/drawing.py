@@ -143,9 +143,9 @@ class VirtualWebcam:
     The person looks straight ahead at rest. Raises MissingExtra without vtk.
     """
 
-    def __init__(self, size_px: tuple[int, int] = SIZE_PX, angle_deg: float = ANGLE_DEG) -> None:
+    def __init__(self) -> None:
         self._vtk = load_vtk()
-        self._window, self._angle_deg = open_window(self._vtk, size_px), angle_deg
+        self._window = open_window(self._vtk, SIZE_PX)
         self._human = load_human()
 
     def picture(self, motion: Floats, place_m: tuple[float, float, float] = PLACE_M) -> NDArray[np.uint8]:
@@ -160,7 +160,7 @@ class VirtualWebcam:
         # The person looks the other way: their left is the camera's right.
         away, left, up = place_m
         lens = (_EYES_M[0] + away, _EYES_M[1] + left, _EYES_M[2] - up)
-        look(renderer, lens, (lens[0] - 1.0, lens[1], lens[2]), self._angle_deg)
+        look(renderer, lens, (lens[0] - 1.0, lens[1], lens[2]), ANGLE_DEG)
         image = _image(vtk, self._window)
         image.Update()
         self._window.RemoveRenderer(renderer)

@@ -8,7 +8,8 @@ stand below one another, and a joint without a drive is a bar on top. Sizes are 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from sfms_robot.config import Head
@@ -31,11 +32,19 @@ _PARTS: Final = (
 )
 
 
+class _Solid(NamedTuple):
+    """A shape of a link: a box (x, y, z), sphere (radius) or cylinder (radius, length), and its place on the link."""
+
+    kind: str
+    size: tuple[float, ...]
+    place: tuple[float, float, float]
+    color: str = "0.78 0.76 0.72"
+
+
 def generic_urdf(head: Head) -> bytes:
     """Return a URDF whose joints have the names of the head's, or of its pose (`face.robot_scene`)."""
-    elements = [
-        _link("base", ("box", (0.10, 0.12, 0.02), (0, 0, 0.01)), ("cylinder", (0.016, 0.08), (0, 0, 0.06))),
-    ]
+    base = _Solid("box", (0.10, 0.12, 0.02), (0, 0, 0.01)), _Solid("cylinder", (0.016, 0.08), (0, 0, 0.06))
+    elements = [_link("base", *base)]
     channels = {name: drive.channels() if drive else set[str]() for name, drive in drives(head).items()}
     turning, neck = {name: axis for axis in _AXES for name, used in channels.items() if axis in used}, set[str]()
     if head.kinematics is not None:
@@ -44,7 +53,7 @@ def generic_urdf(head: Head) -> bytes:
     for name, axis in turning.items():
         elements += [_link(f"{name}_link"), _joint(name, parent, f"{name}_link", (0, 0, height_m), _AXES[axis])]
         parent, height_m = f"{name}_link", 0.0
-    ball = ("sphere", (0.075,), (0, 0, 0.082))
+    ball = _Solid("sphere", (0.075,), (0, 0, 0.082))
     elements += [_link("head", ball), _joint("head_fixed", parent, "head", (0, 0, height_m), "")]
     taken = Counter[tuple[int, int]]()
     for name, used in channels.items():
@@ -58,28 +67,27 @@ def generic_urdf(head: Head) -> bytes:
             size = (0.006, 0.030, 0.005)
         place = (x, side * y, z - _STACK_M * taken[row, side])
         taken[row, side] += 1
-        shape = "sphere" if len(size) == 1 else "box"
-        pupil = [("sphere", (0.005,), (0.009, 0, 0), "0.15 0.15 0.18")] if shape == "sphere" else []
+        round_part = len(size) == 1
+        part = _Solid("sphere" if round_part else "box", size, (0, 0, 0), color)
+        pupil = [_Solid("sphere", (0.005,), (0.009, 0, 0), "0.15 0.15 0.18")] if round_part else []
         elements += [
-            _link(f"{name}_link", (shape, size, (0, 0, 0), color), *pupil),
+            _link(f"{name}_link", part, *pupil),
             _joint(name, "head", f"{name}_link", place, axis),
         ]
     return "\n".join([f"<robot name={quoteattr(head.name)}>", *elements, "</robot>"]).encode()
 
 
-def _link(name: str, *shapes: tuple[object, ...]) -> str:
+def _link(name: str, *shapes: _Solid) -> str:
     visuals = []
-    for shape, size, place, *color in shapes:
-        assert isinstance(size, tuple) and isinstance(place, tuple)
-        numbers = " ".join(map(str, size))
+    for kind, size, place, color in shapes:
         sizes = {
-            "box": f'size="{numbers}"',
+            "box": f'size="{_numbers(size)}"',
             "sphere": f'radius="{size[0]}"',
             "cylinder": f'radius="{size[0]}" length="{size[-1]}"',
-        }[str(shape)]
+        }[kind]
         visuals.append(
-            f'<visual><origin xyz="{" ".join(map(str, place))}"/><geometry><{shape} {sizes}/></geometry>'
-            f'<material name=""><color rgba="{color[0] if color else "0.78 0.76 0.72"} 1"/></material></visual>'
+            f'<visual><origin xyz="{_numbers(place)}"/><geometry><{kind} {sizes}/></geometry>'
+            f'<material name=""><color rgba="{color} 1"/></material></visual>'
         )
     return f"<link name={quoteattr(name)}>{''.join(visuals)}</link>"
 
@@ -88,5 +96,9 @@ def _joint(name: str, parent: str, child: str, place: tuple[float, float, float]
     kind = f'type="continuous"><axis xyz="{axis}"/>' if axis else 'type="fixed">'
     return (
         f'<joint name={quoteattr(name)} {kind}<parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{" ".join(map(str, place))}"/></joint>'
+        f'<origin xyz="{_numbers(place)}"/></joint>'
     )
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(map(str, values))

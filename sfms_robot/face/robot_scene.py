@@ -137,7 +137,7 @@ class RobotScene:
         if read.shape != self._read.shape:
             raise ValueError(f"angles are ({len(self._read)},), not {read.shape}")
         self._read = np.where(np.isfinite(read), read, self._read)
-        values = np.asarray(self._offset + self._scale * self._read[self._columns])
+        values = self._offset + self._scale * self._read[self._columns]
         return values if self._pose is None else np.concatenate([values, self._pose.values(self._read)])
 
     def rest(self) -> Doubles:

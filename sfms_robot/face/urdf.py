@@ -71,8 +71,6 @@ class JointElement:
     child: str
     place: Doubles
     axis: Doubles
-    lower: float
-    upper: float
     mimic: Mimic | None
 
     def motion(self, value: float) -> Doubles:
@@ -193,7 +191,11 @@ class _UrdfReader:
         root, ordered = self._tree(links, joints)
         for joint in ordered.values():
             self._check_mimic(joint, ordered)
-        visuals = [v for link in self._root.findall("link") for v in self._visuals(link)]
+        visuals: list[Visual] = []
+        for link in self._root.findall("link"):
+            for visual in link.findall("visual"):
+                with self._left_out_if_wrong(link, visual, "not drawn"):
+                    visuals.append(self._visual(self._name(link), visual))
         if self._degrees:
             where, angles = next(iter(self._degrees.items()))
             count = f", in {len(self._degrees)} elements" if len(self._degrees) > 1 else ""
@@ -225,15 +227,15 @@ class _UrdfReader:
         length = float(np.linalg.norm(axis))
         if kind in MOVING and length < 1e-9:
             raise self._wrong("joint", name, "has an axis of length 0")
-        limit, copied = element.find("limit"), element.find("mimic")
-        lower, upper = (self._floats(limit, key, where, 1, (math.nan,))[0] for key in ("lower", "upper"))
+        for key in ("lower", "upper"):  # not used here; but whatever reads the file behind us takes them
+            self._floats(element.find("limit"), key, where, 1, (math.nan,))
         mimic = None
-        if copied is not None:
-            multiplier, offset = (
-                self._floats(copied, key, where, 1, (value,))[0]
-                for key, value in (("multiplier", 1.0), ("offset", 0.0))
+        if (copied := element.find("mimic")) is not None:
+            mimic = Mimic(
+                copied.get("joint", ""),
+                *self._floats(copied, "multiplier", where, 1, (1.0,)),
+                *self._floats(copied, "offset", where, 1, (0.0,)),
             )
-            mimic = Mimic(copied.get("joint", ""), multiplier, offset)
         return JointElement(
             name=name,
             kind=kind,
@@ -241,8 +243,6 @@ class _UrdfReader:
             child=ends[1],
             place=self._origin(element, where),
             axis=axis / max(length, 1e-9),
-            lower=lower,
-            upper=upper,
             mimic=mimic,
         )
 
@@ -277,13 +277,6 @@ class _UrdfReader:
             if at.name in seen:
                 raise self._wrong("joint", joint.name, "mimics itself")
             seen.add(at.name)
-
-    def _visuals(self, link: Element) -> list[Visual]:
-        found: list[Visual] = []
-        for visual in link.findall("visual"):
-            with self._left_out_if_wrong(link, visual, "not drawn"):
-                found.append(self._visual(self._name(link), visual))
-        return found
 
     def _visual(self, name: str, visual: Element) -> Visual:
         geometry, where = visual.find("geometry"), f"link {name}"

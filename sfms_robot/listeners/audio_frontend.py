@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, SILENCE, Bools, Floats
 from sfms_robot.signals import mel, mfcc, phase, voice_activity
 from sfms_robot.signals.audio import energies_db
 
@@ -29,7 +28,6 @@ SHAPES: Final[Mapping[Audio, tuple[int, int]]] = {
     "mfcc78": (1, mfcc.DIM),
     "wav2vec2": (1, 768),
 }
-_SILENCE: Final = np.zeros(FRAME_SAMPLES, np.float32)
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class AudioFrontend:
         Returns:
             Rows (frames * R, bins), phases (frames, F), and the next state of each stream.
         """
-        whole = [np.concatenate([sound if len(sound) else _SILENCE for sound in own]) for own in sounds]
+        whole = [np.concatenate([sound if len(sound) else SILENCE for sound in own]) for own in sounds]
         pasts = [state.sound for state in before]
         if self.audio == "mel":
             rows, pasts = mel.log_mel_each(whole, pasts)
@@ -121,7 +119,7 @@ class AudioFrontend:
     def _start(self) -> Floats:
         if self.audio == "mel":
             return mel.start()
-        return np.zeros(0, np.float32) if self.model is None else self.model.start()
+        return NO_SOUND if self.model is None else self.model.start()
 
     def _rows(self, samples: Floats, past: Floats) -> tuple[Floats, Floats]:
         if self.audio == "mel":
@@ -152,7 +150,7 @@ def hear_each(
     `samples`: (640,) of each, or None or empty where there is no sound, which counts as silence. Samples that are not
     finite are silence too. Raises ValueError for another length.
     """
-    clean = [_SILENCE if each is None or not len(each) else _finite(each) for each in samples]
+    clean = [SILENCE if each is None or not len(each) else _finite(each) for each in samples]
     for each in clean:
         check_length(each)
     rows, spoken, after = TRACKS.step_each([[each] for each in clean], before)
@@ -160,14 +158,14 @@ def hear_each(
     return features, [each is not None and len(each) > 0 for each in samples], after
 
 
-def track(samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def track(samples: Floats) -> tuple[Floats, Bools]:
     """Return features (N, 533) and speech (N,) of a recording (n,), N = n // 640, the same as `hear_each`."""
     frames = len(samples) // FRAME_SAMPLES
     clean = _finite(samples[: frames * FRAME_SAMPLES])
     return _with_phrase(TRACKS.rows(clean).reshape(frames, MEL_WIDTH), phase.hear(voice_activity.levels_db(clean)))
 
 
-def of_mel(rows: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def of_mel(rows: Floats) -> tuple[Floats, Bools]:
     """Return what `track` returns of natural log-mel (N, 4, 128), for data without samples."""
     return _with_phrase(rows.reshape(len(rows), -1), phase.hear(voice_activity.mel_levels_db(rows)))
 
@@ -190,7 +188,7 @@ def check_length(samples: Floats) -> None:
         raise ValueError(f"a frame at {AUDIO_HZ} Hz has {FRAME_SAMPLES} samples or none, got {len(samples)}")
 
 
-def _with_phrase(rows: Floats, voiced: list[bool]) -> tuple[Floats, NDArray[np.bool_]]:
+def _with_phrase(rows: Floats, voiced: list[bool]) -> tuple[Floats, Bools]:
     places = phase.features(phase.times(voiced))
     return np.concatenate([rows, places], axis=1), np.array(voiced, dtype=np.bool_)
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, SILENCE, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 
 SIZES: Final = (1, 2, 4, 8, 16, 32)
@@ -94,34 +94,25 @@ class Capacity:
 
 
 def measure_capacity(
-    listener: Listener,
-    sizes: Sequence[int] = SIZES,
-    rounds: int = ROUNDS,
-    now_s: Callable[[], float] = time.perf_counter,
+    listener: Listener, sizes: Sequence[int] = SIZES, now_s: Callable[[], float] = time.perf_counter
 ) -> Capacity:
     """Step batches of silence and return the medians of their durations. Blocks for a second or two."""
-    plan_s, other_s = [], []
+    plan_s: list[float] = []
+    other_s: list[float] = []
     for size in sizes:
-        planned, others = _timed(listener, size, rounds, now_s)
-        plan_s.append(float(np.median(planned)))
+        memories = [listener.start(seed) for seed in range(size)]
+        planned: list[float] = []
+        others: list[float] = []
+        for index in range((ROUNDS + 1) * listener.hop):
+            began_s = now_s()
+            answers = step_each(listener, [SpeakerFrame((index + 1) * FRAME_S, SILENCE)] * size, memories)
+            taken_s = now_s() - began_s
+            memories = [memory for _, memory in answers]
+            (others if answers[0][0] is None else planned).append(taken_s)
+        plan_s.append(float(np.median(planned[1:] or planned or others)))
+        others = others[listener.hop - 1 :]
         other_s.append(float(np.median(others)) if others else 0.0)
     return Capacity(hop=listener.hop, sizes=tuple(sizes), plan_s=tuple(plan_s), other_s=tuple(other_s))
-
-
-def _timed(listener: Listener, size: int, rounds: int, now_s: Callable[[], float]) -> tuple[list[float], list[float]]:
-    """Return the durations of steps of `size` streams, with a plan and without."""
-    memories = [listener.start(seed) for seed in range(size)]
-    silence = np.zeros(FRAME_SAMPLES, np.float32)
-    planned: list[float] = []
-    others: list[float] = []
-    for index in range((rounds + 1) * listener.hop):
-        began_s = now_s()
-        answers = step_each(listener, [SpeakerFrame((index + 1) * FRAME_S, silence)] * size, memories)
-        taken_s = now_s() - began_s
-        memories = [memory for _, memory in answers]
-        plan: Plan | None = answers[0][0]
-        (others if plan is None else planned).append(taken_s)
-    return planned[1:] or planned or others, others[listener.hop - 1 :]
 
 
 def _between(sizes: Sequence[int], costs_s: Sequence[float], count: float) -> float:

@@ -96,9 +96,9 @@ def load_weights(file: Path, module: nn.Module) -> None:
     module.load_state_dict({name: torch.from_numpy(value) for name, value in stored_tensors(file, wanted)})
 
 
-def read_weights(file: Path, wanted: Shapes | None = None) -> dict[str, Array]:
+def read_weights(file: Path) -> dict[str, Array]:
     """Return all `stored_tensors` of a file, by name."""
-    return dict(stored_tensors(file, wanted))
+    return dict(stored_tensors(file))
 
 
 def stored_tensors(file: Path, wanted: Shapes | None = None) -> Iterator[tuple[str, Array]]:

@@ -33,7 +33,7 @@ not rest: it goes through no map until half a second after its own voice, and th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -73,8 +73,8 @@ class HeadSway:
 
     def __init__(self, settings: config.ListenerSettings, tensors: Mapping[str, Floats]) -> None:
         self._head = head_channels(settings.channels) if settings.sway else []
-        self._lateral = lateral_channels(settings.channels)
-        self._shifting = shifting_channels(settings.channels)
+        self._lateral = among_head(settings.channels, LATERAL)
+        self._shifting = among_head(settings.channels, SHIFTING)
         self._tensors = tensors
 
     def start(self, seed: int) -> Doubles:
@@ -141,13 +141,8 @@ def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
     In units of the motion; 0 before the stream began.
     """
     lines, clocks = sway[..., 1:, :], sway[..., :1, :]
-    own_s = times_s[..., None] + sum_of_lines(times_s[..., None], *_parts(clocks))  # (..., T, S)
-    return np.asarray(sum_of_lines(own_s, *_parts(lines)) * set_in(times_s)[..., None], np.float32)
-
-
-def _parts(lines: Doubles) -> tuple[Doubles, Doubles, Doubles]:
-    """Return frequencies, sizes and phases of lines (..., 3, L, S)."""
-    return lines[..., 0, :, :], lines[..., 1, :, :], lines[..., 2, :, :]
+    own_s = times_s[..., None] + sum_of_lines(times_s[..., None], *np.moveaxis(clocks, -3, 0))  # (..., T, S)
+    return np.asarray(sum_of_lines(own_s, *np.moveaxis(lines, -3, 0)) * set_in(times_s)[..., None], np.float32)
 
 
 # --- Spectral lines ---------------------------------------------------------------------------------------------------
@@ -196,14 +191,9 @@ def head_channels(channels: Sequence[str]) -> list[int]:
     return [index for index, name in enumerate(channels) if name in HEAD]
 
 
-def lateral_channels(channels: Sequence[str]) -> list[int]:
-    """Return which of the `head_channels` a mirror turns around, by their place among those."""
-    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in LATERAL]
-
-
-def shifting_channels(channels: Sequence[str]) -> list[int]:
-    """Return which of the `head_channels` move the head without turning it, by their place among those."""
-    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in SHIFTING]
+def among_head(channels: Sequence[str], names: Collection[str]) -> list[int]:
+    """Return which of the `head_channels` have one of the names, such as `LATERAL`, by their place among those."""
+    return [at for at, index in enumerate(head_channels(channels)) if channels[index] in names]
 
 
 # --- Idle motion of a face --------------------------------------------------------------------------------------------

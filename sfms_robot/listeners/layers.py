@@ -9,13 +9,17 @@ Shapes: B batch, T frames of the query, S frames of the memory, N samples, D wid
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import lru_cache
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from sfms_robot import config
+from sfms_robot.listeners.idle import BANDS, head_channels
 
 
 @lru_cache(maxsize=32)
@@ -29,6 +33,61 @@ def sinusoidal(length: int, width: int, device: torch.device | None = None) -> T
     return torch.cat([torch.sin(position * rate), torch.cos(position * rate)], dim=-1)
 
 
+def places_of(x: Tensor) -> Tensor:
+    """Return the sinusoidal positions (T, W) of x (B, T, W), in its type and on its device."""
+    return sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
+
+
+# --- What both models are made of -------------------------------------------------------------------------------------
+
+
+class ListenerModel(nn.Module):
+    """Weights of one listener. Base of both: scales of motion and sound, and the sway, which training sets."""
+
+    def __init__(self, settings: config.ListenerSettings, sound_width: int) -> None:
+        super().__init__()
+        channels = len(settings.channels)
+        self.motion_mean = nn.Buffer(torch.zeros(channels))
+        self.motion_std = nn.Buffer(torch.ones(channels))
+        self.sound_mean = nn.Buffer(torch.zeros(sound_width))
+        self.sound_std = nn.Buffer(torch.ones(sound_width))
+        self.swaying = head_channels(settings.channels) if settings.sway else []
+        if settings.sway:
+            self.sway_mixture = nn.Buffer(torch.zeros(BANDS, len(self.swaying), len(self.swaying)))
+            self.sway_spread = nn.Buffer(torch.zeros(()))
+
+    def standardise(self, motion: Tensor) -> Tensor:
+        """Return motion (..., C) of the model's motion space in the units it works in."""
+        return (motion - self.motion_mean) / self.motion_std
+
+    def restore(self, motion: Tensor) -> Tensor:
+        """Return standardised motion (..., C) in the model's motion space."""
+        return motion * self.motion_std + self.motion_mean
+
+    def standardise_sound(self, sound: Tensor) -> Tensor:
+        """Return sound features (..., A) in the units the model works in."""
+        return (sound - self.sound_mean) / self.sound_std
+
+
+Model = TypeVar("Model", bound=ListenerModel)
+
+
+class Network(nn.Module, Generic[Model]):
+    """A function of tensors of one model, whose weights keep their names in model.safetensors, behind "model.".
+
+    Attributes:
+        free: inputs of (B, K, ...), K any number but the same for all of them.
+        further: names of the inputs that `forward` takes as its last one, `*parts`.
+    """
+
+    free: Sequence[str] = ()
+    further: Sequence[str] = ()
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self.model = model
+
+
 # --- Operators of onnxruntime -----------------------------------------------------------------------------------------
 #
 # While a graph is exported, attention and LayerNorm become the one operator that onnxruntime has for each. The dozen
@@ -37,13 +96,7 @@ def sinusoidal(length: int, width: int, device: torch.device | None = None) -> T
 
 def _operator(name: str, inputs: tuple[Any, ...], attributes: dict[str, Any], like: Tensor, version: int = 1) -> Tensor:
     """Return the output, of the type and shape of `like`, of an ONNX operator."""
-    out: Tensor = torch.onnx.ops.symbolic(name, inputs, attributes, dtype=like.dtype, shape=like.shape, version=version)
-    return out
-
-
-def exported_norm(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """Return LayerNorm of x (..., D), then `scale` and `shift`, which broadcast to x, as one operator."""
-    return _operator("LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, x, 17)
+    return torch.onnx.ops.symbolic(name, inputs, attributes, dtype=like.dtype, shape=like.shape, version=version)
 
 
 def split_heads(x: Tensor, heads: int) -> Tensor:
@@ -180,14 +233,14 @@ class Modulation(nn.Module):
     which DiT begins, only delay learning at these depths.
     """
 
-    def __init__(self, width: int, size: int, kinds: str) -> None:
-        """Make vectors of `size` from a condition of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
+    def __init__(self, width: int, kinds: str) -> None:
+        """Make vectors from a condition, both of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
         super().__init__()
         self.parts = len(kinds)
-        self.linear = nn.Linear(width, self.parts * size)
+        self.linear = nn.Linear(width, self.parts * width)
         nn.init.normal_(self.linear.weight, std=0.5 * width**-0.5)
         with torch.no_grad():
-            self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(size))
+            self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(width))
 
     def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
         """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
@@ -203,7 +256,7 @@ class Modulation(nn.Module):
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """Return LayerNorm of x (..., D) without weights, then scaled and shifted; `shift`, `scale` broadcast to x."""
     if torch.compiler.is_exporting():
-        return exported_norm(x, scale, shift)
+        return _operator("LayerNormalization", (x, scale, shift), {"axis": -1, "epsilon": 1e-5}, x, 17)
     return torch.addcmul(shift, torch.layer_norm(x, x.shape[-1:]), scale)
 
 

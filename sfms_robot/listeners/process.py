@@ -40,7 +40,7 @@ import numpy as np
 from sfms_robot.config.hop import HopChoice, Latencies, Probe, choose_hop
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError, RobotError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_S, SILENCE, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, listen
 from sfms_robot.ports import Listener
@@ -292,19 +292,13 @@ def main() -> None:
 
         listener = load_listener(name, calmness=calmness, engine=engine, threads=1)
         parent.send(("loaded", engine_name(listener), 0.0))
-        choices = hops_of(listener)
-        if use_threads(at_hop(listener, min(choices)), threads()):
+        hops = hops_of(listener)
+        quickest = at_hop(listener, min(hops))
+        if use_threads(quickest, threads()):
             parent.send(("loaded", engine_name(listener), 0.0))
-        p50_s, p99_s = plan_times_s(at_hop(listener, min(choices)))
-        parent.send(
-            (
-                "probed",
-                Probe(
-                    horizon=listener.horizon, hop=listener.hop, hops=tuple(choices), step_p50_s=p50_s, step_p99_s=p99_s
-                ),
-                0.0,
-            )
-        )
+        p50_s, p99_s = plan_times_s(quickest)
+        probe = Probe(horizon=listener.horizon, hop=listener.hop, hops=hops, step_p50_s=p50_s, step_p99_s=p99_s)
+        parent.send(("probed", probe, 0.0))
     except RobotError as error:
         parent.send(("error", str(error), 0.0))
         return
@@ -344,14 +338,13 @@ def plan_times_s(
     At the pace of a run: between two frames caches cool, and a plan takes half as long again. Blocks for `limit_s`, or
     `PROBE_PLANS` plans, and one step more.
     """
-    silence = np.zeros(FRAME_SAMPLES, np.float32)
     memory = listener.start(0)
     planned_s: list[float] = []
     other_s: list[float] = []
     began_s = time.perf_counter()
     while len(planned_s) < PROBE_PLANS and (not other_s + planned_s or time.perf_counter() - began_s < limit_s):
         step_s = time.perf_counter()
-        plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, silence), memory)
+        plan, memory = listener.step(SpeakerFrame((len(planned_s) + len(other_s) + 1) * FRAME_S, SILENCE), memory)
         taken_s = time.perf_counter() - step_s
         (other_s if plan is None else planned_s).append(taken_s)
         wait(max(0.0, FRAME_S - taken_s))

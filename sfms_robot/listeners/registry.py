@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -91,7 +90,7 @@ def set_threads(listener: Listener, threads: int) -> None:
         engine.set_threads(threads)
 
 
-def hops_of(listener: Listener) -> Sequence[int]:
+def hops_of(listener: Listener) -> tuple[int, ...]:
     """Return the hops that it can be run with; its own alone, for one that names none."""
     return tuple(getattr(listener, "hops", (listener.hop,)))
 

@@ -328,4 +328,4 @@ def _pcm(samples: Floats | None) -> bytes:
 
 
 def _floats(values: Floats) -> bytes:
-    return bytes(np.asarray(values, dtype="<f4").tobytes())
+    return np.asarray(values, dtype="<f4").tobytes()

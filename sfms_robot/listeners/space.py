@@ -53,10 +53,9 @@ class MotionSpace:
             shown = np.array(frames, dtype=np.float32)
             np.clip(shown[:, 6:], 0.0, 1.0, out=shown[:, 6:])
             return shown, None
-        out = spaces.decode(
+        return spaces.decode(
             frames, self.name, neutral=self.neutral, metres_per_unit=self.metres_per_unit, flame=self.flame
         )
-        return out.motion, out.jaw_rad
 
     def encode(self, motion: Floats) -> Floats:
         """Return our motion (N, 58) in the space (N, D). deca56 takes pose and jaw; its expression stays at rest."""

@@ -30,7 +30,7 @@ import numpy as np
 from sfms_robot.config.base import parse
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import PacketError, RobotError
-from sfms_robot.frames import FRAME_S, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, NO_SOUND, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.capacity import Capacity, step_each
 from sfms_robot.listeners.remote_messages import (
     OURS,
@@ -55,7 +55,6 @@ MOST_FILLED: Final = MOST_WAITING  # lost frames in a row that become empty ones
 SENT_AGAIN: Final = 2  # plans that repeat an event
 _STALE_S: Final = 2.0  # a frame that claims to be older has a clock of its own
 _SCALE_STEP: Final = 0.05  # of a batch's weight in the scale of costs
-_EMPTY: Final = np.zeros(0, np.float32)
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +69,6 @@ class Figures:
     Attributes:
         server, listener: names.
         hop: frames between plans.
-        deadline_s: promised from a frame to its plan.
         counts: by the names of `_COUNTS`: `heads` at this moment, the others so far.
         most_heads: number of heads that could be answered in time; None where all are admitted.
         delays_s, batch_sizes: of the last plans, and of the last batches.
@@ -81,7 +79,6 @@ class Figures:
     server: str
     listener: str
     hop: int
-    deadline_s: float
     counts: Counter[str]
     most_heads: int | None
     delays_s: Sequence[float]
@@ -101,7 +98,7 @@ def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
         "processes": len(parts),
         **{name: sum(each.counts[name] for each in parts) for name in _COUNTS},
         "most_heads": None if first.most_heads is None else sum(each.most_heads or 0 for each in parts),
-        "deadline_ms": first.deadline_s * 1e3,
+        "deadline_ms": DEADLINE_S * 1e3,
         "delay_ms": _spread([delay_s * 1e3 for each in parts for delay_s in each.delays_s]),
         "batch_size": _spread([size for each in parts for size in each.batch_sizes]),
         "cost_scale": round(max(scales), 3) if scales else None,
@@ -151,7 +148,6 @@ class StreamServer:
         listener: the one that is served, under `name`.
         capacity: costs of its batches; None admits all heads.
         server: name of this server; a fresh number is put behind it.
-        deadline_s: promised from a frame to its plan.
 
     Attributes:
         counts: so far, see `Figures`.
@@ -163,10 +159,9 @@ class StreamServer:
         name: str,
         capacity: Capacity | None = None,
         server: str = "server",
-        deadline_s: float = DEADLINE_S,
     ) -> None:
         self._listener, self._name, self._capacity = listener, name, capacity
-        self._server, self._deadline_s = f"{server}-{secrets.token_hex(3)}", deadline_s
+        self._server = f"{server}-{secrets.token_hex(3)}"
         self.counts: Counter[str] = Counter()
         self._delays_s, self._batch_sizes = deque[float](maxlen=RECENT), deque[int](maxlen=RECENT)
         self._streams: dict[str, _Stream] = {}
@@ -230,13 +225,13 @@ class StreamServer:
         """Return why no more heads are admitted; None: one more is."""
         if self._capacity is None:
             return None
-        delay_s = self._capacity.delay_s(self.heads + 1, self._deadline_s)
-        if delay_s <= self._deadline_s:
+        delay_s = self._capacity.delay_s(self.heads + 1, DEADLINE_S)
+        if delay_s <= DEADLINE_S:
             return None
         after = "not be kept up with" if math.isinf(delay_s) else f"be answered after {delay_s * 1e3:.0f} ms"
         return (
             f"server {self._server} is full: with {self.heads} heads one more would {after}, "
-            f"{self._deadline_s * 1e3:.0f} ms are promised"
+            f"{DEADLINE_S * 1e3:.0f} ms are promised"
         )
 
     def expire(self, now_s: float) -> None:
@@ -284,7 +279,7 @@ class StreamServer:
                 return []  # it came late, and an empty one has taken its place; or twice
             self.counts["lost_frames"] += gap
             for back in range(min(gap, MOST_FILLED), 0, -1):
-                empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, _EMPTY)
+                empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, NO_SOUND)
                 filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
                 stream.waiting.append(self._due(filled, now_s))
         stream.expected = sent.number + 1
@@ -299,7 +294,7 @@ class StreamServer:
     def _due(self, sent: SentFrame, now_s: float) -> _Due:
         age_s = now_s - sent.server_sent_s
         made_s = sent.server_sent_s if 0.0 <= age_s <= _STALE_S else now_s
-        return _Due(sent, now_s, made_s + self._deadline_s)
+        return _Due(sent, now_s, made_s + DEADLINE_S)
 
     # --- batches -----------------------------------------------------------------------------------------------------
 
@@ -342,7 +337,7 @@ class StreamServer:
                 stream.events.append(plan.events)
                 delay_s = now_s - due.came_s
                 self._delays_s.append(delay_s)
-                self.counts.update(plans=1, deadline_misses=delay_s > self._deadline_s)
+                self.counts.update(plans=1, deadline_misses=delay_s > DEADLINE_S)
         self.counts.update(batches=1, steps=len(batch))
         self._batch_sizes.append(len(batch))
         self._weigh(sum(plan is not None for plan, _ in answers), len(answers), step_s)
@@ -377,7 +372,7 @@ class StreamServer:
         if self._capacity is None:
             return 1 << 16
         size = 1
-        while self._capacity.batch_s(size + 1, 0) <= self._deadline_s / 2 and size < 4096:
+        while self._capacity.batch_s(size + 1, 0) <= DEADLINE_S / 2 and size < 4096:
             size += 1
         return size
 
@@ -390,11 +385,10 @@ class StreamServer:
             server=self._server,
             listener=self._name,
             hop=self._listener.hop,
-            deadline_s=self._deadline_s,
             counts=self.counts + Counter(heads=self.heads),
             delays_s=[*self._delays_s],
             batch_sizes=[*self._batch_sizes],
-            most_heads=None if capacity is None else capacity.most(self._deadline_s),
+            most_heads=None if capacity is None else capacity.most(DEADLINE_S),
             cost_scale=None if capacity is None else capacity.scale,
             cpu_s=time.process_time(),
         )

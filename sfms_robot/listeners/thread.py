@@ -35,9 +35,9 @@ log = logging.getLogger(__name__)
 class Inbox:
     """Frames in the order in which they came, until None does.
 
-    A machine that cannot keep up must not answer what was said seconds ago: when more than `most` frames wait, the
-    listener continues with the newest, and the others are counted. Frames that came before the first call of `next` do
-    not count as too many, as long as they become fewer at the pace of `CATCH_UP`.
+    A machine that cannot keep up must not answer what was said seconds ago: when more than `MOST_WAITING` frames wait,
+    the listener continues with the newest, and the others are counted. Frames that came before the first call of `next`
+    do not count as too many, as long as they become fewer at the pace of `CATCH_UP`.
 
     Attributes:
         skipped: frames left out before the last one returned.
@@ -45,9 +45,8 @@ class Inbox:
         hop: requested; None: the listener's own.
     """
 
-    def __init__(self, most: int = MOST_WAITING) -> None:
+    def __init__(self) -> None:
         self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
-        self._most = most
         self._allowed: float | None = None  # to wait, while it catches up with those of before
         self._waiting: deque[SpeakerFrame | None] = deque()
         self.skipped = 0
@@ -67,8 +66,8 @@ class Inbox:
         if None in self._waiting:
             return None
         waiting = len(self._waiting)
-        self._allowed = waiting + self._most if self._allowed is None else self._allowed - CATCH_UP
-        self.skipped = waiting - 1 if waiting > max(self._most, self._allowed) else 0
+        self._allowed = waiting + MOST_WAITING if self._allowed is None else self._allowed - CATCH_UP
+        self.skipped = waiting - 1 if waiting > max(MOST_WAITING, self._allowed) else 0
         for _ in range(self.skipped):
             self._waiting.popleft()
         return self._waiting.popleft()

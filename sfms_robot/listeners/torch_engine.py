@@ -25,19 +25,20 @@ from torch import Tensor, nn
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, ModelError, optional
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.frames import FRAME_S, SILENCE, SpeakerFrame
 from sfms_robot.listeners.arig.model import ArigModel
 from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.arig.networks import networks as arig_networks
 from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
 from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Device, RunsOnEngine, digest
+from sfms_robot.listeners.layers import Network
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.signals.control import COLUMNS
 
-Networks = Mapping[str, nn.Module]  # by name; modules whose inputs and outputs are tensors
+Networks = Mapping[str, Network[Any]]  # by name
 
 MODEL: Final = "model."  # before the name of a weight, in every network
 MOST_STREAMS: Final = 4096
@@ -54,14 +55,10 @@ class TorchEngine:
     """
 
     def __init__(self, model: nn.Module, networks: Networks) -> None:
+        self.name = "torch"
         self.model = model.eval()
         self.tensors = {name: value.detach().numpy() for name, value in model.state_dict().items()}
         self._networks = networks
-
-    @property
-    def name(self) -> str:
-        """Return "torch"."""
-        return "torch"
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
@@ -91,11 +88,7 @@ class BatchEngine(TorchEngine):
             self.model.to(device)
             if device.type == "cuda":
                 self._pool = torch.cuda.graph_pool_handle()
-
-    @property
-    def name(self) -> str:
-        """Return "torch" and the device."""
-        return f"torch on {torch.cuda.get_device_name(self._device) if self._device.type == 'cuda' else 'cpu'}"
+        self.name = f"torch on {torch.cuda.get_device_name(device) if device.type == 'cuda' else 'cpu'}"
 
     @torch.inference_mode()
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
@@ -165,9 +158,9 @@ class RecordingEngine(TorchEngine):
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, see `engine.Engine.run`."""
         module, streams = self._networks[network], max(map(len, inputs))
-        names = [*signature(module.forward).parameters]
-        if further := getattr(module, "further", ()):  # in place of *parts
-            names[-1:] = further
+        names: list[str] = [*signature(module.forward).parameters]
+        if module.further:  # in place of *parts
+            names[-1:] = module.further
         arrays = _tensors(np.broadcast_to(each, (streams, *each.shape[1:])) for each in inputs)
         self.examples[network] = dict(zip(names, arrays, strict=False))
         return super().run(network, *inputs)
@@ -241,7 +234,7 @@ def export(
     else:
         listener = SfmsListener(model.settings, recorder, folder)
     control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
-    speakers = [SpeakerFrame(FRAME_S, np.zeros(FRAME_SAMPLES, np.float32)) for _ in range(EXAMPLE_STREAMS)]
+    speakers = [SpeakerFrame(FRAME_S, SILENCE) for _ in range(EXAMPLE_STREAMS)]
     memories: list[Any] = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
     listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
     models: dict[str, SfmsModel | ArigModel] = {"": model}
@@ -295,8 +288,7 @@ class IntegerLinear(nn.Module):
         """Return (..., out) of x (..., in)."""
         product, shape = "com.microsoft::DynamicQuantizeMatMul", (*x.shape[:-1], len(self.weight.scale))
         inputs = (x, self.weight.int8, self.weight.scale, None, self.bias)  # None: zero point of 0
-        out: Tensor = torch.onnx.ops.symbolic(product, inputs, dtype=x.dtype, shape=shape)
-        return out
+        return torch.onnx.ops.symbolic(product, inputs, dtype=x.dtype, shape=shape)
 
 
 def in_integers(model: ArigModel) -> ArigModel:
@@ -308,14 +300,17 @@ def in_integers(model: ArigModel) -> ArigModel:
     return model
 
 
-def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> Any:
+def _graph(network: Network[Any], example: Mapping[str, Tensor], several: bool) -> Any:
     """Return a simplified `onnx_ir.Model` whose weights are values without content (steps 1 to 3)."""
     with optional("sfms-robot export"):
         import onnxscript
-    streams = torch.export.Dim("streams", min=1, max=MOST_STREAMS)
-    free = torch.export.Dim("free", min=1, max=MOST_STREAMS)
-    also = {name: {1: free} for name in getattr(network, "free", ())}
-    dynamic = _like_arguments(network, [{0: streams} | also.get(name, {}) for name in example]) if several else None
+    dynamic: tuple[Any, ...] | None = None
+    if several:
+        streams, free = (torch.export.Dim(name, min=1, max=MOST_STREAMS) for name in ("streams", "free"))
+        dynamic = tuple({0: streams} | ({1: free} if name in network.free else {}) for name in example)
+        if network.further:  # in the form of the arguments of `forward`, where all of *parts are one
+            named = len(dynamic) - len(network.further)
+            dynamic = (*dynamic[:named], dynamic[named:])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         quiet = logging.getLogger("torch.onnx")
@@ -342,14 +337,6 @@ def _graph(network: nn.Module, example: Mapping[str, Tensor], several: bool) -> 
         if value.uses():
             graph.initializers[value.name] = value
     return exported.model
-
-
-def _like_arguments(network: nn.Module, shapes: list[Any]) -> tuple[Any, ...]:
-    """Return shapes in the form of the arguments of `forward`, where all of *parts are one argument."""
-    code = network.forward.__code__
-    named = code.co_argcount - 1
-    rest = code.co_flags & 0x04  # CO_VARARGS
-    return (*shapes[:named], tuple(shapes[named:])) if rest else tuple(shapes)
 
 
 def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, Any]]:

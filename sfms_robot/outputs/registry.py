@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from sfms_robot.endpoint import LOOPBACK, port_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import LOCAL, Router
-from sfms_robot.plugins import plug_in, plugins
+from sfms_robot.plugins import plug_in, plugins, shipped
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Output
@@ -23,21 +23,19 @@ GROUP: Final = "sfms_robot.outputs"
 _ADDRESS: Final = re.compile(r"(\[(?P<bracketed>[^][]+)\]|(?P<name>[^][:/@ ]*))(:(?P<port>\d+))?")
 
 
-KINDS: Final[Mapping[str, EntryPoint]] = {
-    name: EntryPoint(name, f"sfms_robot.outputs.{place}", GROUP)
-    for name, place in (
-        ("json", "json_stream:JsonStream"),
-        ("vmc", "avatars:VmcOutput"),
-        ("vmc-single", "avatars:VmcSingleOutput"),
-        ("live-link", "avatars:LiveLinkOutput"),
-        ("vtube-studio", "vtube_studio:VtubeStudio"),
-        ("vtube-studio-add", "vtube_studio:VtubeStudioAdd"),
-        ("reachy-mini", "reachy_mini:ReachyMini"),
-        ("reachy-mini-overlay", "reachy_mini:ReachyMiniOverlay"),
-        ("furhat", "furhat:Furhat"),
-        ("ros2", "ros2:Ros2Output"),
-    )
-}
+KINDS: Final = shipped(
+    GROUP,
+    json="json_stream:JsonStream",
+    vmc="avatars:VmcOutput",
+    vmc_single="avatars:VmcSingleOutput",
+    live_link="avatars:LiveLinkOutput",
+    vtube_studio="vtube_studio:VtubeStudio",
+    vtube_studio_add="vtube_studio:VtubeStudioAdd",
+    reachy_mini="reachy_mini:ReachyMini",
+    reachy_mini_overlay="reachy_mini:ReachyMiniOverlay",
+    furhat="furhat:Furhat",
+    ros2="ros2:Ros2Output",
+)
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
     "json": "json[:PORT], 8782: WebSocket server of this machine, a JSON object a frame",

@@ -72,10 +72,14 @@ def attend(
     motion = face.motion
     closed = float(motion[BLINKS].mean()) > CLOSED
     eyes_rad = before.eyes_rad if closed else directions(motion, _FULL_RAD).mean(axis=0)
-    gaze_rad = motion[YAW_PITCH] + eyes_rad - _to_camera(place_m)
+    gaze_rad = motion[YAW_PITCH] + eyes_rad
+    if place_m is not None:  # a person at the camera's left turns to their own left, and one above it looks down
+        gaze_rad = gaze_rad - direction_to(np.asarray(place_m, np.float64)) * [1.0, -1.0]
     neutral_rad, seen_s, open_s = before.neutral_rad, before.seen_s, before.open_s
-    if not closed:
-        neutral_rad = _learnt(neutral_rad, gaze_rad, dt_s, seen_s)
+    if not closed:  # one step of a running median
+        speed_rad_s = NEUTRAL_RAD_S + (NEUTRAL_START_RAD_S - NEUTRAL_RAD_S) * math.exp(-seen_s / SETTLE_S)
+        off_rad = gaze_rad - neutral_rad
+        neutral_rad = neutral_rad + off_rad * min(1.0, speed_rad_s * dt_s / max(float(np.hypot(*off_rad)), 1e-9))
         seen_s, open_s = seen_s + dt_s, face.time_s
     looks = _at(float(np.hypot(*(gaze_rad - neutral_rad)))) if face.time_s - open_s <= BLINK_S else 0.0
     attention = looks if first else looks + (before.attention - looks) * math.exp(-dt_s / SMOOTH_S)
@@ -90,25 +94,6 @@ def attend(
         turns=turns,
     )
     return attention if turns else None, after
-
-
-def _to_camera(place_m: Floats | None) -> Doubles:
-    """Return yaw and pitch (2,) with which a person at that place looks into the camera; that of its axis if unknown.
-
-    A person at the camera's left turns to their own left, and one above it looks down.
-    """
-    if place_m is None:
-        return np.zeros(2)
-    return direction_to(np.asarray(place_m, np.float64)) * [1.0, -1.0]
-
-
-def _learnt(neutral_rad: Doubles, gaze_rad: Doubles, dt_s: float, seen_s: float) -> Doubles:
-    """Return the neutral, nearer to this look by one step of a running median."""
-    speed_rad_s = NEUTRAL_RAD_S + (NEUTRAL_START_RAD_S - NEUTRAL_RAD_S) * math.exp(-seen_s / SETTLE_S)
-    off_rad = gaze_rad - neutral_rad
-    far_rad = float(np.hypot(*off_rad))
-    learnt: Doubles = neutral_rad + off_rad * min(1.0, speed_rad_s * dt_s / max(far_rad, 1e-9))
-    return learnt
 
 
 def _at(angle_rad: float) -> float:

@@ -7,7 +7,8 @@ import logging
 import math
 import os
 import struct
-from contextlib import closing
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.data import archive_kind
 from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, NO_SOUND, Doubles, Floats
 
 if TYPE_CHECKING:
     import soundfile
@@ -29,7 +30,6 @@ HIGHEST_RATE_HZ: Final = 384_000
 LOUDEST: Final = 8.0  # full scale is 1; a file that goes beyond this was written in another unit
 _BLOCK: Final = 65_536  # samples of a file at once
 _UNBOUNDED: Final = ("FLOAT", "DOUBLE")  # sample formats that hold more than full scale, and NaN
-_NONE: Final = np.zeros(0, dtype=np.float32)
 _NO_SIZE: Final = 0x7FFF0000  # of a WAV file: programs that write to a pipe put 0, or this or more
 _HEAD: Final = 65_536  # bytes in which the samples of a WAV file begin
 _LOST: Final = 0.3  # of the loudest channel's energy: less left in the mean is a voice that is lost
@@ -58,7 +58,7 @@ class Downmix:
         self.decided = False
         self.line = ""
 
-    def __call__(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, samples: Floats) -> Floats:
         """Return (n,) of finite samples (n,) or (n, channels)."""
         if samples.ndim == 1:
             return samples
@@ -67,7 +67,7 @@ class Downmix:
         mixed = samples.mean(axis=1, dtype=np.float64) if self._weights is None else samples @ self._weights
         return mixed.astype(np.float32)
 
-    def study(self, samples: NDArray[np.float32]) -> None:
+    def study(self, samples: Floats) -> None:
         """Decide by these samples (n, channels) too."""
         channels = samples.shape[1]
         if len(self._moments) != channels:
@@ -109,13 +109,12 @@ class Resampler:
 
             self._stream = soxr.ResampleStream(rate_hz, AUDIO_HZ, 1, dtype="float32", quality="HQ")
 
-    def push(self, samples: NDArray[np.float32], last: bool = False) -> Floats:
+    def push(self, samples: Floats, last: bool = False) -> Floats:
         """Return (m,) mono, -1..1, of samples (n,) or (n, channels); some come out later, the rest with `last`."""
         mixed = self._mix(samples)
         if self._stream is not None:
             mixed = self._stream.resample_chunk(np.ascontiguousarray(mixed), last=last)
-        clipped: Floats = np.clip(mixed, -1.0, 1.0)
-        return clipped
+        return np.clip(mixed, -1.0, 1.0)
 
 
 class AudioFile:
@@ -148,7 +147,7 @@ class AudioFile:
             self._file.close()
             self._file = _opened(self.path)
         self._resampler = Resampler(self._file.samplerate, self._mix)
-        self._ready = _NONE
+        self._ready = NO_SOUND
         self._over = False
 
     def read(self, n: int) -> Floats:
@@ -195,8 +194,10 @@ def _open(path: Path) -> soundfile.SoundFile:
 def _opened(path: Path) -> soundfile.SoundFile:
     import soundfile
 
-    if path.is_dir() or not path.exists():
-        raise ConfigError(f"{path}: " + ("is a folder, not a sound file" if path.is_dir() else "no such file"))
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder, not a sound file")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file")
     if not path.is_file():
         raise ConfigError(f"{path}: is a pipe or a device: sound is read from files; write it to one first")
     try:
@@ -205,10 +206,10 @@ def _opened(path: Path) -> soundfile.SoundFile:
         place = os.fsencode(path) if os.name == "posix" else str(path)  # the library would not encode every path
         return soundfile.SoundFile(_whole_wav(path, head) or place)
     except (soundfile.SoundFileError, OSError, TypeError, ValueError) as error:
-        kind = archive_kind(head)
-        what = f"is an archive ({kind}): unpack it first" if kind else "not a sound file that can be read"
-        more = "" if kind else f" (WAV, FLAC, OGG, MP3, AIFF; for others: ffmpeg -i {path.name} {path.stem}.wav)"
-        raise ConfigError(f"{path}: {what}{more}") from error
+        if kind := archive_kind(head):
+            raise ConfigError(f"{path}: is an archive ({kind}): unpack it first") from error
+        known = f"WAV, FLAC, OGG, MP3, AIFF; for others: ffmpeg -i {path.name} {path.stem}.wav"
+        raise ConfigError(f"{path}: not a sound file that can be read ({known})") from error
 
 
 def _whole_wav(path: Path, head: bytes) -> io.BytesIO | None:
@@ -251,6 +252,18 @@ def check_scale(name: str, samples: NDArray[Any]) -> None:
     peak = float(np.abs(samples).max(initial=0.0, where=np.isfinite(samples)))
     if peak > LOUDEST:
         raise InputError(f"{name}: holds samples up to {peak:g}, full scale is 1: divide them (16-bit: by 32768)")
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables while a library of sound reads them, and restore them. Not for several threads."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def energy_db(samples: Floats) -> float:

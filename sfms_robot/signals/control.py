@@ -37,32 +37,25 @@ def control_track(events: Sequence[ListenerEvent], first: int, frames: int) -> F
     out = np.zeros((frames, len(COLUMNS)), np.float32)
     begin_s, over_s = (first + 1) * FRAME_S, (first + frames) * FRAME_S
     told = [one for one in events if one.kind in KINDS and one.end_s > begin_s and one.start_s <= over_s + 1e-9]
-    if not told:
-        return out
     times_s = (first + 1 + np.arange(frames)) * FRAME_S
     for event in sorted(told, key=lambda one: one.start_s):
         since_s = times_s - event.start_s
         rows = np.flatnonzero((since_s >= -1e-9) & (since_s < event.duration_s - 1e-9))
-        if len(rows):
-            within = slice(int(rows[0]), int(rows[-1]) + 1)
-            _tell(out, within, np.maximum(since_s[within], 0.0), event)
+        since_s = np.maximum(since_s[rows], 0.0)
+        over = np.minimum(since_s / event.duration_s, 1.0)
+        at = _EACH * KINDS.index(event.kind)
+        out[rows, at] = 1.0
+        out[rows, at + 1] = np.minimum(np.log1p(since_s / _SOFT_S), BOUND)
+        out[rows, at + 2] = over
+        out[rows, at + 3] = min(abs(event.size) / FULL_SIZE.get(event.kind, 1.0), BOUND)
+        if event.kind in SWINGING:
+            # Behind the columns of all kinds: where in its swing the head is.
+            at = _EACH * len(KINDS) + 2 * SWINGING.index(event.kind)
+            turn = 2 * np.pi * event.swings * over
+            out[rows, at], out[rows, at + 1] = np.sin(turn), np.cos(turn)
     return out
-
-
-def _tell(out: Floats, rows: slice, since_s: np.typing.NDArray[np.float64], event: ListenerEvent) -> None:
-    over = np.minimum(since_s / event.duration_s, 1.0)
-    size = min(abs(event.size) / FULL_SIZE.get(event.kind, 1.0), BOUND)
-    at = _EACH * KINDS.index(event.kind)
-    out[rows, at] = 1.0
-    out[rows, at + 1] = np.minimum(np.log1p(since_s / _SOFT_S), BOUND)
-    out[rows, at + 2] = over
-    out[rows, at + 3] = size
-    if event.kind in SWINGING:
-        at = _EACH * len(KINDS) + 2 * SWINGING.index(event.kind)
-        turn = 2 * np.pi * event.swings * over
-        out[rows, at], out[rows, at + 1] = np.sin(turn), np.cos(turn)
 
 
 def since_s(told: Floats) -> Doubles:
     """Return the elapsed time [s] of events from column `since` (...,), at most 10.7."""
-    return np.asarray(_SOFT_S * np.expm1(told.astype(np.float64)))
+    return _SOFT_S * np.expm1(told.astype(np.float64))

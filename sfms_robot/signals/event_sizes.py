@@ -70,7 +70,7 @@ def returned(smiles: Doubles, rng: np.random.Generator) -> Doubles:
     """Return the smiles (L, 3) that answer those of another person (K, 3): start, end [s], size."""
     begins = smiles[:, 0] + [_log_normal(RETURN_S, rng) for _ in smiles]
     answers = np.stack([begins, smiles[:, 1] + RETURN_ENDS_S, RETURN_SIZE * smiles[:, 2]], axis=1)
-    return np.asarray(answers[rng.random(len(smiles)) < RETURNED], np.float64)
+    return answers[rng.random(len(smiles)) < RETURNED]
 
 
 def _log_normal(shape: tuple[float, float, float, float], rng: np.random.Generator) -> float:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles
 
 Event = tuple[float, float, float]
-Bools = NDArray[np.bool_]
 _NOD_RAD: Final = np.deg2rad(1.6)
 _BLINK, _SMILE = 0.35, 0.2
 _SHORTEST: Final = 16  # samples that the zero-phase filter needs
@@ -123,7 +122,12 @@ def find_peaks(values: Doubles, prominence: float, distance: int = 1) -> tuple[I
     The middle of a plateau is its peak. Of two that are too close the higher one stays, of equal ones the later.
     """
     peaks = _maxima(values)
-    peaks = peaks[_far_apart(peaks, values[peaks], distance)]
+    apart = np.ones(len(peaks), dtype=np.bool_)
+    for best in np.argsort(values[peaks])[::-1]:
+        if apart[best]:
+            apart &= np.abs(peaks - peaks[best]) >= distance
+            apart[best] = True
+    peaks = peaks[apart]
     prominences = _prominences(values, peaks)
     keep = prominences >= prominence
     return peaks[keep], prominences[keep]
@@ -166,8 +170,7 @@ def _once(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) -> Dou
         p = (s * s + low * high) / ((high - low) * s)  # low-pass prototype -> band-pass
         response = 1.0 / (p * p + np.sqrt(2) * p + 1.0)
     response[[0, -1]] = 0.0
-    passed: Doubles = np.fft.irfft(np.fft.rfft(values - values[0], size) * response, size)[: len(values)]
-    return passed
+    return np.fft.irfft(np.fft.rfft(values - values[0], size) * response, size)[: len(values)]
 
 
 def _maxima(values: Doubles) -> Indices:
@@ -181,16 +184,6 @@ def _maxima(values: Doubles) -> Indices:
     top = inner[(level[inner] > level[inner - 1]) & (level[inner] > level[inner + 1])]
     middles: Indices = (starts[top] + ends[top]) // 2
     return middles
-
-
-def _far_apart(peaks: Indices, heights: Doubles, distance: int) -> NDArray[np.bool_]:
-    keep = np.ones(len(peaks), dtype=np.bool_)
-    for best in np.argsort(heights)[::-1]:
-        if keep[best]:
-            near = np.abs(peaks - peaks[best]) < distance
-            near[best] = False
-            keep[near] = False
-    return keep
 
 
 def _prominences(values: Doubles, peaks: Indices) -> Doubles:

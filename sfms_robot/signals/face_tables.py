@@ -216,9 +216,9 @@ def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
     whole_s += 86_400.0 * np.cumsum(np.diff(whole_s, prepend=whole_s[0]) < -43_200)  # a take across midnight
     counts = _counts_a_second(file, name, whole_s, frames)
     if not any(";" in cell for cell in cells):
-        return np.asarray(whole_s + frames / counts)
+        return whole_s + frames / counts
     minute = whole_s // 60  # every one but each tenth begins with count 2, of 60 with count 4
-    return np.asarray((whole_s * counts + frames - counts // 15 * (minute - minute // 10)) * 1.001 / counts)
+    return (whole_s * counts + frames - counts // 15 * (minute - minute // 10)) * 1.001 / counts
 
 
 def _counts_a_second(file: Path, name: str, whole_s: Doubles, frames: Doubles) -> int:

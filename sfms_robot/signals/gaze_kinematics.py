@@ -130,8 +130,8 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
     since_s, left_s = state.since_s + FRAME_S, max(0.0, state.left_s - FRAME_S)
     part = minimum_jerk(min(1.0, since_s / state.shift_s))
     goal = head_share(target, state.share)
-    yaw = _towards(state.head[0], goal[0], state.head_left_s, FRAME_S)
-    pitch = _towards(state.head[1], goal[1], state.head_left_s, FRAME_S)
+    yaw = _towards(state.head[0], goal[0], state.head_left_s)
+    pitch = _towards(state.head[1], goal[1], state.head_left_s)
     head = (yaw[0] + body[0], pitch[0] + body[1])
     begun, spot, drift = state.from_rad, state.spot_rad, state.drift_rad_s
     pan = begun[0] + part * (target[0] + spot[0] + drift[0] * since_s - begun[0]) - head[0]
@@ -145,7 +145,9 @@ def _step(target: Pair, body: Pair, state: GazeState) -> tuple[tuple[float, ...]
         head=(yaw, pitch),
         head_left_s=max(0.0, state.head_left_s - FRAME_S),
     )
-    return (_ROLL * yaw[0], pitch[0], yaw[0]), _eyes(pan, tilt), after
+    left, right = max(0.0, pan) / EYE_PAN_RAD, max(0.0, -pan) / EYE_PAN_RAD
+    down, up = max(0.0, tilt) / EYE_TILT_RAD, max(0.0, -tilt) / EYE_TILT_RAD
+    return (_ROLL * yaw[0], pitch[0], yaw[0]), (down, right, left, up, down, left, right, up), after
 
 
 def _aimed(target: Pair, state: GazeState) -> GazeState:
@@ -194,25 +196,19 @@ def head_share(target_rad: Pair, share: float) -> Pair:
     return part * target_rad[0], _TILT_SHARE * part * target_rad[1]
 
 
-def _towards(axis: Axis, goal: float, left_s: float, dt_s: float) -> Axis:
-    """Return angle, speed and acceleration `dt_s` later on the minimum-jerk path that rests at `goal` in `left_s`."""
-    if left_s <= dt_s + 1e-9:
+def _towards(axis: Axis, goal: float, left_s: float) -> Axis:
+    """Return angle, speed and acceleration a frame later on the minimum-jerk path that rests at `goal` in `left_s`."""
+    if left_s <= FRAME_S + 1e-9:
         return goal, 0.0, 0.0
     x, v, a = axis
     d, v_t, a_t = goal - x, v * left_s, a * left_s**2
     c3, c4, c5 = (20 * d - 12 * v_t - 3 * a_t) / 2, (-30 * d + 16 * v_t + 3 * a_t) / 2, (12 * d - 6 * v_t - a_t) / 2
-    s = dt_s / left_s
+    s = FRAME_S / left_s
     return (
         x + s * (v_t + s * (a_t / 2 + s * (c3 + s * (c4 + s * c5)))),
         (v_t + s * (a_t + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / left_s,
         (a_t + s * (6 * c3 + s * (12 * c4 + s * 20 * c5))) / left_s**2,
     )
-
-
-def _eyes(pan: float, tilt: float) -> tuple[float, ...]:
-    left, right = max(0.0, pan) / EYE_PAN_RAD, max(0.0, -pan) / EYE_PAN_RAD
-    down, up = max(0.0, tilt) / EYE_TILT_RAD, max(0.0, -tilt) / EYE_TILT_RAD
-    return down, right, left, up, down, left, right, up
 
 
 # --- Eye channels as angles and back: (yaw, pitch), yaw + to the head's left, pitch + down ----------------------------
@@ -267,5 +263,4 @@ class Jump:
     def at(self, times_s: Doubles) -> Doubles:
         """Return directions (N, 2) at (N,) instants."""
         share = ease((times_s - self.began_s) / self.duration_s)[:, None]
-        direction: Doubles = self.start_rad + share * (self.end_rad - self.start_rad)
-        return direction
+        return self.start_rad + share * (self.end_rad - self.start_rad)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
 
@@ -54,7 +53,7 @@ def log_mel_each(samples: Sequence[Floats], pasts: Sequence[Floats]) -> tuple[Fl
     return _rows(windows[0] if len(windows) == 1 else np.concatenate(windows)), after
 
 
-def _rows(windows: NDArray[np.float32]) -> Floats:
+def _rows(windows: Floats) -> Floats:
     """(rows, 400) -> (rows, 128). Each row is added up alone: the result never depends on how many come at once."""
     spectrum = np.fft.rfft(windows * _HANN, FFT)
     power = spectrum.real**2 + spectrum.imag**2
@@ -63,7 +62,7 @@ def _rows(windows: NDArray[np.float32]) -> Floats:
 
 
 def _mel(hz: Doubles | float) -> Doubles:
-    return np.asarray(2595.0 * np.log10(1.0 + np.asarray(hz, dtype=np.float64) / 700.0))
+    return 2595.0 * np.log10(1.0 + np.asarray(hz, dtype=np.float64) / 700.0)
 
 
 def triangles(edges: Doubles, places: Doubles) -> Doubles:

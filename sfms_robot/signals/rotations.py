@@ -81,8 +81,7 @@ def twist(matrix: Doubles, axis: int) -> Doubles:
     first, second = (axis + 1) % 3, (axis + 2) % 3
     sine = matrix[..., second, first] - matrix[..., first, second]
     cosine = matrix[..., first, first] + matrix[..., second, second]
-    angle: Doubles = np.arctan2(sine, cosine)
-    return angle
+    return np.arctan2(sine, cosine)
 
 
 def from_vector(vector: Doubles) -> Doubles:
@@ -106,8 +105,7 @@ def angle_between(one: Doubles, other: Doubles) -> Doubles:
 
 def wrapped(angle_rad: Doubles) -> Doubles:
     """Return the same angle within -pi..pi."""
-    out: Doubles = (angle_rad + np.pi) % (2 * np.pi) - np.pi
-    return out
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def seen_from(body_yaw_rad: ArrayLike, poses: Doubles) -> Doubles:

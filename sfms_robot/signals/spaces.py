@@ -87,21 +87,6 @@ SPACES: Final[Mapping[str, Space]] = {
 }
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """Frames of a space in our terms.
-
-    Attributes:
-        motion: (N, 58).
-        jaw_rad: (N, 3) axis-angle in our axes, + about y lowers the chin, or None: the space has no jaw.
-        missing: one line about a part that could not be shown, or None.
-    """
-
-    motion: Floats
-    jaw_rad: Floats | None
-    missing: str | None
-
-
 def decode(
     frames: Floats | Doubles,
     space: str,
@@ -109,9 +94,10 @@ def decode(
     neutral: Doubles | None = None,
     metres_per_unit: float | None = None,
     flame: FlameMatrix | None = None,
-) -> Decoded:
-    """Return frames (N, dim) of the named space as our motion.
+) -> tuple[Floats, Floats | None]:
+    """Return frames (N, dim) of the named space as our motion (N, 58), and the jaw (N, 3) of a space that has one.
 
+    The jaw is axis-angle in our axes, + about y lowers the chin. `limitation` says what cannot be shown.
     neutral (dim,): the person's face at rest; by default the space's own, with the translation's median. Blendshapes
     are clipped to 0..1. Raises ConfigError for an unknown space or a flame matrix where it has no meaning, and
     ValueError for frames that are not (N, dim) and finite.
@@ -137,13 +123,13 @@ def decode(
     if known.jaw is None:
         shapes = reorder(values[:, known.expression], "faceverse")
         motion[:, SHAPES] = np.minimum(np.maximum(shapes, 0.0), 1.0)
-        return Decoded(motion.astype(np.float32), None, None)
+        return motion.astype(np.float32), None
     jaw_rad = values[:, known.jaw] @ axes.T
     jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
     if flame is not None:
         motion[:, SHAPES] = flame.solve(values[:, known.expression], jaw_open)
     motion[:, SHAPES][:, _JAW] = jaw_open
-    return Decoded(motion.astype(np.float32), jaw_rad.astype(np.float32), limitation(space, flame))
+    return motion.astype(np.float32), jaw_rad.astype(np.float32)
 
 
 def encode(
@@ -343,12 +329,14 @@ _SHAPE_OF: Final[Mapping[str, str]] = {
 _MOST_NAMED: Final = 8
 
 _ANGLES: Final = slice(0, 3)
+_PARTS: Final = (3, 3, len(BLENDSHAPES))  # angles, place, shapes: channels of each
 _MOST_TURN_RAD: Final = 2.0  # further than a head turns; the same number of degrees is a small movement
 _FASTEST_RAD_S: Final = 4.0  # on average; a head that is shaken fast reaches 3
 _RARE: Final = 0.05  # share of rows that a tracker may get wrong
 _DECIDED_S: Final = 1.0
 _WINDOW: Final = 256  # rows kept of the last second
 _SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped
+_MOST_MOVED_M: Final = 10.0
 
 
 @lru_cache(maxsize=1024)
@@ -429,13 +417,22 @@ def units_of(motion: Floats | Doubles, times_s: Doubles) -> FaceUnits:
     return FaceUnits(math.pi / 180 if degrees else 1.0, 0.01 if percent else 1.0)
 
 
-def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | None:
-    """Return what is wrong with a face (58,) in our units: one line that names the channel, or None.
+@lru_cache(maxsize=8)
+def face_bounds(turn_rad: float = _MOST_TURN_RAD) -> tuple[Doubles, Doubles]:
+    """Return the least and the most (58,) of a face in our units, not to be changed; `turn_rad`: the largest angle."""
+    low, high = _SHAPE_RANGE
+    least, most = (-turn_rad, -_MOST_MOVED_M, low), (turn_rad, _MOST_MOVED_M, high)
+    return np.repeat(least, _PARTS), np.repeat(most, _PARTS)
 
-    turn_rad: the largest angle.
-    """
-    low = np.array([-turn_rad] * 3 + [-10.0] * 3 + [_SHAPE_RANGE[0]] * len(BLENDSHAPES))
-    high = np.array([turn_rad] * 3 + [10.0] * 3 + [_SHAPE_RANGE[1]] * len(BLENDSHAPES))
+
+def expected_unit(place: int) -> str:
+    """Return what is expected of a channel, and in what a value beyond its bounds probably is."""
+    return ("radians (in degrees?)", "metres (in cm or mm?)", "0 to 1 (in percent?)")[(place > 2) + (place > 5)]
+
+
+def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | None:
+    """Return what is wrong with a face (58,) in our units: one line that names the channel, or None."""
+    low, high = face_bounds(turn_rad)
     inside = (motion >= low) & (motion <= high)  # NaN is in no range
     if inside.all():
         return None
@@ -443,8 +440,7 @@ def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | 
     value, name = float(motion[place]), CHANNELS[place]
     if not math.isfinite(value):
         return f"{name} is not finite"
-    expected = ("radians (in degrees?)", "metres (in cm or mm?)", "0 to 1 (in percent?)")[(place > 2) + (place > 5)]
-    return f"{name}: expected {expected}, got {value:g}"
+    return f"{name}: expected {expected_unit(place)}, got {value:g}"
 
 
 class LiveUnits:

@@ -33,6 +33,7 @@ from sfms_robot.frames import (
     Doubles,
     Floats,
 )
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.face_tables import (
     csv_cells,
     csv_numbers,
@@ -42,7 +43,7 @@ from sfms_robot.signals.face_tables import (
     row_times,
     time_column,
 )
-from sfms_robot.signals.spaces import channel_of, pose_of, units_of, used_line
+from sfms_robot.signals.spaces import channel_of, expected_unit, face_bounds, pose_of, units_of, used_line
 
 logger = logging.getLogger(__name__)
 
@@ -60,14 +61,7 @@ _NOT_NEEDED: Final = re.compile(r"(left|right)eye(yaw|pitch|roll)|blendshapecoun
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
 _ANGLES: Final = ("roll", "pitch", "yaw")
 _PLACE: Final = slice(CHANNEL_INDEX["x"], CHANNEL_INDEX["z"] + 1)
-# Lowest and highest value, and the problem of one beyond: most likely it is in another unit.
-_RANGES: Final[Mapping[str, tuple[float, float, str]]] = {
-    **dict.fromkeys(
-        _ANGLES, (-2 * math.pi, 2 * math.pi, "is more than a turn: in degrees? (_deg at the column's name)")
-    ),
-    **dict.fromkeys(("x", "y", "z"), (-10.0, 10.0, "is more than 10 m: in cm or mm? (_cm at the column's name)")),
-}
-_SHAPE_RANGE: Final = (-0.5, 2.0, "is not a blendshape (0 to 1)")  # a tracker may overshoot 0..1, and is clipped
+_MOST_TURN_RAD: Final = 2 * math.pi
 _TIME_EPS_S: Final = 1e-6
 
 
@@ -161,10 +155,6 @@ def resample(track: Track, rate_hz: float = FRAME_HZ, start_s: float = 0.0) -> T
     grid_s = start_s + np.arange(count) / rate_hz
     if not len(track.times_s) or not count:
         return Track(grid_s, np.full((count, MOTION_DIM), np.nan, dtype=np.float32), track.known)
-    return Track(grid_s, _interpolated(track, grid_s, 1.0 / rate_hz), track.known)
-
-
-def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
     times_s, last = track.times_s, len(track.times_s) - 1
     after = np.clip(np.searchsorted(times_s, grid_s - _TIME_EPS_S), 0, last)
     before = np.where(times_s[after] <= grid_s + _TIME_EPS_S, after, np.maximum(after - 1, 0))
@@ -174,12 +164,12 @@ def _interpolated(track: Track, grid_s: Doubles, interval_s: float) -> Floats:
     out = np.where(weight <= 0, low, low + weight * (high - low))
     outside = (grid_s < times_s[0] - _TIME_EPS_S) | (grid_s > times_s[-1] + _TIME_EPS_S)
     out[outside | (gap_s > _LONGEST_GAP_S)] = np.nan
-    first = np.searchsorted(times_s, grid_s - interval_s + _TIME_EPS_S)
+    first = np.searchsorted(times_s, grid_s - 1.0 / rate_hz + _TIME_EPS_S)
     end = np.searchsorted(times_s, grid_s + _TIME_EPS_S)
     for row in np.flatnonzero((end > first) & np.isfinite(out[:, 0])):
         window = track.motion[first[row] : end[row], BLINKS]
         out[row, BLINKS] = np.fmax(out[row, BLINKS], np.fmax.reduce(window, axis=0))
-    return out.astype(np.float32)
+    return Track(grid_s, out.astype(np.float32), track.known)
 
 
 # --- the parts of reading ---------------------------------------------------------------------------------------
@@ -249,14 +239,16 @@ def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: _Colum
 
 
 def _check_ranges(file: Path, header: Sequence[str], rows: _Rows, motion: Doubles, columns: _Columns) -> None:
-    """Raise ConfigError for a value beyond its range, with row and column."""
-    for channel, column in columns.items():
-        low, high, problem = _RANGES.get(channel, _SHAPE_RANGE)
-        values = motion[:, CHANNEL_INDEX[channel]]
-        outside = np.flatnonzero((values < low) | (values > high))
-        if len(outside):
-            row, place = int(outside[0]), column.place
-            raise ConfigError(f"{file}: row {row + 2}, column {header[place]} = {rows[row][place].strip()} {problem}")
+    """Raise ConfigError for a value beyond its bounds, with row and column: most likely it is in another unit."""
+    low, high = face_bounds(_MOST_TURN_RAD)
+    outside = np.argwhere((motion < low) | (motion > high)).tolist()
+    if outside:
+        row, place = outside[0]
+        column = columns[CHANNELS[place]].place
+        cell, unit = rows[row][column].strip(), "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
+        raise ConfigError(
+            f"{file}: row {row + 2}, column {header[column]}: expected {expected_unit(place)}, got {cell}{unit}"
+        )
 
 
 @dataclass(frozen=True)
@@ -285,6 +277,4 @@ def folder_takes(folder: Path) -> list[Take]:
 
 def stretches(motion: Floats, name: str) -> list[Take]:
     """Return the parts of `motion` (N, 58) without gaps (rows that are not finite)."""
-    known = np.isfinite(motion).all(axis=1)
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-    return [Take(name, motion[first:last]) for first, last in zip(ends[::2], ends[1::2], strict=True)]
+    return [Take(name, motion[first:end]) for first, end in runs(np.isfinite(motion).all(axis=1))]

@@ -17,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, address_text, host_and_p
 from sfms_robot.errors import NOTE, ConfigError, PacketError, PortError
 from sfms_robot.frames import (
     BLENDSHAPES,
-    CHANNEL_INDEX,
+    BLINKS,
     CHANNELS,
     MOTION_DIM,
     POSE,
@@ -38,12 +39,11 @@ from sfms_robot.frames import (
 )
 from sfms_robot.signals.rotations import angles_of, rotation
 from sfms_robot.signals.spaces import LiveUnits, beyond
-from sfms_robot.sources.live_voice import SourcePart
+from sfms_robot.sources.live_voice import Clock, SourcePart
 
 logger = logging.getLogger(__name__)
 
 _OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
-_BLINKS: Final = [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]
 _WAITING: Final = 256  # faces; the newest are kept
 REMEMBERED_S: Final = 120.0
 AWAY_S: Final = 10.0
@@ -108,7 +108,7 @@ class LiveFace(SourcePart):
     signs: (6,) factors of the pose channels; None: 1.
     """
 
-    def __init__(self, signs: Floats | None = None, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, signs: Floats | None = None, now: Clock = time.monotonic) -> None:
         super().__init__(now)
         self._lock = threading.Lock()
         self._signs: Floats = np.ones(len(POSE_CHANNELS), dtype=np.float32) if signs is None else signs
@@ -141,7 +141,7 @@ class LiveFace(SourcePart):
             if seen:
                 seen_s, newest, place_m = seen[-1]
                 motion = newest.copy()
-                motion[_BLINKS] = np.max([each[_BLINKS] for _, each, _ in seen], axis=0)
+                motion[BLINKS] = np.max([each[BLINKS] for _, each, _ in seen], axis=0)
                 motion[POSE] *= self._signs
                 # Learned in monotonic time: a start does not tear it apart.
                 face = FaceFrame.of(seen_s - self._origin_s, self._rest.relative(motion, seen_s))
@@ -194,7 +194,15 @@ class RestingFace:
         else:
             self._rest = self._estimate
         self._seen_s = time_s
-        return _relative(motion, self._rest)
+        # The pose as seen from the resting one, R0^T R, and the shapes above their resting level.
+        out, rest = np.zeros(MOTION_DIM, dtype=np.float32), self._rest
+        both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
+        at_rest, now = rotation(both[:, :3])
+        out[POSE][:3] = angles_of(at_rest.T @ now)
+        out[POSE][3:] = at_rest.T @ (both[1, 3:] - both[0, 3:])
+        level = rest[SHAPES]
+        out[SHAPES] = np.clip((motion[SHAPES] - level) / (1.0 - level), 0.0, 1.0)
+        return out
 
 
 def _rest(samples: Floats) -> Floats:
@@ -205,18 +213,6 @@ def _rest(samples: Floats) -> Floats:
     rest[_MEDIANS] = ranked[middle, _MEDIANS]
     rest[SHAPES] = np.minimum(rest[SHAPES], _HIGHEST_REST)
     return rest
-
-
-def _relative(motion: Floats, rest: Floats) -> Floats:
-    """Return the pose seen from the resting one, R0^T R, and the shapes above their resting level."""
-    out = np.zeros(MOTION_DIM, dtype=np.float32)
-    both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
-    at_rest, now = rotation(both[:, :3])
-    out[POSE][:3] = angles_of(at_rest.T @ now)
-    out[POSE][3:] = at_rest.T @ (both[1, 3:] - both[0, 3:])
-    level = rest[SHAPES]
-    out[SHAPES] = np.clip((motion[SHAPES] - level) / (1.0 - level), 0.0, 1.0)
-    return out
 
 
 # --- a face that arrives as UDP datagrams, of any protocol -----------------------------------------------------------
@@ -253,14 +249,6 @@ def _bound(kind: str, host: str, port: int) -> socket.socket:
         raise PortError(f"{where}: {error.strerror or error}") from error
     bound.setblocking(False)
     return bound
-
-
-def _ask_for_stamps(of: socket.socket) -> bool:
-    try:
-        of.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-    except OSError:
-        return False
-    return True
 
 
 def _age_s(extra: list[tuple[int, int, bytes]], wall_s: float) -> float:
@@ -326,7 +314,6 @@ class UdpSight(LiveFace):
         self,
         kind: str,
         argument: str,
-        usual_port: int,
         decoder: Decoder,
         hint: Callable[[str, int, str], str],
         units: LiveUnits | None = None,
@@ -334,11 +321,13 @@ class UdpSight(LiveFace):
         place, signs = parse_face_argument(kind, argument)
         super().__init__(signs)
         self._kind, self._decoder, self._units = kind, decoder, units
-        self._socket = _bound(kind, *parse_endpoint(kind, place, usual_port))
+        self._socket = _bound(kind, *parse_endpoint(kind, place))
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
-        self._stamped = sys.platform == "linux" and _ask_for_stamps(self._socket)
+        if sys.platform == "linux":
+            with suppress(OSError):  # a system without stamps: a packet counts from when it is read
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         host, port = self.address
-        wider = f"--face {kind}:{ANY[0]}" + ("" if port == usual_port else f":{port}")
+        wider = f"--face {kind}:{ANY[0]}" + ("" if port == USUAL_PORTS[kind] else f":{port}")
         self._hint: str | None = hint(host, port, wider if is_loopback(host) else "")
         self._sender: Address | None = None
         self._before: Address | None = None  # the sender's last port, where it has changed
@@ -411,7 +400,7 @@ class UdpSight(LiveFace):
                     data, sender = self._socket.recvfrom(LONGEST_PACKET)
                     age_s = 0.0
                 else:
-                    data, extra, _, sender = self._socket.recvmsg(LONGEST_PACKET, 64 if self._stamped else 0)
+                    data, extra, _, sender = self._socket.recvmsg(LONGEST_PACKET, 64)
                     age_s = _age_s(extra, wall_s)
             except BlockingIOError:
                 return
@@ -483,15 +472,15 @@ class UdpSight(LiveFace):
             self._said.add(key)
 
 
-def parse_endpoint(kind: str, place: str, port: int) -> tuple[str, int]:
+def parse_endpoint(kind: str, place: str) -> tuple[str, int]:
     """Return host and port of PORT, HOST:PORT ([HOST]:PORT for IPv6) or an address alone.
 
-    Loopback and `port` are what PLACE leaves out. Raises ConfigError.
+    Loopback and the kind's usual port are what PLACE leaves out. Raises ConfigError.
     """
     if not place:
-        return LOOPBACK, port
+        return LOOPBACK, USUAL_PORTS[kind]
     if is_address(place.strip("[]")):
-        return place.strip("[]"), port
+        return place.strip("[]"), USUAL_PORTS[kind]
     found = host_and_port(place, least=1)
     if found is None:
         choices = f"{kind}, {kind}:PORT, {kind}:HOST:PORT, {kind}:ADDRESS; PORT 1 to {HIGHEST_PORT}"

@@ -26,9 +26,8 @@ from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, Floats
 from sfms_robot.signals.spaces import LiveUnits
-from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
+from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
-PORT: Final = USUAL_PORTS["live-link"]
 VERSION: Final = 6
 LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began again
 
@@ -225,7 +224,7 @@ def open_live_link(argument: str) -> UdpSight:
     The log says what to type for a phone, which is another machine, and the address for its app. Raises as
     `UdpSight`.
     """
-    return UdpSight("live-link", argument, PORT, LiveLinkDecoder(), _hint, LiveUnits())
+    return UdpSight("live-link", argument, LiveLinkDecoder(), _hint, LiveUnits())
 
 
 def _hint(host: str, port: int, wider: str) -> str:

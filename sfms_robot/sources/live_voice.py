@@ -16,6 +16,7 @@ placed again where it is `UNSETTLED_S` off.
 
 from __future__ import annotations
 
+import logging
 import math
 import statistics
 import threading
@@ -27,11 +28,12 @@ from numbers import Real
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, Floats
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix
+
+logger = logging.getLogger(__name__)
 
 GAP_S: Final = 0.15
 SETTLE_S: Final = 1.0
@@ -40,13 +42,15 @@ PULL_S: Final = 1.0  # time constant of a correction
 LARGEST_PULL: Final = 0.01  # of the rate: a sixth of a semitone
 KEPT_FRAMES: Final = 50  # at most, ahead of the one that is asked for
 _LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
-_NONE: Final = np.zeros(0, dtype=np.float32)
 
 BIN_S: Final = 1.0  # the least late callback of every second is kept
 BINS: Final = 64  # so the line follows a card that warms up within a minute
 LEAST_SPAN_S: Final = 8.0  # of fewer seconds jitter would say more of the rate than the card does
 LOST_S: Final = 0.02  # when the least late of a whole second is this late, samples were lost
 LARGEST_SKEW: Final = 5e-3  # more is another rate than the one that was said
+
+
+Clock = Callable[[], float]  # in seconds
 
 
 class SourcePart:
@@ -59,7 +63,7 @@ class SourcePart:
     duration_s: float | None = None
     latency_s: float = 0.0
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now: Clock = time.monotonic) -> None:
         self._now = now
 
     def start(self, origin_s: float) -> None:
@@ -72,10 +76,10 @@ class SourcePart:
         """Give back what is open. Idempotent."""
 
 
-def window(first: int, samples: Floats, begin: int, count: int) -> Floats:
-    """Return `count` samples from place `begin` on, of `samples` that begin at place `first`; silence elsewhere."""
-    out = np.zeros(count, np.float32)
-    start, end = max(first, begin), min(first + len(samples), begin + count)
+def window(first: int, samples: Floats, begin: int) -> Floats:
+    """Return the (640,) from place `begin` on, of `samples` that begin at place `first`; silence elsewhere."""
+    out = np.zeros(FRAME_SAMPLES, np.float32)
+    start, end = max(first, begin), min(first + len(samples), begin + FRAME_SAMPLES)
     if start < end:
         out[start - begin : end - begin] = samples[start - first : end - first]
     return out
@@ -126,9 +130,16 @@ class SampleClock:
         self._offset_s = below_s if self._offset_s is None else min(self._offset_s, below_s)
         if self._bin is None or below_s < self._bin[1] - self.skew * self._bin[0]:
             self._bin = point
-        if x_s >= self._bin_ends_s:
-            self._least_of_bin(self._bin)
-            self._bin, self._bin_ends_s = None, x_s + BIN_S
+        if x_s < self._bin_ends_s:
+            return
+        least, self._bin, self._bin_ends_s = self._bin, None, x_s + BIN_S
+        if self.lateness_s(round(least[0] * self._nominal_hz), sum(least)) > LOST_S:
+            self._least.clear()
+        self._least.append(least)
+        if least[0] - self._least[0][0] >= LEAST_SPAN_S:
+            (x0, r0), (x1, r1) = _edge_below_middle(list(self._least))
+            self.skew = min(max((r1 - r0) / (x1 - x0), -LARGEST_SKEW), LARGEST_SKEW)
+        self._offset_s = min(r - self.skew * x for x, r in self._least)
 
     def lateness_s(self, count: int, captured_s: float) -> float:
         """Return how late such a callback would be; below 0: earlier than the line allows. 0 for the first."""
@@ -143,17 +154,6 @@ class SampleClock:
     def count_at(self, time_s: float) -> float:
         """Return how many samples had been captured then."""
         return (time_s - self.time_s(0)) * self.rate_hz
-
-    def _least_of_bin(self, point: _Point) -> None:
-        if self.lateness_s(round(point[0] * self._nominal_hz), sum(point)) > LOST_S:
-            self._least.clear()
-        self._least.append(point)
-        if len(self._least) == 1 or self._least[-1][0] - self._least[0][0] < LEAST_SPAN_S:
-            self._offset_s = min(r - self.skew * x for x, r in self._least)
-            return
-        (x0, r0), (x1, r1) = _edge_below_middle(list(self._least))
-        self.skew = min(max((r1 - r0) / (x1 - x0), -LARGEST_SKEW), LARGEST_SKEW)
-        self._offset_s = min(r - self.skew * x for x, r in self._least)
 
 
 def _edge_below_middle(points: list[_Point]) -> tuple[_Point, _Point]:
@@ -198,6 +198,7 @@ class Pace:
         self._least: deque[_Point] = deque(maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
         self._wait_s = self._widest_s = 0.0  # longest since the last burst, and before any
         self._bursts_s: deque[float] = deque(maxlen=BURSTS)
+        self._said = False
 
     def observe(self, piece_s: float, now_s: float) -> None:
         """Take in a piece that is handed over at `now_s`."""
@@ -227,6 +228,12 @@ class Pace:
             return f"sound comes in bursts, up to {self.apart_s * 1e3:.0f} ms apart: send it as it is recorded"
         return None
 
+    def warn_once(self, name: str) -> None:
+        """Log what is wrong with the pace of the source of that name, the first time."""
+        if not self._said and (problem := self.problem) is not None:
+            self._said = True
+            logger.warning("%s: %s (said once)", name, problem)
+
     @property
     def off(self) -> float | None:
         """Return the rate where it is not that of time, else None."""
@@ -254,7 +261,7 @@ class LiveVoice(SourcePart):
         mix: of its channels; `name` is that of the sound in its line.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic, name: str = "sound") -> None:
+    def __init__(self, now: Clock = time.monotonic, name: str = "sound") -> None:
         super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s: float | None = None
@@ -280,9 +287,7 @@ class LiveVoice(SourcePart):
             self._origin_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
             self._frames.clear()
 
-    def push(
-        self, samples: NDArray[np.float32], rate_hz: float, captured_s: float, arrived_s: float | None = None
-    ) -> None:
+    def push(self, samples: Floats, rate_hz: float, captured_s: float, arrived_s: float | None = None) -> None:
         """Take the next piece, (n,) or (n, channels), full scale 1.
 
         Args:
@@ -389,7 +394,7 @@ class LiveVoice(SourcePart):
 
     def _end_stream(self) -> None:
         if self._stream is not None:
-            self._write(self._stream.resample_chunk(_NONE, last=True), None)
+            self._write(self._stream.resample_chunk(NO_SOUND, last=True), None)
             self._stream = None
 
     def _write(self, samples: Floats, arrived_s: float | None) -> None:
@@ -408,8 +413,12 @@ class LiveVoice(SourcePart):
 
     def _measure(self, end_s: float, arrived_s: float) -> None:
         assert self._origin_s is not None
-        late_s = float(arrived_s) - self._origin_s - end_s
-        self.latency_s = max(late_s, self.latency_s - _LATENCY_FALLS_S, 0.0)
+        self.latency_s = latency_after(float(arrived_s) - self._origin_s - end_s, self.latency_s)
+
+
+def latency_after(late_s: float, latency_s: float) -> float:
+    """Return the latency after a frame that came `late_s`: never less, and falling slowly."""
+    return max(late_s, latency_s - _LATENCY_FALLS_S, 0.0)
 
 
 def check_rate(rate_hz: float) -> None:
@@ -418,7 +427,7 @@ def check_rate(rate_hz: float) -> None:
         raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
 
 
-def _finite(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+def _finite(samples: Floats) -> tuple[Floats, int]:
     """Return the samples, 0 for those that are not finite, and how many these are."""
     finite = np.isfinite(samples)
     not_finite = samples.size - int(np.count_nonzero(finite))

@@ -19,11 +19,11 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import NOTE
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, SILENCE, Floats
 from sfms_robot.ports import Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
-from sfms_robot.sources.live_voice import LiveVoice, window
+from sfms_robot.sources.live_voice import LiveVoice, latency_after, window
 from sfms_robot.sources.sound_devices import BLOCK_S, Capture, device_name
 from sfms_robot.sources.worker import SourceWorker
 
@@ -39,9 +39,6 @@ SAID_FRAMES: Final = 12  # of the robot's voice in a message: the worker may mis
 KEPT_FRAMES: Final = 50
 _ALIVE_S: Final = 0.1
 _NEW_SPEED_RAD_S: Final = 0.1  # a change of speed that is worth a message
-_LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
-_SILENCE: Final = np.zeros(FRAME_SAMPLES, dtype=np.float32)
-_SILENCE.flags.writeable = False
 
 
 # --- the worker's side -----------------------------------------------------------------------------------------------
@@ -60,7 +57,6 @@ class Recording:
     device: str
     flag: str
     reference: str | None = None
-    reference_flag: str = ""
     spoken: bool = False
 
 
@@ -112,7 +108,7 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
         mic = stack.enter_context(Capture.opened(recording.device, recording.flag))
         said = None
         if recording.reference is not None:
-            said = stack.enter_context(Capture.opened(recording.reference, recording.reference_flag))
+            said = stack.enter_context(Capture.opened(recording.reference, DEVICE_FLAG))
         reference = SpeechFrames() if recording.spoken else None if said is None else LiveVoice()
         front_end = FrontEnd(reference, mic.device.name)
         given = yield mic.device.name
@@ -155,7 +151,7 @@ class SpeechFrames:
 
     def __init__(self) -> None:
         self._first = 0  # sample of the loop
-        self._samples: Floats = _SILENCE[:0]
+        self._samples: Floats = SILENCE[:0]
 
     def start(self, origin_s: float) -> None:
         """Do nothing: they are counted from the origin already."""
@@ -169,7 +165,7 @@ class SpeechFrames:
         begin = index * FRAME_SAMPLES + ECHO_LATENCY_SAMPLES - self._first
         if begin + FRAME_SAMPLES > len(self._samples):
             return None
-        return window(0, self._samples, begin, FRAME_SAMPLES)
+        return window(0, self._samples, begin)
 
 
 class FrontEnd:
@@ -234,8 +230,8 @@ class FrontEnd:
 
     def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> MicrophoneFrame:
         """Return a frame without the robot's own voice: one in, one out, since the gate counts samples."""
-        own = None if self._reference is None else (_SILENCE if said is None else said)
-        (frame,) = self._gate.push(_SILENCE if mic is None else mic, own, self.speed_rad_s)
+        own = None if self._reference is None else (SILENCE if said is None else said)
+        (frame,) = self._gate.push(SILENCE if mic is None else mic, own, self.speed_rad_s)
         self._counts["voice_frames"] += frame.voice
         self._counts["own_voice_frames"] += own is not None and bool(own.any())
         self._counts["without_reference"] += own is not None and said is None
@@ -264,7 +260,7 @@ class Microphone:
         self._worker = worker
         self.own_voice = None if early_s is None else self._take_own_voice
         self._early = round((early_s or 0.0) * AUDIO_HZ)
-        self._own: deque[Floats] = deque([_SILENCE], maxlen=SAID_FRAMES)
+        self._own: deque[Floats] = deque([SILENCE], maxlen=SAID_FRAMES)
         self._origin_s: float | None = None
         self._frames: dict[int, MicrophoneFrame] = {}
         self.device = ""
@@ -279,7 +275,7 @@ class Microphone:
     @property
     def lost(self) -> bool:
         """It gave sound, and has stopped."""
-        return bool(self.device) and self._worker.statistics()["state"] in ("lost", "starting")
+        return self._worker.lost
 
     def start(self, origin_s: float) -> None:
         self._origin_s = origin_s
@@ -306,9 +302,9 @@ class Microphone:
 
         A voice that is to be known early is so much sooner in what is sent, with silence at its end.
         """
-        self._own.append(_SILENCE if said is None else said)
+        self._own.append(SILENCE if said is None else said)
         if self._origin_s is not None:
-            samples = np.concatenate([*self._own, _SILENCE[: self._early]])[self._early :]
+            samples = np.concatenate([*self._own, SILENCE[: self._early]])[self._early :]
             self._tell(self._origin_s, index + 1 - len(self._own), samples)
 
     def _tell(self, origin_s: float, first: int = 0, said: Floats | None = None) -> None:
@@ -350,7 +346,7 @@ class Microphone:
     def _take_in(self, heard: MicrophoneFrame, wanted: int) -> None:
         assert self._origin_s is not None
         late_s = heard.known_s - self._origin_s - (heard.index + 1) * FRAME_S
-        self.latency_s = max(late_s, self.latency_s - _LATENCY_FALLS_S, 0.0)
+        self.latency_s = latency_after(late_s, self.latency_s)
         if wanted <= heard.index < wanted + KEPT_FRAMES:
             self._frames[heard.index] = heard
         else:
@@ -403,7 +399,7 @@ def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
     """Open as `open_microphone`, without what `device` records of the robot's voice; return also that voice."""
     reference = device_name(device, DEVICE_FLAG)
-    microphone = _opened(_recording(argument, reference=reference, reference_flag=DEVICE_FLAG))
+    microphone = _opened(_recording(argument, reference=reference))
     return microphone, Loudspeaker(microphone, beside=True)
 
 

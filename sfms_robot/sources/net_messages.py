@@ -26,9 +26,9 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from sfms_robot.config.base import one_line
+from sfms_robot.config.base import PRINTABLE, one_line
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import MOTION_DIM, Floats
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
@@ -47,13 +47,7 @@ _REALTIME: Final = re.compile(rb'"type"\s*:\s*"((?:session|input_audio_buffer|co
 _FILES: Final = {b"RIFF": "a WAV file", b"OggS": "an Ogg file", b"fLaC": "a FLAC file", b"ID3\x04": "an MP3 file"}
 
 
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("expected printable characters")
-    return text
-
-
-_Text = Annotated[str, Field(max_length=64), AfterValidator(_printable)]
+_Text = Annotated[str, Field(max_length=64), PRINTABLE]
 
 
 class Hello(BaseModel):

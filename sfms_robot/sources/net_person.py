@@ -18,8 +18,8 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Final, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from sfms_robot.endpoint import LOOPBACK, address_text, host_and_port, is_loopba
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.live_face import LiveFace
-from sfms_robot.sources.live_voice import SourcePart
+from sfms_robot.sources.live_voice import Clock, SourcePart
 from sfms_robot.sources.net_messages import (
     FEEDS,
     MICROPHONE,
@@ -98,7 +98,7 @@ class Intake:
         counts: messages that came too late, and sound that came faster than time passes.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Clock) -> None:
         self.counts = dict.fromkeys(("old", "too_fast"), 0)
         self._now = now
         self._spare_s = _SPARE_S
@@ -156,10 +156,10 @@ class NetPerson:
         token: needed in a hello; None: not needed.
     """
 
-    def __init__(self, flag: str, host: str, port: int, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, flag: str, host: str, port: int, now: Clock = time.monotonic) -> None:
         self.now = now
         self._place = (host, port)
-        self._feeds: dict[str, NetVoice | NetSight | NetSpeech] = {}
+        self._feeds: dict[str, _NetPart] = {}
         self._feeders: dict[str, NetProgram] = {}
         self._clocks: dict[NetProgram, SenderClock] = {}
         self._heard_s: dict[str, float] = {}
@@ -180,7 +180,7 @@ class NetPerson:
 
     # --- from the run, in its threads ---
 
-    def join(self, name: str, part: NetVoice | NetSight | NetSpeech) -> None:
+    def join(self, name: str, part: _NetPart) -> None:
         """Give `part` what programs feed as `name`. Raises PortError when another one takes it already."""
         if name in self._feeds:
             raise PortError(f"{FLAGS[name]}: port {self.address[1]} is used by another run of this program")
@@ -310,7 +310,7 @@ class _NetPart(SourcePart):
     def __init__(self, argument: str | NetPerson) -> None:
         self.outlet = _person(FLAGS[self.feed], argument) if isinstance(argument, str) else argument
         super().__init__(self.outlet.now)
-        self.outlet.join(self.feed, cast(Any, self))
+        self.outlet.join(self.feed, self)
 
     def start(self, origin_s: float) -> None:
         self.outlet.start(origin_s)
@@ -364,9 +364,9 @@ class PageVisitor:
         voice, sight: the person, as sources.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self.voice = BrowserVoice(self, now)
-        self.sight = BrowserSight(self, now)
+    def __init__(self, now: Clock = time.monotonic) -> None:
+        self.now = now
+        self.voice, self.sight = BrowserVoice(self), BrowserSight(self)
         self._lock = threading.Lock()
         self._number: int | None = None
         self._feeds: frozenset[str] = frozenset()
@@ -423,8 +423,8 @@ class BrowserVoice(PushedVoice):
 
     _way = "--audio browser"
 
-    def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
-        super().__init__(now)
+    def __init__(self, visitor: PageVisitor) -> None:
+        super().__init__(visitor.now)
         self._visitor = visitor
 
     def statistics(self) -> Mapping[str, Any]:
@@ -434,8 +434,8 @@ class BrowserVoice(PushedVoice):
 class BrowserSight(LiveFace):
     """`ports.Sight` of a visitor. Their rest is learned while they are seen, as that of a person at a webcam."""
 
-    def __init__(self, visitor: PageVisitor, now: Callable[[], float]) -> None:
-        super().__init__(now=now)
+    def __init__(self, visitor: PageVisitor) -> None:
+        super().__init__(now=visitor.now)
         self._visitor = visitor
 
     def see(self, face: Floats | None, seen_s: float | None = None, attention: float | None = None) -> None:

@@ -25,7 +25,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting, SpeakerFrame
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    FRAME_HZ,
+    FRAME_S,
+    FRAME_SAMPLES,
+    NO_SOUND,
+    FaceFrame,
+    Floats,
+    Sighting,
+    SpeakerFrame,
+)
 from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.quantiles import Quantiles
@@ -39,7 +49,6 @@ LONGEST_WAIT_S: Final = 0.15
 FACE_S: Final = 0.25  # a face that is older counts as lost
 _EPS_FRAMES: Final = 1e-6
 _EPS_S: Final = 1e-6
-_NONE: Final = np.zeros(0, dtype=np.float32)
 
 
 class PairedSource:
@@ -131,7 +140,7 @@ class PairedSource:
     def _heard(self, index: int, now_s: float) -> Floats | None:
         """Return the voice of a frame, empty where it is given up; None: wait."""
         waited_s = max(0.0, now_s - (index + 1) / FRAME_HZ)
-        heard: Floats | None = _NONE
+        heard: Floats | None = NO_SOUND
         if self._voice is not None:
             own_voice = getattr(self._voice, "own_voice", None)
             if own_voice is not None and self._says[0] <= index:
@@ -142,7 +151,7 @@ class PairedSource:
         self._wait_ms.add(waited_s * 1e3)
         if heard is None:
             self._overruns += 1
-            return _NONE
+            return NO_SOUND
         return heard
 
     def _frame(self, index: int, heard: Floats, now_s: float) -> SpeakerFrame:
@@ -178,7 +187,7 @@ class JudgedSource:
         self._inner = inner
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
-        self._pace, self._said = Pace(), False
+        self._pace = Pace()
         self._given = 0
 
     def start(self, origin_s: float) -> None:
@@ -192,9 +201,7 @@ class JudgedSource:
             frames.append(self._judge.frame(self._given, given.audio, seen, given.agent_audio))
             self._given += 1
             self._pace.observe(FRAME_S, now_s)
-        if not self._said and (problem := self._pace.problem) is not None:
-            self._said = True
-            logger.warning("%s: %s (said once)", type(self._inner).__name__, problem)
+        self._pace.warn_once(type(self._inner).__name__)
         self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 
@@ -241,8 +248,8 @@ class FrameJudge:
         return SpeakerFrame(time_s, audio, face, own_audio, attention, place_m)
 
     def _samples(self, index: int, what: str, given: Floats) -> Floats:
-        samples = _NONE if np.shape(given) == (0,) else self._finite(index, what, given, (FRAME_SAMPLES,))
-        return _NONE if samples is None else np.clip(samples, -1.0, 1.0)
+        samples = NO_SOUND if np.shape(given) == (0,) else self._finite(index, what, given, (FRAME_SAMPLES,))
+        return NO_SOUND if samples is None else np.clip(samples, -1.0, 1.0)
 
     def _face(self, index: int, face: FaceFrame) -> FaceFrame | None:
         pose = self._finite(index, "face", face.pose, (6,))

@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
@@ -23,9 +23,9 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import NOTE
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, SILENCE, Floats
 from sfms_robot.signals.audio import at_positions
-from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, SampleClock, window
+from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, Clock, SampleClock, window
 from sfms_robot.sources.push import Spoken
 from sfms_robot.sources.sound_devices import STEREO, DeviceStream, SoundDevice, device_name
 from sfms_robot.sources.worker import SourceWorker
@@ -47,7 +47,6 @@ EARLY_S: Final = 0.02  # of the echo canceller: a device's time stamps may be of
 AHEAD_FRAMES: Final = 10  # that the worker knows beforehand, where they are known: the loop may be held up
 _KEPT: Final = AUDIO_HZ  # samples of what left
 _FADE: Final = np.linspace(1.0, 0.0, AUDIO_HZ // 200, dtype=np.float32)  # 5 ms: a voice that is cut off clicks
-_NONE: Final = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -265,14 +264,14 @@ class PlayedVoice:
     latency_s = 0.0
     early_s = EARLY_S
 
-    def __init__(self, loudspeaker: SourceWorker, spoken: Spoken, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, loudspeaker: SourceWorker, spoken: Spoken, now: Clock = time.monotonic) -> None:
         self._loudspeaker, self._spoken, self._now = loudspeaker, spoken, now
         self.device = ""
         self.delay_s = self._device_s = 0.0
         self._origin_s: float | None = None
         self._turn = threading.Lock()  # of sending to the loudspeaker
         self._next = 0  # frame of `spoken` that is taken next
-        self._leaves: tuple[int, Floats] = (0, _NONE)  # from which sample of the loop on, and what
+        self._leaves: tuple[int, Floats] = (0, NO_SOUND)  # from which sample of the loop on, and what
         self._speaks = False
         self._unsaid = 0
         self._told: Mapping[str, Any] = {}
@@ -289,7 +288,7 @@ class PlayedVoice:
         self._spoken.start(origin_s)
         with self._turn:
             self._origin_s = origin_s
-            self._next, self._leaves = 0, (round(self.delay_s * AUDIO_HZ), _NONE)
+            self._next, self._leaves = 0, (round(self.delay_s * AUDIO_HZ), NO_SOUND)
             self._tell()
 
     def take(self, index: int) -> Floats | None:
@@ -306,7 +305,7 @@ class PlayedVoice:
         if not self._speaks:
             return None
         begin, leaves = self._leaves
-        return window(begin, _NONE if self.lost else leaves, index * FRAME_SAMPLES, FRAME_SAMPLES)
+        return window(begin, NO_SOUND if self.lost else leaves, index * FRAME_SAMPLES)
 
     def said(self) -> None:
         """Send what is new; see `Player`."""
@@ -392,7 +391,7 @@ class PlayedVoice:
 
 
 def _sounding(piece: Floats | None) -> Floats:
-    return np.zeros(FRAME_SAMPLES, np.float32) if piece is None else piece
+    return SILENCE if piece is None else piece
 
 
 def open_playback(argument: str, spoken: Spoken) -> PlayedVoice:

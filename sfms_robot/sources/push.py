@@ -7,11 +7,10 @@ for the longest wait between two.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Final, Protocol
 
@@ -19,13 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Sighting
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Sighting
 from sfms_robot.ports import Voice
 from sfms_robot.signals.audio import Downmix, Resampler, check_scale
 from sfms_robot.signals.spaces import beyond, motion_of
-from sfms_robot.sources.live_voice import LiveVoice, Pace, SourcePart, check_rate, window
-
-logger = logging.getLogger(__name__)
+from sfms_robot.sources.live_voice import Clock, LiveVoice, Pace, SourcePart, check_rate, window
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
 
@@ -34,7 +31,6 @@ SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sente
 SIGHTINGS: Final = 64  # kept: more than a camera sees between two ticks
 _JOIN: Final = round(0.02 * AUDIO_HZ)
 _MOST_CHANNELS: Final = 32
-_NONE: Final = np.zeros(0, dtype=np.float32)
 
 
 class Player(Protocol):
@@ -72,14 +68,13 @@ class PushedVoice(LiveVoice):
 
     _way: ClassVar[str] = "hear()"  # in logs
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
         self._pushing = threading.Lock()
         self._longest_s = 0.0  # piece
         self._last_s = 0.0
         self._dropped = 0
         self.pace = Pace()
-        self._said = False
 
     def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
         """Take the next piece, float of full scale 1 or int16: (n,), (n, channels) or (channels, n); or bytes of mono.
@@ -105,9 +100,7 @@ class PushedVoice(LiveVoice):
                 self._last_s = now_s
                 captured_s = now_s + self._longest_s
             self.push(kept, rate_hz, captured_s, now_s)
-        if not self._said and (problem := self.pace.problem) is not None:
-            self._said = True
-            logger.warning("%s: %s (said once)", self._way, problem)
+        self.pace.warn_once(self._way)
 
     def statistics(self) -> Mapping[str, Any]:
         return {
@@ -121,7 +114,7 @@ class PushedVoice(LiveVoice):
 class PushedSight(SourcePart):
     """`ports.Sight` of what a program sees."""
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
         self._lock = threading.Lock()
         self._origin_s = 0.0
@@ -173,7 +166,7 @@ class PushedSpeech(SourcePart):
     silence after that. All methods may be called from any thread; `take` waits for none of them.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic, longest_s: float = SAID_S) -> None:
+    def __init__(self, now: Clock = time.monotonic, longest_s: float = SAID_S) -> None:
         super().__init__(now)
         self._longest = int(longest_s * AUDIO_HZ)
         self._saying = threading.Lock()  # of `say` and `hush`: the stretch that is resampled
@@ -272,11 +265,11 @@ class PushedSpeech(SourcePart):
 
     def _frame(self, begin: int) -> Floats:
         """Return the (640,) from place `begin` on."""
-        frame = window(0, _NONE, begin, FRAME_SAMPLES)
+        frame = np.zeros(FRAME_SAMPLES, np.float32)
         for place, piece in self._pieces:
             if place >= begin + FRAME_SAMPLES:
                 break
-            frame += window(place, piece, begin, FRAME_SAMPLES)
+            frame += window(place, piece, begin)
         return frame
 
     def _begin(self, at: int, rate_hz: float) -> None:
@@ -289,7 +282,7 @@ class PushedSpeech(SourcePart):
         """End the stretch: let out what the resampler still holds."""
         if self._resampler is not None:
             end = self._end
-            self._append(self._resampler.push(_NONE, last=True))
+            self._append(self._resampler.push(NO_SOUND, last=True))
             self._resampler, self._began, self._given = None, end, 0
 
     def _cut(self, at: int) -> None:
@@ -315,7 +308,7 @@ def _place(time_s: float) -> int:
     return round(time_s * AUDIO_HZ)
 
 
-def as_floats(pcm: Pcm) -> NDArray[np.float32]:
+def as_floats(pcm: Pcm) -> Floats:
     """Return sound as (n,) or (n, channels) of full scale 1; the smaller axis is that of channels.
 
     Raises ConfigError for another type, shape or scale.
@@ -329,7 +322,7 @@ def as_floats(pcm: Pcm) -> NDArray[np.float32]:
         problem = "not float or int16 of (n,), (n, channels) or (channels, n)"
         raise ConfigError(f"pcm is {samples.dtype} of shape {samples.shape}, {problem}")
     if not samples.size:
-        return _NONE
+        return NO_SOUND
     if samples.ndim == 2:
         channels, n = sorted(samples.shape)
         if channels > _MOST_CHANNELS or 1 < channels == n:

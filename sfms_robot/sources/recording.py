@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, FaceFrame, Floats, Sighting
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, resample
 from sfms_robot.sources.live_voice import SourcePart, window
@@ -18,7 +18,6 @@ from sfms_robot.sources.push import Player
 
 _PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
 _EPS_FRAMES = 1e-6
-_NONE = np.zeros(0, dtype=np.float32)
 
 
 class RecordedVoice(SourcePart):
@@ -60,8 +59,8 @@ class RecordedVoice(SourcePart):
 
     def _frame(self, index: int) -> Floats:
         frame = index % (self.frames + _PAUSE_FRAMES) if self._loop else index
-        part = self._part(frame) if frame < self.frames else _NONE
-        return window(0, part, 0, FRAME_SAMPLES)
+        part = self._part(frame) if frame < self.frames else NO_SOUND
+        return window(0, part, 0)
 
     def _part(self, frame: int) -> Floats:
         if not isinstance(self._audio, AudioFile):

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.data import SPEAKER_VOICE, data_dir, speaker_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import LOCAL, Router
-from sfms_robot.plugins import plug_in, plugins
+from sfms_robot.plugins import plug_in, plugins, shipped
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Source
@@ -38,21 +38,16 @@ _PARTS: Final[Mapping[str, Mapping[str, str]]] = {
 Kinds = Mapping[str, EntryPoint]
 
 
-def _ours(**kinds: str) -> Kinds:
-    named = {name.replace("_", "-"): place for name, place in kinds.items()}
-    return {name: EntryPoint(name, f"sfms_robot.sources.{place}", GROUP) for name, place in named.items()}
-
-
 KINDS: Final[Mapping[str, Kinds]] = {
-    "--audio": _ours(
-        mic="microphone:open_microphone", push="net_person:NetVoice", browser="net_person:open_browser_voice",
+    "--audio": shipped(
+        GROUP, mic="microphone:open_microphone", push="net_person:NetVoice", browser="net_person:open_browser_voice",
         ros2="ros2:Ros2Voice",
     ),
-    "--face": _ours(
-        live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
+    "--face": shipped(
+        GROUP, live_link="live_link:open_live_link", vmc="vmc:open_vmc", webcam="webcam:open_webcam",
         push="net_person:NetSight", browser="net_person:open_browser_sight", ros2="ros2:Ros2Sight",
     ),
-    "--agent-audio": _ours(device="microphone:open_loudspeaker", tcp="net_person:NetSpeech"),
+    "--agent-audio": shipped(GROUP, device="microphone:open_loudspeaker", tcp="net_person:NetSpeech"),
 }  # fmt: skip
 
 

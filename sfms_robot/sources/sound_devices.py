@@ -6,14 +6,13 @@ environment variables PULSE_SOURCE and PULSE_SINK at that moment; monitors, what
 
 from __future__ import annotations
 
-import os
 import queue
 import re
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, ClassVar, Final, Self
@@ -23,6 +22,7 @@ import numpy as np
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.signals.audio import environment
 from sfms_robot.sources.live_voice import LiveVoice, Pace
 from sfms_robot.sources.worker import SourceWorker
 
@@ -68,19 +68,10 @@ class SoundDevice:
         """It records what a loudspeaker is given."""
         return self.of_server and not self.plays and self.name.endswith(".monitor")
 
-    @contextmanager
-    def selected(self) -> Iterator[None]:
+    def selected(self) -> AbstractContextManager[None]:
         """Let what is opened inside by `number` be this device. Not for several threads."""
         variable = "PULSE_SINK" if self.plays else "PULSE_SOURCE"
-        before = os.environ.get(variable)
-        if self.of_server:
-            os.environ[variable] = self.name
-        try:
-            yield
-        finally:
-            if self.of_server:
-                os.environ.pop(variable)
-                os.environ.update({} if before is None else {variable: before})
+        return environment({variable: self.name} if self.of_server else {})
 
 
 class DeviceStream:

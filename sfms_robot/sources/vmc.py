@@ -35,9 +35,7 @@ from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
 from sfms_robot.signals.rotations import angles_of
 from sfms_robot.signals.spaces import LiveUnits, channel_of, used_line
-from sfms_robot.sources.live_face import ANY, USUAL_PORTS, Decoder, UdpSight, foreign
-
-PORT: Final = USUAL_PORTS["vmc"]
+from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 # The ARKit shapes nearest to a preset of VRM 0 and 1.
 _SMILE: Final = {"mouthSmileLeft": 1.0, "mouthSmileRight": 1.0, "cheekSquintLeft": 0.5, "cheekSquintRight": 0.5}
@@ -82,7 +80,6 @@ _NOTHING: Final = (
 _ONLY_THE_HEAD: Final = "the head's pose and no blendshapes: switch on sending of blendshapes (perfect sync)"
 
 _BUNDLE: Final = b"#bundle\0"
-_SIZE: Final = struct.Struct(">i")
 _READ: Final = frozenset((b"/VMC/Ext/Blend/Val", b"/VMC/Ext/Blend/Apply", b"/VMC/Ext/Bone/Pos", b"/VMC/Ext/OK"))
 
 
@@ -97,10 +94,8 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
         raise PacketError("bundles in bundles without end")
     start = len(_BUNDLE) + 8  # the time tag
     while start < len(data):
-        if start + _SIZE.size > len(data):
-            raise PacketError("an OSC bundle that is cut off")
-        (size,) = _SIZE.unpack_from(data, start)
-        start += _SIZE.size
+        size = int.from_bytes(data[start : start + 4], "big", signed=True)
+        start += 4
         if size <= 0 or start + size > len(data):
             raise PacketError("an OSC bundle that is cut off")
         element = data[start : start + size]
@@ -296,7 +291,7 @@ def open_vmc(argument: str) -> UdpSight:
 
     Raises as `UdpSight`.
     """
-    return UdpSight("vmc", argument, PORT, VmcDecoder(), _hint, LiveUnits(angles=False))
+    return UdpSight("vmc", argument, VmcDecoder(), _hint, LiveUnits(angles=False))
 
 
 def _hint(host: str, port: int, wider: str) -> str:

@@ -283,16 +283,15 @@ def choose(places_m: Sequence[Floats], time_s: float, before: Choice | None) -> 
 
     `before`: the choice of the last picture, None at first. The order of the faces does not matter.
     """
-    distances_m = [float(np.linalg.norm(place)) for place in places_m]
     same = _same(places_m, before)
-    if before is None or same is None:
-        if before is not None and time_s - before.seen_s < GONE_S:
-            return None, replace(before, rival_since_s=None)
-        if not places_m:
-            return None, None
-        nearest = int(np.argmin(distances_m))
-        return nearest, Choice(places_m[nearest], time_s)
+    if before is not None and same is None and time_s - before.seen_s < GONE_S:
+        return None, replace(before, rival_since_s=None)
+    if not places_m:
+        return None, None
+    distances_m = [float(np.linalg.norm(place)) for place in places_m]
     nearest = int(np.argmin(distances_m))
+    if before is None or same is None:
+        return nearest, Choice(places_m[nearest], time_s)
     if distances_m[nearest] >= NEARER * distances_m[same]:
         return same, Choice(places_m[same], time_s)
     since_s = time_s if before.rival_since_s is None else before.rival_since_s

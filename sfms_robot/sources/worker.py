@@ -126,8 +126,7 @@ def _failure(message: Any) -> RobotError | str | None:
     """Return what a message says went wrong; None if nothing did."""
     if isinstance(message, Ended):
         return f"its process died (exit code {message.code})"
-    failure: RobotError | str | None = message[1] if message[0] in ("failed", "broke") else None
-    return failure
+    return message[1] if message[0] in ("failed", "broke") else None
 
 
 # --- Child ------------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ import orjson
 from pydantic import AfterValidator, Field, StrictBool, create_model
 
 from sfms_robot.config import parse
-from sfms_robot.config.base import Model
+from sfms_robot.config.base import PRINTABLE, Model
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import MOTION_DIM, Doubles, Floats
 
@@ -115,12 +115,6 @@ def message_json(**message: Any) -> bytes:
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("expected printable characters")
-    return text
-
-
 def _short(value: Any) -> Any:
     if len(orjson.dumps(value)) > _LONGEST_TEXT:
         raise ValueError(f"expected up to {_LONGEST_TEXT} characters")
@@ -129,7 +123,7 @@ def _short(value: Any) -> Any:
 
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Whole = Annotated[int, Field(strict=True, ge=0, lt=2**32)]
-_Text = Annotated[str, Field(max_length=_LONGEST_TEXT), AfterValidator(_printable)]
+_Text = Annotated[str, Field(max_length=_LONGEST_TEXT), PRINTABLE]
 _Anything = Annotated[Any, AfterValidator(_short)]
 _Numbers = Annotated[dict[str, _Number], Field(max_length=128)]
 _Rates = Annotated[dict[str, _Number | None], Field(max_length=128)]  # None: as people do

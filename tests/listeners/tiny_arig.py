@@ -75,7 +75,7 @@ def streamed(
 
 def noise_of(listener: ArigListener, frames: int, seed: int = 1) -> torch.Tensor:
     """What a stream of that seed draws: (1, frames, steps, channels)."""
-    shape = listener.model.noise_shape
+    shape = listener.noise_shape
     noise = [normals(seed, frame, Use.NOISE, *shape) for frame in range(1, 1 + frames)]
     return torch.from_numpy(np.stack(noise))[None]
 

@@ -81,13 +81,13 @@ def test_an_option_that_cannot_be_used_is_one_line_with_choices(argument, text):
     ],
 )
 def test_a_place_without_a_host_is_this_machine_alone(place, expected):
-    assert parse_endpoint("vmc", place, 39539) == expected
+    assert parse_endpoint("vmc", place) == expected
 
 
 @pytest.mark.parametrize("place", ["x", "0", "65536", "-1", ":1234", "host:", "host", "1.5", "²"])
 def test_a_port_that_is_none_is_one_line(place):
     with pytest.raises(ConfigError, match="expected a UDP port .valid: live-link, live-link:PORT, live-link:HOST:PORT"):
-        parse_endpoint("live-link", place, 11111)
+        parse_endpoint("live-link", place)
 
 
 # --- the person's rest --------------------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ class Bytes(Decoder):
 
 
 def opened(place=None, decoder=None):
-    return UdpSight("test", str(place or free_udp_port()), 1, decoder or Bytes(), lambda *_: "call 42")
+    return UdpSight("vmc", str(place or free_udp_port()), decoder or Bytes(), lambda *_: "call 42")
 
 
 @pytest.fixture
@@ -264,7 +264,7 @@ def test_noise_takes_no_senders_place_and_its_reason_is_logged_once(sight, caplo
     feed(sight, FIRST, 0.2)
     assert counts(sight) == {"faces": 1, "refused": 0, "malformed": 2}
     (said,) = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    assert said == "test: packets of 192.0.2.2:2 are left out: 255 percent (said once)"
+    assert said == "vmc: packets of 192.0.2.2:2 are left out: 255 percent (said once)"
 
 
 def test_without_packets_the_log_says_once_what_to_do_and_no_sender_is_lost(sight, caplog):
@@ -272,7 +272,7 @@ def test_without_packets_the_log_says_once_what_to_do_and_no_sender_is_lost(sigh
     assert not caplog.records
     sight.at(UNHEARD_S + 1)
     sight.at(1e6)
-    assert [record.message for record in caplog.records] == ["test: no packets yet: call 42"]
+    assert [record.message for record in caplog.records] == ["vmc: no packets yet: call 42"]
     assert not sight.lost
 
 
@@ -346,7 +346,7 @@ def test_a_datagram_has_the_time_it_came_in_not_the_time_it_was_read():
 
 def test_a_port_is_one_runs_until_it_is_closed(sight):
     place = sight.address[1]
-    with pytest.raises(PortError, match=r"test: UDP port \d+ on 127.0.0.1 is used by another program"):
+    with pytest.raises(PortError, match=r"vmc: UDP port \d+ on 127.0.0.1 is used by another program"):
         opened(place)
     sight.close()
     sight.close()
@@ -355,6 +355,6 @@ def test_a_port_is_one_runs_until_it_is_closed(sight):
 
 @pytest.mark.parametrize("host", ["a..b", "203.0.113.7"])
 def test_an_address_of_another_machine_is_one_line(host):
-    with pytest.raises(PortError, match=f"test: UDP port 11111 on {host}: ") as raised:
+    with pytest.raises(PortError, match=f"vmc: UDP port 11111 on {host}: ") as raised:
         opened(f"{host}:11111")
     assert "\n" not in str(raised.value)

@@ -382,7 +382,7 @@ def test_programs_behind_what_is_said_are_told_also_where_it_is_played():
 class Sent(list):
     """A microphone's worker that keeps what it is sent."""
 
-    tell = list.append
+    tell, lost = list.append, False
 
     def messages(self, now_s):
         return []

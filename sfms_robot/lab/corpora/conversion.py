@@ -97,10 +97,10 @@ def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Flo
     elif space == "seamless27":
         turned = np.zeros((int(known.sum()), SPACES["deca56"].dim))
         turned[:, SPACES["deca56"].rotation] = motion[known, _ANGLES]
-        out[known] = decode(turned, "deca56").motion
+        out[known] = decode(turned, "deca56")[0]
         out[known, SHAPES] = blendshapes_of(motion[known, _UNITS])
     else:
-        out[known] = decode(motion[known], space, flame=flame).motion
+        out[known] = decode(motion[known], space, flame=flame)[0]
     return out
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.signal import welch
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, YAW_PITCH, Doubles, Floats, ListenerEvent
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, YAW_PITCH, Bools, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.evaluation import phrase_timing
@@ -325,7 +325,7 @@ def _fastest(motions: Sequence[Floats], order: int) -> float:
 # --- how a face moves -----------------------------------------------------------------------------------------------
 
 
-def movement(motions: Sequence[Floats], addressed: Sequence[events.Bools]) -> dict[str, float]:
+def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str, float]:
     """Return figures of motions (N, 58), each with the frames (N,) in which gaze at the person is expected.
 
     Medians of nods (size, length, swings), of the lengths of blinks, smiles and looks, gaze within 5 degrees of the

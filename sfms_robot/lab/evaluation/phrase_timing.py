@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import Doubles
-from sfms_robot.signals.events import Bools, runs
+from sfms_robot.frames import Bools, Doubles
+from sfms_robot.signals.events import runs
 
 AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
 LATER_S: Final = (1.5, 3.0)  # compared with `AFTER_S`

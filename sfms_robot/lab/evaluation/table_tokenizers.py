@@ -24,7 +24,7 @@ from sfms_robot.config import load, parse
 from sfms_robot.config.training import HALVINGS
 from sfms_robot.frames import BLENDSHAPES, CHANNELS
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.layers import Block, sinusoidal
+from sfms_robot.listeners.layers import Block, places_of
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.listeners.sfms.quantizer import Codebook, Grid
@@ -147,7 +147,7 @@ class Stack(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x + sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
+        x = x + places_of(x)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.norm(x)

@@ -17,7 +17,7 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.app.output_paths import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain, save
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Doubles, Floats
+from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Bools, Doubles, Floats
 from sfms_robot.lab.evaluation.rollout import run_in_processes
 from sfms_robot.lab.evaluation.table_tokenizers import (
     DenseTokenizer,
@@ -34,7 +34,6 @@ from sfms_robot.lab.learning.train_runs import device_of
 from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, place, tracks
-from sfms_robot.signals.events import Bools
 from sfms_robot.signals.tracks import Take
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats, ListenerEvent
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation import phrase_timing
@@ -29,7 +29,7 @@ from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.lab.learning.events.event_trainer import listening_in
 from sfms_robot.signals import phase
-from sfms_robot.signals.events import MOTION_EVENTS, Bools
+from sfms_robot.signals.events import MOTION_EVENTS
 
 ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # besides nods
 _WITHIN_S: Final = 0.5  # a nod this close counts for an instant

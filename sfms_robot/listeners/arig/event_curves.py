@@ -71,10 +71,7 @@ def features(row: Tensor, at: Tensor | None = None) -> Tensor:
 
 def _of_kinds(row: Tensor) -> tuple[Tensor, ...]:
     """Return active, since, over and size (..., KINDS, 1) of control rows (..., K): views, no index is made."""
-    found: tuple[Tensor, ...] = torch.unflatten(row[..., : _EACH * len(KINDS)], -1, (len(KINDS), _EACH)).chunk(
-        4, dim=-1
-    )
-    return found
+    return torch.unflatten(row[..., : _EACH * len(KINDS)], -1, (len(KINDS), _EACH)).chunk(4, dim=-1)
 
 
 def moves(channels: Sequence[str]) -> Tensor:
@@ -99,8 +96,7 @@ def remains(before: Tensor, now: Tensor, moves: Tensor) -> Tensor:
     left = torch.where((was_active > 0) & (active == 0), 0.0, 1 - over * active)
     was = (1 - was_over * was_active).clamp(min=LEAST)
     # Events that overlap each take back what they move: their shares multiply.
-    share: Tensor = torch.where(moves, (left / was).clamp(0, 1), 1.0).prod(dim=-2)
-    return share
+    return torch.where(moves, (left / was).clamp(0, 1), 1.0).prod(dim=-2)
 
 
 def _hats(x: Tensor, at: Tensor) -> Tensor:

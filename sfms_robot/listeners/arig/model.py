@@ -39,8 +39,7 @@ from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, Sho
 from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
 from sfms_robot.listeners.arig.stream import CONTROL_ROWS, FIRST
 from sfms_robot.listeners.audio_frontend import WIDTHS
-from sfms_robot.listeners.idle import BANDS, head_channels
-from sfms_robot.listeners.layers import weighted_mean, windows
+from sfms_robot.listeners.layers import ListenerModel, weighted_mean, windows
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
@@ -122,11 +121,11 @@ class SamplerCondition:
     moved: Tensor
 
 
-class ArigModel(nn.Module):
+class ArigModel(ListenerModel):
     """Weights of one listener, with the scales of its motion and sound."""
 
     def __init__(self, settings: config.Arig) -> None:
-        super().__init__()
+        super().__init__(settings, WIDTHS[settings.sound])
         d, innovation, events = settings.width, settings.draws == "innovation", settings.events
         self.settings = settings
         self.channels, self.sound_width = len(settings.channels), WIDTHS[settings.sound]
@@ -155,8 +154,6 @@ class ArigModel(nn.Module):
     def _register_scales(self) -> None:
         """Register the buffers that training sets from its data, and which channels are drawn and recalled."""
         settings, c = self.settings, self.channels
-        self.motion_mean = nn.Buffer(torch.zeros(c))
-        self.motion_std = nn.Buffer(torch.ones(c))
         self.motion_low = nn.Buffer(torch.full((c,), -8.0))
         self.motion_high = nn.Buffer(torch.full((c,), 8.0))
         self.step_std = nn.Buffer(torch.ones(c))
@@ -172,27 +169,8 @@ class ArigModel(nn.Module):
         drawn = [name in settings.drawn_channels for name in settings.channels]
         self.is_drawn = nn.Buffer(torch.tensor(drawn), persistent=False)
         is_recalled = torch.ones(c, dtype=torch.bool)
-        if settings.sway:
-            head = head_channels(settings.channels)
-            is_recalled[head] = False
-            self.sway_mixture = nn.Buffer(torch.zeros(BANDS, len(head), len(head)))
-            self.sway_spread = nn.Buffer(torch.zeros(()))
+        is_recalled[self.swaying] = False
         self.is_recalled = nn.Buffer(is_recalled, persistent=False)
-        self.sound_mean = nn.Buffer(torch.zeros(self.sound_width))
-        self.sound_std = nn.Buffer(torch.ones(self.sound_width))
-
-    @property
-    def noise_shape(self) -> tuple[int, int]:
-        """Return the shape of the standard normal numbers that one frame takes: (steps, channels)."""
-        return (1, 1) if self.settings.discrete else (self.settings.diffusion.steps, self.channels)
-
-    def standardise(self, motion: Tensor) -> Tensor:
-        """Return motion (..., C) of the motion space in the units the model works in."""
-        return (motion - self.motion_mean) / self.motion_std
-
-    def restore(self, motion: Tensor) -> Tensor:
-        """Return standardised motion (..., C) in the motion space."""
-        return motion * self.motion_std + self.motion_mean
 
     # --- Motion and draws: the table above ----------------------------------------------------------------------------
 
@@ -299,8 +277,7 @@ class ArigModel(nn.Module):
 
     def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
         """Return (..., D) of features (..., A), and `absent` (D,) or (..., D) where not heard (...)."""
-        standard = (sound - self.sound_mean) / self.sound_std
-        out: Tensor = self.sound_in(standard[..., : self.sounds_read])
+        out: Tensor = self.sound_in(self.standardise_sound(sound)[..., : self.sounds_read])
         return torch.where(heard[..., None], out, absent)
 
     def embed_own(self, motion: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ class TrackSide(nn.Module):
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.modulation = Modulation(width, width, "scgscg")
+        self.modulation = Modulation(width, "scgscg")
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         self.ffn = FeedForward(width, hidden)
@@ -97,7 +97,7 @@ class Integrated(nn.Module):
         super().__init__()
         self.heads = heads
         self.asked, self.hidden = 3 * width, hidden
-        self.modulation = Modulation(width, width, "scg")
+        self.modulation = Modulation(width, "scg")
         self.wide = nn.Linear(width, 3 * width + hidden)
         self.narrow = nn.Linear(width + hidden, width)
 

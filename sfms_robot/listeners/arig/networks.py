@@ -14,14 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.layers import Network
 
 
-class RestNetwork(nn.Module):
+class RestNetwork(Network[ArigModel]):
     """A still face and silence as the memory of a stream: called once, when a listener is loaded."""
-
-    def __init__(self, model: ArigModel) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(self, still: Tensor) -> tuple[Tensor, ...]:
         """Return embedded motion and silence (1, D), and the keys of each (1, 2D), of still (1, C) standardised."""
@@ -29,12 +26,11 @@ class RestNetwork(nn.Module):
         return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
 
 
-class FrameNetwork(nn.Module):
+class FrameNetwork(Network[ArigModel]):
     """Sounds and face of one frame, and the memory of the stream -> the inputs of the sampler for the next."""
 
     def __init__(self, model: ArigModel) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model)
         layers = range(model.settings.context_layers)
         self.further = [f"{part}_{layer}" for layer in layers for part in ("keys", "values")]  # names of `past`
 
@@ -97,12 +93,8 @@ class FrameNetwork(nn.Module):
         return z, logits, made, now, agent_behaviour, user_behaviour, sound_keys
 
 
-class DrawNetwork(nn.Module):
+class DrawNetwork(Network[ArigModel]):
     """Inputs of the sampler and its noise -> the agent's motion, and the memory of it."""
-
-    def __init__(self, model: ArigModel) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(
         self,
@@ -116,7 +108,7 @@ class DrawNetwork(nn.Module):
         """Draw one frame.
 
         Args:
-            z: of `FrameNetwork`; noise: (N, *model.noise_shape).
+            z: of `FrameNetwork`; noise: (N, *noise_shape).
             standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.ArigMemory`.
             rows: (N, 2K) of `FrameNetwork`, and speaks: (N,) bool, the agent; for a listener with events.
 
@@ -141,7 +133,7 @@ def _after(queue: Tensor, new: Tensor, first: Tensor) -> Tensor:
     return torch.where(first[:, None, None], new[:, None], push(queue, new))
 
 
-def networks(model: ArigModel) -> dict[str, nn.Module]:
+def networks(model: ArigModel) -> dict[str, Network[ArigModel]]:
     """Return all networks by name."""
     return {"rest": RestNetwork(model), "frame": FrameNetwork(model), "draw": DrawNetwork(model)}
 

@@ -56,7 +56,7 @@ class Denoiser(nn.Module):
         # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
         self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.condition = nn.Linear(condition, width)
-        self.modulation = Modulation(width, width, "scg" * settings.blocks + "sc")  # of every block, in one product
+        self.modulation = Modulation(width, "scg" * settings.blocks + "sc")  # of every block, in one product
         self.enter = nn.Linear(channels, width)
         self.up = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
         self.down = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sfms_robot import config
 from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
@@ -72,7 +72,7 @@ def with_feedback(states: NDArray[Any], rows: Floats) -> NDArray[Any]:
 
 
 def draw_sojourn(
-    durations: Floats, possible: Floats, logits: Floats, voiced: NDArray[np.bool_], before: Sojourn, uniforms: Doubles
+    durations: Floats, possible: Floats, logits: Floats, voiced: Bools, before: Sojourn, uniforms: Doubles
 ) -> Sojourn:
     """Draw the state of a frame.
 
@@ -178,15 +178,19 @@ class BothPeople(NamedTuple):
     """
 
     sounds: Floats
-    present: NDArray[np.bool_]
-    voiced: NDArray[np.bool_]
+    present: Bools
+    voiced: Bools
     face: Floats
-    seen: NDArray[np.bool_]
+    seen: Bools
     voices: list[tuple[AudioState, AudioState]]
 
 
 class ArigListener(RunsOnEngine):
-    """ARIG as a stream; its engine runs `networks`."""
+    """ARIG as a stream; its engine runs `networks`.
+
+    Attributes:
+        noise_shape: of the standard normal numbers that one frame takes: (steps, channels).
+    """
 
     def __init__(self, settings: config.Arig, engine: Engine, folder: Path | None = None) -> None:
         """Take the matrix that the settings may name from `folder`.
@@ -201,7 +205,7 @@ class ArigListener(RunsOnEngine):
         self.sway = HeadSway(settings, engine.tensors)
         if settings.events:
             self.control_frames = (1, CONTROL_ROWS - 1)
-        self._noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
+        self.noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
 
     def start(self, seed: int) -> ArigMemory:
         """Return the memory of a stream without sound so far and with a neutral face (A.2)."""
@@ -242,7 +246,7 @@ class ArigListener(RunsOnEngine):
         heard = self._hear(speakers, memories)
         # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         z, logits, now = self._conditions(heard, memories, rows)
-        noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self._noise_shape) for memory in now])
+        noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self.noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
         told = [rows, heard.voiced[:, 0]] if self.settings.events else []
         made, *drawn = self.engine.run("draw", *inputs, *told)
@@ -264,11 +268,25 @@ class ArigListener(RunsOnEngine):
         self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats
     ) -> tuple[Floats, Floats, list[ArigMemory]]:
         """Return the sampler's inputs (N, its width), logits of the states (N, S), and memories without its draws."""
-        z, logits, made, *rest = self.engine.run("frame", *self._frame_inputs(heard, memories, rows))
+        settings = self.settings
+        # 3.2: chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view, w - 1 are whole.
+        passed = np.array([memory.frames for memory in memories])
+        chunks, room = passed // settings.chunk_frames, settings.context_chunks - 1
+        z, logits, made, *rest = self.engine.run(
+            "frame",
+            *heard[:5],
+            passed == 0,
+            np.array([memory.state for memory in memories]),
+            rotary(chunks, settings.width // settings.heads),
+            np.arange(room) >= room - np.minimum(chunks, room)[:, None],  # the newest chunks are last
+            *(_stacked(memories, name) for name in REMEMBERED),
+            rows,
+            *(stacked([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
+        )
         after = []
         for index, ((user, agent), memory) in enumerate(zip(heard.voices, memories, strict=True)):
             frames, context = memory.frames + 1, memory.context
-            if frames % self.settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
+            if frames % settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
                 context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
             own = dict(zip(REMEMBERED[:4], (part[index] for part in rest), strict=True))
             voices = {"user_voice": user, "agent_voice": agent}
@@ -323,23 +341,6 @@ class ArigListener(RunsOnEngine):
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
         voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
         return BothPeople(sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen, voices)
-
-    def _frame_inputs(self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats) -> list[NDArray[Any]]:
-        """Return the inputs of the network `frame`."""
-        settings = self.settings
-        # 3.2: chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view, w - 1 are whole.
-        frames = np.array([memory.frames for memory in memories])
-        chunks, room = frames // settings.chunk_frames, settings.context_chunks - 1
-        return [
-            *heard[:5],
-            frames == 0,
-            np.array([memory.state for memory in memories]),
-            rotary(chunks, settings.width // settings.heads),
-            np.arange(room) >= room - np.minimum(chunks, room)[:, None],  # the newest chunks are last
-            *(_stacked(memories, name) for name in REMEMBERED),
-            rows,
-            *(stacked([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
-        ]
 
 
 def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:

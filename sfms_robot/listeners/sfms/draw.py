@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.config import NodCourse, SmileCourse
-from sfms_robot.frames import FRAME_S, Doubles, Floats
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats
 from sfms_robot.listeners.engine import Engine
 from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.control import COLUMNS, FULL_SIZE, since_s
@@ -115,7 +115,7 @@ def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
     key, frame = tokens > 0, np.arange(frames)[:, None]
     before = np.maximum.accumulate(np.where(key, frame, -1), axis=1)
     after = np.ascontiguousarray(np.minimum.accumulate(np.where(key, frame, frames)[:, ::-1], axis=1)[:, ::-1])
-    seen: NDArray[np.bool_] = np.asarray(key.any(-1))
+    seen: Bools = np.asarray(key.any(-1))
     seen[~seen.any(-1)] = True
     counts, window = seen.sum(-1, keepdims=True), np.arange(windows)[:, None]
     most = min(-(-int(counts.max()) // KEYS_STEP) * KEYS_STEP, frames)
@@ -168,7 +168,7 @@ def revoked(tokens: Tokens, drawn_under: Floats, control: Floats, horizon: int) 
     return np.concatenate([tokens[:, :-horizon], future], axis=1), settled
 
 
-def anchored(tokens: Tokens, drawn: NDArray[np.bool_], settled: Tokens, ramp: int) -> Tokens:
+def anchored(tokens: Tokens, drawn: Bools, settled: Tokens, ramp: int) -> Tokens:
     """Return tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before frame `settled`.
 
     `settled`: (B,). There the keyframe that a group held until then is repeated.
@@ -219,12 +219,11 @@ class CodeReach:
         self._speed = [np.maximum(speed[own, None], TINY) for own in channels]
         self._rows: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
-    def too_soon(self, last: Tokens, gap: Tokens) -> NDArray[np.bool_]:
+    def too_soon(self, last: Tokens, gap: Tokens) -> Bools:
         """Return the classes (B, G, V + 1) out of reach `gap` (B, G) frames after the last keyframes (B, G)."""
         needed = np.concatenate([self._needed(*each) for row in last.tolist() for each in enumerate(row)])
         passed = np.minimum(gap, NEVER - 1).astype(np.uint8)  # as wide as what it is compared with
-        too_soon: NDArray[np.bool_] = needed.reshape(*last.shape, self._classes) > passed[..., None]
-        return too_soon
+        return needed.reshape(*last.shape, self._classes) > passed[..., None]
 
     def _needed(self, group: int, token: int) -> NDArray[np.uint8]:
         """Return the whole frames needed, at least, from a token to every class (V + 1,).
@@ -323,7 +322,7 @@ def smile_course(smile: SmileCourse, control: Floats) -> Course:
 def smile_share(smile: SmileCourse, since: Doubles, left: Doubles) -> Doubles:
     """Return the share of its size that a smile has `since` its beginning, with `left` to its end, both in seconds."""
     rise = np.interp(since, smile.RISE_S, smile.rise)
-    return np.asarray(np.minimum(rise, np.interp(left, smile.FALL_S, smile.fall)))
+    return np.minimum(rise, np.interp(left, smile.FALL_S, smile.fall))
 
 
 def nod_course(nod: NodCourse, control: Floats) -> Course:
@@ -346,7 +345,7 @@ def nod_course(nod: NodCourse, control: Floats) -> Course:
     return Course(wanted, nod.spread * np.maximum(size, _LEAST_RAD))
 
 
-def _turned(control: Floats, told: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
+def _turned(control: Floats, told: Bools) -> tuple[Doubles, Doubles]:
     """Return how far the swings of a nod have turned since its beginning, and the step from row to row, in radians.
 
     The step is 0 where only one row of the nod is known.

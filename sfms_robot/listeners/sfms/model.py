@@ -27,8 +27,7 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
-from sfms_robot.listeners.idle import BANDS, head_channels
-from sfms_robot.listeners.layers import Block, sinusoidal
+from sfms_robot.listeners.layers import Block, ListenerModel, Network, sinusoidal
 from sfms_robot.listeners.sfms.draw import Context, LastKeyframes, neutral_mask
 from sfms_robot.listeners.sfms.piecewise_linear import POSITION_BITS, Around, Neighbours
 from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, Strategy, place
@@ -191,72 +190,33 @@ class Tokenizer(nn.Module):
         return out
 
 
-class SfmsModel(nn.Module):
+class SfmsModel(ListenerModel):
     """Weights of one listener, with the scales of its motion and sound."""
 
     def __init__(self, settings: config.Sfms) -> None:
-        super().__init__()
+        super().__init__(settings, SHAPES[settings.audio][1])
         self.settings = settings
-        width, bins = len(settings.channels), SHAPES[settings.audio][1]
-        self.motion_mean = nn.Buffer(torch.zeros(width))
-        self.motion_std = nn.Buffer(torch.ones(width))
         # Fastest natural change of each channel from one frame to the next, standardised.
-        self.motion_speed = nn.Buffer(torch.full((width,), UNMEASURED))
-        self.sound_mean = nn.Buffer(torch.zeros(bins))
-        self.sound_std = nn.Buffer(torch.ones(bins))
-        self.head = head_channels(settings.channels) if settings.sway else []
-        if settings.sway:
-            self.sway_mixture = nn.Buffer(torch.zeros(BANDS, len(self.head), len(self.head)))
-            self.sway_spread = nn.Buffer(torch.zeros(()))
+        self.motion_speed = nn.Buffer(torch.full((len(settings.channels),), UNMEASURED))
         self.tokenizer = Tokenizer(settings)
         self.predictor = Predictor(settings)
-
-    def standardise(self, motion: Tensor) -> Tensor:
-        """Return motion (..., C) of the model's motion space in the units it works in."""
-        return (motion - self.motion_mean) / self.motion_std
-
-    def restore(self, motion: Tensor) -> Tensor:
-        """Return standardised motion (..., C) in the model's motion space."""
-        return motion * self.motion_std + self.motion_mean
-
-    def standardise_sound(self, rows: Tensor) -> Tensor:
-        """Return rows (..., bins) of sound features in the units the model works in."""
-        return (rows - self.sound_mean) / self.sound_std
 
 
 # --- Networks of a stream ---------------------------------------------------------------------------------------------
 
 
-class Network(nn.Module):
-    """A function of tensors of one model, whose weights keep their names in model.safetensors, behind "model.".
-
-    Attributes:
-        free: inputs of (B, K, ...), K any number but the same for all of them.
-        further: names of the inputs of `forward` that have none there.
-    """
-
-    free: tuple[str, ...] = ()
-    further: tuple[str, ...] = ()
-
-    def __init__(self, model: SfmsModel) -> None:
-        super().__init__()
-        self.model, settings = model, model.settings
-        self.future = settings.future_frames
-        self.codes = [group.codes for group in settings.groups.values()]
-
-
-class Rest(Network):
+class Rest(Network[SfmsModel]):
     """A still face as tokens, and every code as motion: called once, when a listener is loaded."""
 
     def forward(self, still: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
-        quantizer = self.model.tokenizer.quantizer
-        place = still.device
-        indices = torch.arange(max(self.codes), device=place)[:, None] % torch.tensor(self.codes, device=place)
+        quantizer, place = self.model.tokenizer.quantizer, still.device
+        codes = [group.codes for group in self.model.settings.groups.values()]
+        indices = torch.arange(max(codes), device=place)[:, None] % torch.tensor(codes, device=place)
         return self.model.tokenizer.encode(still, mask), quantizer.decode(quantizer.codebook.codes(indices)[None])
 
 
-class Hear(Network):
+class Hear(Network[SfmsModel]):
     """Sound of a frame and of the one before it, for the predictor."""
 
     def forward(self, rows: Tensor) -> tuple[Tensor]:
@@ -264,7 +224,7 @@ class Hear(Network):
         return (self.model.predictor.speaker.listen(rows)[:, 0],)
 
 
-class Ahead(Network):
+class Ahead(Network[SfmsModel]):
     """The predictor up to the point where the drawn keyframes matter."""
 
     further = (*Context._fields, "last", "at")
@@ -274,7 +234,7 @@ class Ahead(Network):
         return (self.model.predictor(Context(*inputs[:-2]), LastKeyframes(*inputs[-2:])),)
 
 
-class Next(Network):
+class Next(Network[SfmsModel]):
     """The classes of one future frame, given the keyframes before it."""
 
     def forward(self, slots: Tensor, last: Tensor, at: Tensor, frame: Tensor) -> tuple[Tensor]:
@@ -285,7 +245,7 @@ class Next(Network):
         return (self.model.predictor.flat_logits(slots, LastKeyframes(last, at), frame[:, None, None]),)
 
 
-class Decode(Network):
+class Decode(Network[SfmsModel]):
     """Tokens as motion."""
 
     free = ("rows", "seen")
@@ -295,7 +255,7 @@ class Decode(Network):
     ) -> tuple[Tensor]:
         """Return standardised motion (B, 2 + H, C), from the frame before now, of tokens (B, P + H, G) and `Around`."""
         found = Around(before, after, rows, seen, places)
-        return (self.model.tokenizer.decode(tokens, last=self.future + 2, around=found),)
+        return (self.model.tokenizer.decode(tokens, last=self.model.settings.future_frames + 2, around=found),)
 
 
 @torch.no_grad()
@@ -306,7 +266,7 @@ def neutral_tokens(model: SfmsModel, space: MotionSpace, frames: int) -> Tensor:
     return model.tokenizer.encode(model.standardise(still), mask[None])[0]
 
 
-def networks(model: SfmsModel) -> dict[str, Network]:
+def networks(model: SfmsModel) -> dict[str, Network[SfmsModel]]:
     """Return all networks by name."""
     kinds = {"rest": Rest, "hear": Hear, "ahead": Ahead, "next": Next, "decode": Decode}
     return {name: kind(model).eval() for name, kind in kinds.items()}

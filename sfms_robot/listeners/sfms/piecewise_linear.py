@@ -139,8 +139,7 @@ class Neighbours:
 # --- Errors of all stretches, and the best k keyframes ----------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Segments:
+class Segments(NamedTuple):
     """Squared errors of the stretches of N tracks of T frames.
 
     Attributes:

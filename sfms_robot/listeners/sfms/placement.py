@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.listeners.layers import Block, sinusoidal
+from sfms_robot.listeners.layers import Block, places_of
 from sfms_robot.listeners.sfms.piecewise_linear import (
     Neighbours,
     Segments,
@@ -54,9 +54,8 @@ TIME_SCALE_FRAMES = 48.0
 class ScoreNetwork(nn.Module):
     """Phi_score: 1-D convolution, linear, sinusoidal positions, transformer encoder -> logits s of equation (4)."""
 
-    def __init__(self, inputs: int, outputs: int, width: int, heads: int, layers: int = 2) -> None:
+    def __init__(self, inputs: int, outputs: int, width: int, heads: int, layers: int) -> None:
         super().__init__()
-        self.width = width
         self.conv = nn.Conv1d(inputs, width, kernel_size=5, padding=2)
         self.linear = nn.Linear(width, width)
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
@@ -66,7 +65,7 @@ class ScoreNetwork(nn.Module):
     def forward(self, seen: Tensor) -> Tensor:
         """Return logits (B, T, outputs) of (B, T, inputs): in the paper standardised motion, one output per group."""
         x = self.linear(self.conv(seen.transpose(1, 2)).transpose(1, 2))
-        x = x + sinusoidal(x.shape[1], self.width, x.device).to(x)
+        x = x + places_of(x)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.out(self.norm(x))
@@ -86,8 +85,7 @@ class Tracks:
     cost: Segments
 
     def __getitem__(self, rows: Tensor) -> Tracks:
-        cost = Segments(self.cost.inside[rows], self.cost.before[rows], self.cost.after[rows])
-        return Tracks(self.curves[rows], cost)
+        return Tracks(self.curves[rows], Segments(*(part[rows] for part in self.cost)))
 
 
 @torch.no_grad()
@@ -99,8 +97,7 @@ def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
         own = centred[..., row > 0.5]  # (B, T, c)
         own = own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None]
         curves.append(_principal(own, most))
-        cost = segments(own)
-        costs.append((cost.inside.float(), cost.before.float(), cost.after.float()))
+        costs.append([part.float() for part in segments(own)])
     parts = [torch.stack(part, 1).flatten(0, 1) for part in zip(*costs, strict=True)]
     return Tracks(torch.stack(curves, 1).flatten(0, 1), Segments(*parts))
 

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
-from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, sinusoidal
+from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, places_of
 from sfms_robot.listeners.sfms.draw import Context, LastKeyframes
 from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.signals.control import COLUMNS
@@ -100,7 +100,7 @@ class SpeakerEncoder(nn.Module):
         x = torch.where(c.face_known[..., None], self.face_in(c.face), self.no_face)
         voice = c.voice if self.phase_in is None else c.voice + self.phase_in(c.phase)
         y = torch.where(c.heard[..., None], voice, self.no_voice)
-        places = sinusoidal(x.shape[1], x.shape[2], x.device).to(x)  # (P, W)
+        places = places_of(x)  # (P, W)
         x, y = x + places, y + places
         for face_layer, voice_layer in zip(self.face, self.voice, strict=True):
             x, y = face_layer(x, y), voice_layer(y, x)
@@ -180,7 +180,7 @@ class Predictor(nn.Module):
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         if self.control_in is not None:
             x = x + self.control_in(control)
-        x = x + sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
+        x = x + places_of(x)
         for block in self.own:
             x = block(x)
         return x

@@ -196,7 +196,6 @@ class Quantizer(nn.Module):
         most = max(map(len, own))
         self.member = nn.Buffer(member, persistent=False)
         self.drawn = nn.Buffer(member.amax(0), persistent=False)
-        self.levels = nn.Buffer(as_levels(levels), persistent=False)
         # Each group's channels in slots 0..: with a group per channel a full (G, C) matrix would be zeros but for 1/C.
         slots = torch.stack([F.pad(channels, (0, most - len(channels))) for channels in own])
         filled = torch.stack([(torch.arange(most) < len(channels)).float() for channels in own])

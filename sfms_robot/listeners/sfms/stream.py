@@ -25,6 +25,7 @@ from sfms_robot.frames import (
     FRAME_S,
     MOTION_DIM,
     SMILE_CORNERS,
+    Bools,
     Doubles,
     Floats,
     Plan,
@@ -69,10 +70,10 @@ class SpeakerState:
     audio: AudioState
     rows: Floats
     voice: Floats
-    heard: NDArray[np.bool_]
+    heard: Bools
     phase: Floats
     face: Floats
-    face_known: NDArray[np.bool_]
+    face_known: Bools
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +201,12 @@ class SfmsListener(RunsOnEngine):
         for speaker, memory in zip(speakers, memories, strict=True):
             same = id(speaker), id(memory.speaker)
             if same not in heard:
-                heard[same] = _listened(speaker, memory.speaker)
+                check_length(speaker.audio)
+                face = _NO_FACE if speaker.face is None else speaker.face.motion
+                # Nothing is computed until the next plan (see the module).
+                sound = np.array(speaker.audio, np.float32)  # a copy: the caller may use the array again
+                before = memory.speaker
+                heard[same] = changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
             found.append((None, changed(memory, frames=memory.frames + 1, speaker=heard[same])))
         due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
@@ -340,39 +346,26 @@ class SfmsListener(RunsOnEngine):
             "phase": phase,
         }
         # Each queue of P frames loses its oldest and gains the new ones.
-        found: dict[str, Any] = {
-            name: np.stack(
-                [
-                    np.concatenate([queue := getattr(state, name), own])[-len(queue) :]
-                    for state, own in zip(states, np.split(part, ends[:-1]), strict=True)
-                ]
-            )
-            for name, part in new.items()
-        }
+        found: dict[str, Any] = {}
+        for name, part in new.items():
+            each = zip(states, np.split(part, ends[:-1]), strict=True)
+            queues = [np.concatenate([getattr(state, name), own]) for state, own in each]
+            found[name] = np.stack([queue[-self.settings.past_frames :] for queue in queues])
         after = [
             SpeakerState(audio=sound, rows=rows[end - 1], **{name: part[row] for name, part in found.items()})
             for row, (sound, end) in enumerate(zip(audio, ends.tolist(), strict=True))
         ]
         return after, found
 
-    def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+    def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, Bools]:
         """Return standardised motion (N, C) and which faces are known, of motion (58,) of N frames, NaN where not."""
         rows = stacked(motion)
-        known: NDArray[np.bool_] = np.asarray(np.isfinite(rows).all(axis=1))
+        known: Bools = np.asarray(np.isfinite(rows).all(axis=1))
         # A face that is not known is 0, the mean of the data; `face_known` marks it for the encoder.
         faces = np.zeros((len(rows), self.space.dim), np.float32)
         if known.any():
             faces[known] = self.standardise(self.space.encode(rows[known]))
         return faces, known
-
-
-def _listened(speaker: SpeakerFrame, before: SpeakerState) -> SpeakerState:
-    """Return the state with a new frame. Raises ValueError for another number of samples than a frame has, or none."""
-    check_length(speaker.audio)
-    face = _NO_FACE if speaker.face is None else speaker.face.motion
-    # Nothing is computed until the next plan (see the module).
-    sound = np.array(speaker.audio, np.float32)  # a copy: the caller may use the array again
-    return changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
 
 
 def join(tail: Floats, decoded: Floats, seam: int) -> Floats:

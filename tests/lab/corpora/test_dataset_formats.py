@@ -245,7 +245,7 @@ def test_dualtalk_angles_in_arkit_s_edition_are_the_turns_of_flame_s(tmp_path):
     rows[:, 52:55] = Rotation.from_rotvec(vectors).as_euler("YXZ")
     np.save(file, rows)
     arkit = open_dataset(tmp_path, "test")[0]
-    flame = decode(open_dataset(tmp_path, "test", layout="dualtalk")[0].listener, "deca56").motion
+    flame = decode(open_dataset(tmp_path, "test", layout="dualtalk")[0].listener, "deca56")[0]
     np.testing.assert_allclose(arkit.listener[:, :3], flame[:, :3], atol=1e-6)
 
 

@@ -183,5 +183,5 @@ def test_nothing_is_drawn_that_is_faster_than_the_data():
         listener.model.head.high.fill_(2.0)
         listener.model.mean[-1].bias.fill_(9.0)
         z = torch.randn(7, listener.model.mean[0].in_features)
-        found = listener.model.sample(z, torch.randn(7, *listener.model.noise_shape))
+        found = listener.model.sample(z, torch.randn(7, *listener.noise_shape))
         assert float(found.max()) == 2.0 and float(found.min()) >= -1.5

@@ -234,7 +234,7 @@ def test_a_code_may_follow_itself_and_class_0_anything():
 def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     model, reach = listener_with_speed(0.1)
     quantizer = model.tokenizer.quantizer
-    codes = indices_to_codes(torch.arange(6)[:, None].expand(6, 2), quantizer.levels)
+    codes = indices_to_codes(torch.arange(6)[:, None].expand(6, 2), quantizer.codebook.levels)
     neck = quantizer.decode(codes[None])[0, :, :6].detach()
     for gap in (1, 5, 20):
         allowed = ~reach.too_soon(np.array([[3, 0]]), np.array([[gap, gap]]))[0, 0, 1:7]

@@ -48,7 +48,7 @@ def test_exact_placement_beats_every_other_mask(first: int, second: int, seed: i
 @cache
 def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
     torch.manual_seed(0)
-    return (ScoreNetwork(3, 2, 8, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
+    return (ScoreNetwork(3, 2, 8, 2, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
 
 
 @pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised", "adaptive"}))

@@ -38,7 +38,7 @@ from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import StateUnderstanding
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
-from sfms_robot.listeners.idle import lateral_channels
+from sfms_robot.listeners.idle import LATERAL, among_head
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.events import runs
@@ -242,7 +242,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) ->
     if model.settings.sway:  # of listening where there is any: speakers sway further, and no input tells them apart
         slow = corpus.by_dyad(frames.sway)
         listening = [one for one, scene in zip(slow, corpus.scenes, strict=True) if scene == "listening"]
-        fit_sway(model, listening or slow, lateral_channels(channels))
+        fit_sway(model, listening or slow, among_head(channels, LATERAL))
     if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))

@@ -24,7 +24,7 @@ from sfms_robot.lab.learning.corpus import (
 )
 from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners.audio_frontend import AudioFrontend
-from sfms_robot.listeners.idle import lateral_channels
+from sfms_robot.listeners.idle import LATERAL, among_head
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.predictor import last_keyframes
@@ -134,8 +134,8 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
     model.motion_std.copy_(spread)
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
-    if model.head:
-        fit_sway(model, corpus.by_dyad(corpus.frames.sway), lateral_channels(channels))
+    if model.swaying:
+        fit_sway(model, corpus.by_dyad(corpus.frames.sway), among_head(channels, LATERAL))
 
 
 def context(

@@ -35,7 +35,7 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
-from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
+from sfms_robot.listeners.sfms.quantizer import Grid, codes_to_indices, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
@@ -106,7 +106,8 @@ def listener_job(
     tokens_at, held = placed_tokens(model, corpus, tokens, listener, phase.tokens)
     motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
-    levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
+    codebook = model.tokenizer.quantizer.codebook
+    levels = codebook.levels if isinstance(codebook, Grid) else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
 
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
