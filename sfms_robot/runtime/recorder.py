@@ -421,4 +421,5 @@ def _number(value: float) -> float:
 
 
 def _numbers(values: NDArray[np.floating]) -> list[Any]:
-    return values.astype(np.float64).round(_DIGITS).tolist()
+    rounded: list[Any] = values.astype(np.float64).round(_DIGITS).tolist()
+    return rounded

@@ -340,7 +340,8 @@ def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: N
             try:
                 pause_s = next(steps)
             except StopIteration as end:
-                return end.value
+                result: T = end.value
+                return result
             wait(pause_s)
 
 

@@ -141,7 +141,8 @@ class Telemetry:
 
     def currents_mA(self) -> list[float]:
         """Return the last present current of every servo, NaN if not known."""
-        return self.extra[_CURRENT].tolist()
+        currents: list[float] = self.extra[_CURRENT].tolist()
+        return currents
 
     def supply_mA(self) -> float:
         """Return the sum of the known motor currents: an upper bound of what the servos take from the supply."""
