@@ -14,10 +14,9 @@ from functools import reduce
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config.kinematics import SerialNeck, Split
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Bools, Doubles
 from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
@@ -42,7 +41,7 @@ class Solved:
     """
 
     angles_rad: Doubles
-    reached: NDArray[np.bool_]
+    reached: Bools
     residual_rad: Doubles
     residual_m: Doubles
     shown: Doubles
@@ -194,5 +193,4 @@ def shrunk(servos_rad: Doubles, low_rad: Doubles, high_rad: Doubles) -> Doubles:
         over = np.where(servos_rad > high_rad, high_rad / servos_rad, 1.0)
         under = np.where(servos_rad < low_rad, low_rad / servos_rad, 1.0)
     factor = np.minimum(over, under).min(axis=-1, keepdims=True)
-    out: Doubles = np.clip(servos_rad * factor, low_rad, high_rad)
-    return out
+    return np.clip(servos_rad * factor, low_rad, high_rad)

@@ -21,11 +21,10 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
-from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Doubles, Floats
+from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Bools, Doubles, Floats
 from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.spaces import channel_of, motion_of
@@ -38,8 +37,6 @@ HEAD_S: Final = 0.6  # a head turn that follows it
 HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
 LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
 _NEVER_S: Final = -math.inf
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,15 +83,13 @@ class Request:
         """Return the weights (N, C) at (N,) instants."""
         times = times_s[:, None]
         risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
-        weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
-        return weight
+        return risen * (1.0 - ease((times - self.until_s) / self.fall_s))
 
     def values(self, times_s: Doubles) -> Doubles:
         """Return the values (N, C) at (N,) instants."""
         share = (times_s - self.since_s) / self.change_s
         share = ease(share) if self.smooth else np.clip(share, 0.0, 1.0)
-        value: Doubles = self.before + share[:, None] * (self.after - self.before)
-        return value
+        return self.before + share[:, None] * (self.after - self.before)
 
     def then(self, values: Doubles, which: Bools, seconds: float, now_s: float) -> Request:
         """Return the request with `which` (C,) of `values` (C,) from now on: risen, they stay for `seconds`."""

@@ -12,20 +12,19 @@ acceleration are central differences, so one sample lies one tick ahead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Reading
 from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
-from sfms_robot.runtime.clock import tick_times
+from sfms_robot.runtime.clock import TickTime, tick_times
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
@@ -71,7 +70,7 @@ class Parts:
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False
     halt: HaltLatch = field(default_factory=HaltLatch)
-    holds: NDArray[np.bool_] | None = None
+    holds: Bools | None = None
     heat: HeatGuard | None = None
     ignored: frozenset[str] = frozenset()
     missing: Callable[[], Sequence[str]] = tuple
@@ -100,9 +99,9 @@ class LoopState:
     goals_rad: Doubles
     retargeter: Any
     heat: Heat
-    released: NDArray[np.bool_]
+    released: Bools
     life: LifeState = LifeState()
-    presence: Presence = field(default_factory=Presence.start)
+    presence: Presence = field(default_factory=Presence)
     run: RunState = RunState()
     lost_joints: tuple[str, ...] = ()
     answer: Fade = Fade()
@@ -167,20 +166,8 @@ def drive(
                     )
                 )
         finally:
-            state = _ending(log, clock.now_s() - start_s, state)
-            if not parts.halt.causes:  # a head that was halted moves no more
-                seen = partial(_seen_on_the_way, observers, state)
-                come_to_rest(
-                    parts.bus,
-                    parts.limiter,
-                    state.limiter,
-                    from_rad=state.here_rad,
-                    rest_rad=parts.rest_rad,
-                    ticks=tick_times(clock, rate_hz, start_s),
-                    log=log,
-                    seen=seen,
-                )
-            log.state = state
+            ticks = tick_times(clock, rate_hz, start_s)
+            log.state = _ended(parts, observers, log, ticks, clock.now_s() - start_s, state)
     finally:
         parts.bus.stop("release")
     return "interrupted" if interrupted() else "done"
@@ -254,23 +241,29 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
     return replace(state, run=run, released=released)
 
 
-def _ending(log: RunLog, now_s: float, state: LoopState) -> LoopState:
+def _ended(
+    parts: Parts, observers: Observers, log: RunLog, ticks: Iterator[TickTime], now_s: float, state: LoopState
+) -> LoopState:
+    """Bring the head to rest; return the last state."""
     run = state.run.then(now_s, ending=True)
     log.entered(run, now_s)
+
+    def seen(time_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]) -> None:
+        """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
+        observers.tick(Tick(time_s, state.motion * np.float32(ahead), goals_rad, readings, run.name, run.why))
+
+    if not parts.halt.causes:  # a head that was halted moves no more
+        come_to_rest(
+            parts.bus,
+            parts.limiter,
+            state.limiter,
+            from_rad=state.here_rad,
+            rest_rad=parts.rest_rad,
+            ticks=ticks,
+            log=log,
+            seen=seen,
+        )
     return replace(state, run=run)
-
-
-def _seen_on_the_way(
-    observers: Observers,
-    state: LoopState,
-    now_s: float,
-    ahead: float,
-    goals_rad: Doubles,
-    readings: Mapping[str, Reading],
-) -> None:
-    """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
-    motion = state.motion * np.float32(ahead)
-    observers.tick(Tick(now_s, motion, goals_rad, readings, state.run.name, state.run.why))
 
 
 def turned_by_hand(planned: Floats, asked: Floats) -> bool:
@@ -337,7 +330,7 @@ def _halted(parts: Parts, now_s: float, state: LoopState) -> tuple[LoopState, Ti
     return replace(state, limiter=limiter, goals_rad=goals_rad, released=released, stands=stands), command
 
 
-def _let_go(parts: Parts, which: NDArray[np.bool_]) -> None:
+def _let_go(parts: Parts, which: Bools) -> None:
     parts.bus.release([joint for joint, each in zip(parts.retargeter.joints, which, strict=True) if each])
 
 
@@ -363,7 +356,7 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
 
 
 def _eased_in_from(
-    parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: LoopState, now_s: float
+    parts: Parts, log: RunLog, stands_rad: Doubles, which: Bools, state: LoopState, now_s: float
 ) -> LoopState:
     """Return the state in which `which` (J,) joints ease in from standing at `stands_rad` (J,), from `now_s` on."""
     log.restart(which, stands_rad)

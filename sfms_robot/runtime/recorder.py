@@ -57,6 +57,7 @@ _log = logging.getLogger(__name__)
 
 _NUMBER: Final = {"type": "number"}
 _NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
+_NUMBERS: Final = {"type": "array", "items": _NUMBER}
 _NUMBERS_OR_NULL: Final = {"type": ["array", "null"], "items": _NUMBER}
 _PCM16: Final = {"type": "string", "contentEncoding": "base64"}
 _CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
@@ -83,9 +84,9 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
     },
     "/plan": {
         "made_at_s": _NUMBER,
-        "times_s": {"type": "array", "items": _NUMBER},
-        "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
-        "jaw_rad": {"type": ["array", "null"], "items": {"type": "array", "items": _NUMBER}},
+        "times_s": _NUMBERS,
+        "frames": {"type": "array", "items": _NUMBERS},
+        "jaw_rad": {"type": ["array", "null"], "items": _NUMBERS},
         "hazards_hz": {"type": "object", "additionalProperties": _NUMBER},
     },
     "/event": {
@@ -152,13 +153,16 @@ class Recorder(Observer):
         """Queue a tick. The readings are copied, because the bus may change its own later."""
         self._put(replace(seen, readings=dict(seen.readings)))
 
-    def heard(self, frame: SpeakerFrame) -> None:
-        """Queue a frame of the person."""
-        self._put(frame)
+    def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
+        """Queue a tick, a frame of the person or a plan of the listener."""
+        if self._closed:
+            return
+        try:
+            self._queue.put(value, block=self._wait)
+        except queue.Full:
+            self._dropped += 1
 
-    def planned(self, plan: Plan) -> None:
-        """Queue a plan of the listener."""
-        self._put(plan)
+    heard = planned = _put
 
     def close(self) -> None:
         """Write what is queued and finish the file. Idempotent."""
@@ -177,14 +181,6 @@ class Recorder(Observer):
         """Return figures for the report: messages written, values dropped, bytes on disk, and trouble with the file."""
         size = sum(part.stat().st_size for part in parts_of(self._folder))
         return {"messages": self._written, "dropped": self._dropped, "bytes": size, "trouble": self._trouble}
-
-    def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
-        if self._closed:
-            return
-        try:
-            self._queue.put(value, block=self._wait)
-        except queue.Full:
-            self._dropped += 1
 
     def _begin(self) -> None:
         """Open the next file and write its head. Raises ConfigError where it cannot be written."""

@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError, RobotError
 from sfms_robot.frames import Doubles, Reading
@@ -33,7 +32,7 @@ FAILED: Final = "bus failed"
 
 
 class Writer:
-    """A thread for one bus, from construction until `close`. `raise_failure` raises what ended it.
+    """A thread for one bus, from construction until `close`. `readings` raises what ended it.
 
     The newest goals win: goals that come while a write is in progress replace one another. Nothing is sent that the
     loop did not ask for: if the loop stops, so does the wire, and the servos' watchdogs see it.
@@ -62,15 +61,14 @@ class Writer:
             self._goals = goals_rad.copy(), now_s
             self._changed.notify()
 
-    def raise_failure(self) -> None:
-        """Raise what ended the thread, if anything did."""
+    def readings(self, now_s: float) -> Mapping[str, Reading]:
+        """Return the last readings, older by the time since; empty before the first tick of the bus.
+
+        Raises what ended the thread, if anything did.
+        """
         with self._changed:
             if self._failure is not None:
                 raise self._failure
-
-    def readings(self, now_s: float) -> Mapping[str, Reading]:
-        """Return the last readings, older by the time since; empty before the first tick of the bus."""
-        with self._changed:
             later_s = max(0.0, now_s - self._read_s)
             out = {
                 joint: replace(each, age_s=each.age_s + later_s, rejoined=joint in self._back)
@@ -155,7 +153,7 @@ class CompositeBus:
             self.close()
             raise
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Enable joints as `ports.Bus`, one bus after the other, for supplies that cannot start many at once.
 
         A bus that has a thread continues in a new one. Joints of a bus that has failed count as absent.
@@ -282,7 +280,6 @@ class CompositeBus:
         writer = self._writers.get(name)
         if writer is None:
             return bus.poll(now_s)
-        writer.raise_failure()
         return writer.readings(now_s) or {joint: Reading(None, float("inf")) for joint in bus.joints}
 
     def _fail(self, name: str, error: Exception) -> None:

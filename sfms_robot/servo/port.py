@@ -134,7 +134,7 @@ class SerialPort:
 
     def __init__(self, device: str, baud: int, clock: Clock, rs485: Rs485 | None = None) -> None:
         self.name = device
-        self._clock = clock
+        self.now_s, self.wait_until = clock.now_s, clock.wait_until
         self._serial = _open(device, baud)
         try:
             self._io = serial_io(self._serial, device, rs485)
@@ -162,12 +162,6 @@ class SerialPort:
         except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
 
-    def now_s(self) -> float:
-        return self._clock.now_s()
-
-    def wait_until(self, time_s: float) -> None:
-        self._clock.wait_until(time_s)
-
     def set_baud(self, baud: int) -> None:
         if _is_socket(self.name) and baud != self._serial.baudrate:
             raise PortError(f"{self.name}: cannot change to {baud} baud: a socket:// port has the rate of its server")
@@ -189,7 +183,7 @@ class VirtualTimePort:
 
     def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
         self.name = device
-        self._clock = clock
+        self.now_s, self.wait_until = clock.now_s, clock.wait_until
         self._written = 0
         self._announced = 0  # of them, those that the emulator has taken
         self._wanted_from = 0
@@ -209,9 +203,9 @@ class VirtualTimePort:
         self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
 
     def write(self, data: bytes) -> None:
-        now_s = self._clock.now_s()
-        if self._announced < self._written and self._written_at_s < now_s:
-            self._exchange(self._written_at_s)
+        now_s = self.now_s()
+        if self._written_at_s < now_s:
+            self._announce()
         for start in range(0, len(data), self._WINDOW):
             chunk = data[start : start + self._WINDOW]
             if self._written + len(chunk) - self._announced > self._WINDOW:
@@ -225,7 +219,7 @@ class VirtualTimePort:
 
     def read(self, n: int, deadline_s: float) -> bytes:
         if not self._inbox:
-            self._exchange(self._clock.now_s(), deadline_s)
+            self._exchange(self.now_s(), deadline_s)
         data = bytes(self._inbox[:n])
         del self._inbox[:n]
         return data
@@ -234,25 +228,23 @@ class VirtualTimePort:
         self._inbox.clear()
         self._wanted_from = self._written  # answers to earlier bytes need not even be sent
 
-    def now_s(self) -> float:
-        return self._clock.now_s()
-
-    def wait_until(self, time_s: float) -> None:
-        self._clock.wait_until(time_s)
-
     def set_baud(self, baud: int) -> None:
-        if self._announced < self._written:
-            self._exchange(self._written_at_s)
+        self._announce()
         self._serial.baudrate = baud
 
     def close(self) -> None:
-        if self._serial.is_open and self._announced < self._written:
+        if self._serial.is_open:
             try:
-                self._exchange(self._written_at_s)
+                self._announce()
             except BusError:
                 self._inbox.clear()  # the emulator is gone
         _shut(self._serial)
         self._control.close()
+
+    def _announce(self) -> None:
+        """Let the emulator take what it has not taken yet, at the time of the last write."""
+        if self._announced < self._written:
+            self._exchange(self._written_at_s)
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
         """Let the emulator take the bytes written, at `now_s`, and read all that it sends by `until_s`."""

@@ -22,7 +22,6 @@ from contextlib import closing
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
@@ -86,6 +85,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         reconnect_s = config.reconnect_s if config is not None else RECONNECT_S
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
+        self.capabilities = dict.fromkeys(self.joints, _CAPABILITIES)
         self._confirmed = confirmed
         table = board_of(name, servos)
         self.model = table.model
@@ -113,10 +113,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._status_due_s: float | None = None  # when to ask the board next
         self._unanswered = 0
         self._next_on_s = -math.inf  # when the next waiting output may come on
-
-    @property
-    def capabilities(self) -> Mapping[str, frozenset[str]]:
-        return dict.fromkeys(self.joints, _CAPABILITIES)
 
     def connect(self) -> None:
         """Open the port and find the board, pulses left unchanged.
@@ -154,7 +150,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.pulse = pulses[output.channel]
         return pulses is not None
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
 
         Blocks for 0.7 s a joint, and a few answers. Raises ConfigError unless the user has confirmed that joints may

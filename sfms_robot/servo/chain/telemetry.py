@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Ints, Reading
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.registers import Field, Table, span_of
 
@@ -96,7 +96,7 @@ class Telemetry:
         self._columns = [column for column in columns if np.isfinite(column[3]).any()]
         self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
         self._conversion = conversion
-        self.ticks: NDArray[np.int64] = np.zeros(len(tables), np.int64)
+        self.ticks: Ints = np.zeros(len(tables), np.int64)
         self.seen_s = np.full(len(tables), -np.inf)
         self.extra = np.full((len(_EXTRA), len(tables)), np.nan)
 
@@ -218,9 +218,8 @@ def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) ->
     raw: NDArray[Any] = np.ndarray(len(rows) // length, raw_type, rows, field.address - start, strides=(length,))
     if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)
         return np.asarray(raw.astype(np.int64) - 2048)
-    if field.signed.startswith("sign_bit_"):
-        # A bit above the magnitude is the sign (AX speed and load, Feetech).
-        wide, bit = raw.astype(np.int64), 1 << int(field.signed[9:])
+    if bit := field.sign_bit:  # AX speed and load, Feetech
+        wide = raw.astype(np.int64)
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)
     return raw
