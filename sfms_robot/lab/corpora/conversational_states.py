@@ -54,7 +54,8 @@ def label(heard: Voices) -> NDArray[np.int8]:
     """Return one state per frame (N,); see the table above."""
     agent, user = heard.agent, heard.user
     told, answered = agent & heard.agent_feedback, user & heard.user_feedback
-    own_turn = _own_turn(agent & ~told, user & ~answered)
+    floor = np.where(agent & ~told, 1, np.where(user & ~answered, -1, 0))
+    own_turn = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)  # the agent had the floor, and has it next
     rules = (  # the first that holds
         (told, "giving_feedback"),
         (agent & answered, "receiving_feedback"),
@@ -66,13 +67,6 @@ def label(heard: Voices) -> NDArray[np.int8]:
         (own_turn, "thinking"),
     )
     return np.select([rule for rule, _ in rules], [STATE[name] for _, name in rules], STATE["waiting"]).astype(np.int8)
-
-
-def _own_turn(agent: Mask, user: Mask) -> Mask:
-    """Return frames (N,) before and after which the agent is the next to have the floor, at any distance."""
-    floor = np.where(agent, 1, np.where(user, -1, 0))
-    own: Mask = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)
-    return own
 
 
 def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, UNREADABLE, WIDTHS, WITHOUT_SHAPE, WITHOUT_UNIT, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, Problem, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Problem, guarded
 from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
@@ -80,7 +80,7 @@ def splits(place: Path) -> Mapping[str, str]:
     return {ours: theirs for ours, theirs in SPLITS.items() if any(_archives(place, theirs, one) for one in patterns)}
 
 
-def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     files, seen = _files(place, split), Counter[str]()
     interactions: dict[str, list[str]] = defaultdict(list)
     for name in files:
