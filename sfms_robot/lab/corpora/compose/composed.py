@@ -16,7 +16,7 @@ than they occur in the meetings; a set of enough minutes holds every stretch onc
 
 A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
-the filmed recordings themselves (`speaking.py`). Each is a data set of its own in a folder of that name.
+the filmed recordings themselves (`speaking.py`). Each is a separate data set, in a folder of that name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
@@ -38,7 +38,8 @@ from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
-from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
+from sfms_robot.lab.corpora.compose.motions import pick
+from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
     VoiceClip,
@@ -140,7 +141,8 @@ def compose_folder(
 ) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
-    Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
+    Two further sets of the same form go into out/interaction and out/speaking; without a filmed voice there is no
+    speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
     ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
@@ -150,61 +152,61 @@ def compose_folder(
     ConfigError.
     """
     folders = {"listening": out, **{name: out / name for name in SHARES}}
-    wanted = {name: SHARES.get(name, 1.0) * minutes for name in folders}
+    parts = [
+        Part(name, split, folder, SHARES.get(name, 1.0) * minutes)
+        for name, folder in folders.items()
+        for split in SPLITS
+    ]
     if not overwrite and (earlier := sorted(file for folder in folders.values() for file in _composed(folder))):
         raise ConfigError(
             f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
         )
-    parts = [(name, split) for name in folders for split in SPLITS]
-    found: dict[tuple[str, Split], list[tuple[Path, float]]] = {}
+    written: dict[Part, dict[Path, float]] = {part: {} for part in parts}
     done = dict.fromkeys(folders, 0.0)
-    for part, file, minute in _written(data, folders, wanted, seed, parts, jobs):
-        found.setdefault(part, []).append((file, minute))
-        done[part[0]] += minute
+    for part, file, minute in _written(data, parts, seed, jobs):
+        written[part][file] = minute
+        done[part.name] += minute
         if told:
-            told(part[0], wanted[part[0]] * (1 + 2 * HELD_OUT_SHARE), done[part[0]])
-    fresh = {file for files in found.values() for file, _ in files}
-    for stale in {file for folder in folders.values() for file in _composed(folder)} - fresh:
+            told(part.name, part.minutes * (1 + 2 * HELD_OUT_SHARE), done[part.name])
+    for stale in {file for folder in folders.values() for file in _composed(folder)}.difference(*written.values()):
         stale.unlink()
-    names = {(name, split): split if name == "listening" else f"{name}_{split}" for name, split in parts}
-    return {names[part]: sum(minute for _, minute in found.get(part, ())) for part in parts}
+    return {
+        part.split if part.name == "listening" else f"{part.name}_{part.split}": sum(files.values())
+        for part, files in written.items()
+    }
 
 
-Part = tuple[str, Split]  # a set and one of its splits
+@dataclass(frozen=True)
+class Part:
+    """A split of a set, the folder of the set, and the minutes wanted of its training split."""
+
+    name: str
+    split: Split
+    folder: Path
+    minutes: float
+
+    def write(self, material: Mapping[Split, Material], seed: int) -> Iterator[tuple[Part, Path, float]]:
+        """Write the dyads of the part; yield the file and minutes of each."""
+        for dyad in dyads(material, self.name, self.split, seed, self.minutes):
+            save(self.folder / self.split, [dyad])
+            yield self, self.folder / self.split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
 
 
-def _written(
-    data: Path, folders: Mapping[str, Path], wanted: Mapping[str, float], seed: int, parts: Sequence[Part], jobs: int
-) -> Iterator[tuple[Part, Path, float]]:
+def _written(data: Path, parts: Sequence[Part], seed: int, jobs: int) -> Iterator[tuple[Part, Path, float]]:
     """Yield each dyad once it is written: its part, file and minutes; with several jobs, part by part."""
     if jobs == 1:
-        material = material_of(data)
         for part in parts:
-            for file, minute in write_part(material, part, folders[part[0]], seed, wanted[part[0]]):
-                yield part, file, minute
+            yield from part.write(material_of(data), seed)
         return
     with process_pool(min(jobs, len(parts))) as pool:
-        largest = sorted(parts, key=lambda part: (part[1] != "train", -wanted[part[0]]))
-        of = {pool.submit(_whole_part, data, part, folders[part[0]], seed, wanted[part[0]]): part for part in largest}
-        for ended in as_completed(of):
-            yield from ((of[ended], file, minute) for file, minute in ended.result())
+        largest = sorted(parts, key=lambda part: (part.split != "train", -part.minutes))
+        for ended in as_completed([pool.submit(_whole_part, data, part, seed) for part in largest]):
+            yield from ended.result()
 
 
-def _whole_part(data: Path, part: Part, folder: Path, seed: int, minutes: float) -> list[tuple[Path, float]]:
+def _whole_part(data: Path, part: Part, seed: int) -> list[tuple[Part, Path, float]]:
     """Write a part, in a process of a pool."""
-    return [*write_part(material_of(data), part, folder, seed, minutes)]
-
-
-def write_part(
-    material: Mapping[Split, Material], part: Part, folder: Path, seed: int, minutes: float
-) -> Iterator[tuple[Path, float]]:
-    """Write the dyads of a part; yield the file and minutes of each."""
-    name, only = part
-    scene: Scene = "interaction" if name == "interaction" else "listening"
-    make = monologues if name == "speaking" else partial(dyads, scene=scene)
-    for split, dyad in make(material, seed, minutes, only=only):
-        save(folder / split, [dyad])
-        yield folder / split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
+    return [*part.write(material_of(data), seed)]
 
 
 @lru_cache(maxsize=1)
@@ -221,53 +223,36 @@ def _composed(out: Path) -> set[Path]:
     return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
 
 
-def dyads(
-    material: Mapping[Split, Material],
-    seed: int,
-    minutes: float,
-    scene: Scene = "listening",
-    only: Split | None = None,
-) -> Iterator[tuple[Split, Dyad]]:
-    """Yield dyads one by one, as (split, dyad): for sets that need not fit in memory; `only` of one split.
+def dyads(material: Mapping[Split, Material], name: str, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
+    """Yield the dyads of one split of a set, one by one: for sets that need not fit in memory.
 
-    Raises ConfigError.
+    `minutes`: of the training split. Without filmed voices, the set `speaking` has none. Raises ConfigError.
     """
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
-    for number, split in enumerate(SPLITS):
-        if only not in (None, split):
-            continue
-        rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
-        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
-        for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
-            yield split, compose_one(stretch, material[split], rng)
-
-
-def monologues(
-    material: Mapping[Split, Material], seed: int, minutes: float, only: Split | None = None
-) -> Iterator[tuple[Split, Dyad]]:
-    """Yield dyads in which only the agent speaks; none for a split without filmed voices; `only` of one split."""
-    for number, split in enumerate(SPLITS):
-        if only not in (None, split):
-            continue
-        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
-        part = material[split]
-        for dyad in speaking.dyads(part.voices, part.motions, part.dwell, [seed, number, 2], wanted):
-            yield split, dyad
+    number, own = SPLITS.index(split), material[split]
+    wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+    if name == "speaking":
+        yield from speaking.dyads(own.voices, own.motions, own.dwell, [seed, number, 2], wanted)
+        return
+    scene: Scene = "interaction" if name == "interaction" else "listening"
+    rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
+    for stretch in choose(stretches(own.people, rng, scene), wanted, rng):
+        yield compose_one(stretch, own, rng)
 
 
 def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
     """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
-    return fitting[int(rng.integers(len(fitting)))]
+    return pick(fitting, rng)
 
 
 def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
     """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
-    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+    return pick(fitting, rng) if fitting else None
 
 
 # --- which stretches --------------------------------------------------------------------------------------------
@@ -335,7 +320,11 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     person, frames = stretch.person, stretch.frames
     voice = cast(material.voices, rng)
     others, own = active(person.others, stretch), active(person.talk, stretch)
-    said, mouth = _own_words(stretch, own_voice(material.voices, voice, rng), rng.spawn(1)[0])
+    spoken, speaking_rng = own_voice(material.voices, voice, rng), rng.spawn(1)[0]
+    said = mouth = None
+    if spoken is not None:
+        speech, mouth = _laid(person.talk, stretch, spoken, speaking_rng)
+        said = speaking.sent(speech, speaking_rng)
     score = Score(
         frames=frames,
         nods=within(person.nods, stretch),
@@ -378,15 +367,10 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     )
 
 
-def _own_words(
-    stretch: Stretch, voice: VoiceClip | None, rng: np.random.Generator
-) -> tuple[Floats | None, Floats | None]:
-    """Return the listener's own voice (N * 640,), as sent to a loudspeaker, and its mouth (N, 52)."""
-    if voice is None:
-        return None, None
-    said = np.clip(stretch.person.talk - stretch.start_s, 0, stretch.frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
-    return speaking.sent(speech, rng), mouth
+def _laid(spans: Doubles, stretch: Stretch, voice: VoiceClip, rng: np.random.Generator) -> tuple[Floats, Floats | None]:
+    """Return sound and mouth (`voices.lay`) of a voice that speaks in spans (K, 2) of the meeting."""
+    said = np.clip(spans - stretch.start_s, 0, stretch.frames * FRAME_S)
+    return lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
 
 
 def speaker_of(
@@ -395,15 +379,14 @@ def speaker_of(
     motions: Motions,
     rng: np.random.Generator,
     laughter: Sequence[Floats] = (),
-    smiles: Doubles | None = None,
+    smiles: Doubles = NO_SPANS,
 ) -> tuple[Floats, Floats]:
     """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen.
 
     `smiles`: (K, 3) start, end [s] and size of theirs, besides those of laughs.
     """
     person, frames = stretch.person, stretch.frames
-    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    speech, mouth = _laid(person.others, stretch, voice, rng)
     laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
     audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
     if rng.random() < _FACELESS:

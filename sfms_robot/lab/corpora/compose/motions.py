@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy import signal
@@ -14,6 +14,7 @@ SHAPE: Final = {name: index for index, name in enumerate(BLENDSHAPES)}
 
 FADE: Final = FRAME_HZ
 SMILE: Final = [SHAPE[name] for name in SMILE_CORNERS]
+_Item = TypeVar("_Item")
 
 
 def slow(pose: Floats, cut_hz: float = 0.8) -> Floats:
@@ -88,8 +89,9 @@ def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> Listene
     return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
-def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    return pieces[int(rng.integers(len(pieces)))]
+def pick(items: Sequence[_Item], rng: np.random.Generator) -> _Item:
+    """Draw one, each as likely as any other."""
+    return items[int(rng.integers(len(items)))]
 
 
 def over(below: Floats, above: Floats) -> Floats:

@@ -16,6 +16,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floa
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
+from sfms_robot.lab.corpora.compose.motions import pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
@@ -85,18 +86,15 @@ def sent(speech: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(np.clip(gain * speech + floor, -1, 1), np.float32)
 
 
-# --- Where listeners look: annotated looks away from whoever has the floor, and how long people look, learned from them
+# --- Where listeners look: annotated looks away from the person with the floor, and durations learned from them -----
 #
 # Across a table with papers people look away a lot more than in front of one face, and watch slides for minutes: a
-# share
-# of the looks is kept, and none lasts longer than a look aside by lot of those who had no table between them
-# (`signals.event_sizes`), which is what a listener's own events go by. What is drawn where nobody annotated gaze goes
-# by
-# these kept ones, at somebody and away in turns, each as long as some annotated one was. That they do not hang on what
-# is
-# heard is ours.
+# share of the looks is kept, and none lasts longer than a look aside drawn for people without a table between them
+# (`signals.event_sizes`), which is what a listener's own events go by. Where gaze was not annotated, looks are drawn
+# from these kept ones: at the person and away in turns, each as long as some annotated one was. That they do not
+# depend on what is heard is ours.
 
-Look = tuple[float, float, str]  # start, end, where (`acting.Score.gaze`)
+Look = tuple[float, float, str]  # start, end, where (`render_events.Score.gaze`)
 
 _KEPT: Final = 0.4
 _NEAR_S: Final = 300.0  # no look is longer
@@ -115,11 +113,11 @@ class Dwell:
         found: list[Look] = []
         if not self.at_s or not self.away:
             return ()
-        at = float(rng.uniform(0, 1)) * self.at_s[int(rng.integers(len(self.at_s)))]
+        at = float(rng.uniform(0, 1)) * pick(self.at_s, rng)
         while at < length_s:
-            lasts_s, where = self.away[int(rng.integers(len(self.away)))]
+            lasts_s, where = pick(self.away, rng)
             found.append((at, min(at + lasts_s, length_s), where))
-            at += lasts_s + self.at_s[int(rng.integers(len(self.at_s)))]
+            at += lasts_s + pick(self.at_s, rng)
         return tuple(found)
 
 

@@ -19,7 +19,7 @@ from scipy.signal import oaconvolve
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
-from sfms_robot.lab.corpora.compose.motions import SHAPE
+from sfms_robot.lab.corpora.compose.motions import SHAPE, pick
 from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
@@ -88,14 +88,14 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
         rows = columns(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
-        said = list(
-            zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True)
-        )
-        for (clip, start, end, _), text in zip(said, rows["text"], strict=True):
-            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind in said)
+        starts_s, ends_s = (map(float, rows[name]) for name in ("start_s", "end_s"))
+        said = list(zip(rows["clip"], starts_s, ends_s, rows["kind"], rows["text"], strict=True))
+        for clip, start, end, _, text in said:
+            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind, _ in said)
             if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
                 audio = read_audio(folder / clip)[int(start * AUDIO_HZ) : int(end * AUDIO_HZ)]
-                found.append((split_of_voice(Path(clip).stem), _eased(audio * (_LEVEL / np.sqrt(np.mean(audio**2))))))
+                levelled = np.clip(audio * (_LEVEL / np.sqrt(np.mean(audio**2))), -1, 1)
+                found.append((split_of_voice(Path(clip).stem), _eased(levelled)))
     return by_split(found)
 
 
@@ -105,18 +105,19 @@ def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Float
     for start_s, end_s in spans_s if laughter else ():
         at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
         while end - at > _FADE:
-            piece = laughter[int(rng.integers(len(laughter)))][: end - at]
+            piece = pick(laughter, rng)[: end - at]
             out[at : at + len(piece)] += np.float32(rng.uniform(0.5, 1.2)) * _eased(piece)
             at += len(piece)
     return out
 
 
-def _eased(sound: Floats) -> Floats:
+def _eased(sound: Floats, longest: int = _FADE) -> Floats:
+    """Return sound (n,) that fades in and out over `longest` samples, or over half of it."""
     ramp = np.ones(len(sound), np.float32)
-    fade = min(_FADE, len(sound) // 2)
+    fade = min(longest, len(sound) // 2)
     ramp[:fade] = np.linspace(0, 1, fade)
     ramp[len(ramp) - fade :] = np.linspace(1, 0, fade)
-    return np.asarray(np.clip(sound, -1, 1) * ramp, np.float32)
+    return sound * ramp
 
 
 def read_voice(file: Path) -> VoiceClip:
@@ -131,15 +132,11 @@ def read_voice(file: Path) -> VoiceClip:
         raise ConfigError(f"{file}: no speech found in it")
     pieces, breaks, total = [], [], 0
     for number, (start, end) in enumerate(speech):
-        piece = audio[start:end].copy()
-        piece[:_JOIN] *= np.linspace(0, 1, _JOIN, dtype=np.float32)
-        piece[-_JOIN:] *= np.linspace(1, 0, _JOIN, dtype=np.float32)
-        pieces.append(piece)
-        total += len(piece)
+        pieces.append(_eased(audio[start:end], _JOIN))
+        total += len(pieces[-1])
         if number + 1 == len(speech) or speech[number + 1][0] - end >= _PHRASE:
             breaks.append(total)
-    joined = np.concatenate(pieces)
-    joined = _levelled(joined)
+    joined = _levelled(np.concatenate(pieces))
     keep = ~_lulls(joined)
     ends = np.cumsum(keep)[np.array(breaks) // _GRAIN - 1] * _GRAIN
     joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
@@ -254,10 +251,7 @@ def lay(
         # Recordings go on where they were, a phrase or two further: the same words do not come at once again.
         last = (last + int(rng.integers(1, 4))) % len(voice.ends)
         index = np.arange(voice.ends[last] - (end - start), voice.ends[last]) % len(voice.audio)
-        piece = voice.audio[index] * np.float32(rng.uniform(0.8, 1.25))
-        piece[:_FADE] *= np.linspace(0, 1, _FADE, dtype=np.float32)
-        piece[-_FADE:] *= np.linspace(1, 0, _FADE, dtype=np.float32)
-        audio[start:end] = piece
+        audio[start:end] = _eased(voice.audio[index] * np.float32(rng.uniform(0.8, 1.25)))
         if mouth is not None and voice.mouth is not None:
             covered = np.arange(start // FRAME_SAMPLES, end // FRAME_SAMPLES)  # frames that end inside
             spoken = index[(covered + 1) * FRAME_SAMPLES - 1 - start] // _GRAIN
@@ -298,7 +292,7 @@ def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.rand
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """
-    source = talk[int(rng.integers(len(talk)))]
+    source = pick(talk, rng)
     piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
     power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
     level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)
