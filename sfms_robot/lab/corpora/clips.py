@@ -213,14 +213,14 @@ def read(file: Path) -> Dyad:
             optional: dict[str, Any] = {
                 key: arrays[key].astype(read) for key, (_, read) in _OPTIONAL.items() if key in arrays
             }
+            if "space" in arrays:
+                optional |= {"space": str(arrays["space"]), "fps": float(arrays["fps"])}
             return Dyad(
                 name=file.stem,
                 audio=_voice(arrays, "audio"),
                 speaker=arrays["speaker"].astype(np.float32),
                 listener=arrays["listener"].astype(np.float32),
                 listening=arrays["listening"].astype(bool),
-                space=str(arrays["space"]) if "space" in arrays else "arkit58",
-                fps=float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
                 features={key.removeprefix(FEATURE): arrays[key] for key in arrays if key.startswith(FEATURE)},
                 agent_audio=_voice(arrays, "agent_audio"),
                 events=_events(arrays["events"]) if "events" in arrays else None,
@@ -261,14 +261,9 @@ def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
 def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
     return tuple(
         ListenerEvent(
-            str(row["kind"]),
-            float(row["start_s"]),
-            float(row["duration_s"]),
-            float(row["size"]),
-            int(row["swings"]),
-            None if np.isnan(row["target_rad"]).any() else (float(row["target_rad"][0]), float(row["target_rad"][1])),
+            kind, start_s, duration_s, size, swings, None if np.isnan(target).any() else tuple(target.tolist())
         )
-        for row in rows.astype(_EVENT)
+        for start_s, duration_s, size, kind, swings, target in rows.astype(_EVENT).tolist()
     )
 
 

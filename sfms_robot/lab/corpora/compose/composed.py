@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -37,8 +36,8 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubl
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
-from sfms_robot.lab.corpora.compose.motions import pick
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
@@ -55,6 +54,7 @@ from sfms_robot.lab.corpora.compose.voices import (
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes
+from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)
@@ -241,14 +241,14 @@ def dyads(material: Mapping[Split, Material], name: str, split: Split, seed: int
         yield compose_one(stretch, own, rng)
 
 
-def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
+def cast(voices: Sequence[VoiceClip], rng: Rng) -> VoiceClip:
     """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
     return pick(fitting, rng)
 
 
-def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
+def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: Rng) -> VoiceClip | None:
     """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
@@ -258,7 +258,7 @@ def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Gene
 # --- which stretches --------------------------------------------------------------------------------------------
 
 
-def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
+def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listening") -> list[Stretch]:
     """Cut the time of each person into pieces of 30 to 60 s; keep those on camera that fit the scene.
 
     Listening: the person mostly listens. Interaction: the person talks at least a fifth of the time, and so do the
@@ -285,7 +285,7 @@ def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: 
     return found
 
 
-def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -> list[Stretch]:
+def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
     """Draw about `minutes` of stretches without repetition, by weight; all of them where there are no more.
 
     Systematic draw along the nod rate: even a small set has the rates of the large one.
@@ -315,7 +315,7 @@ def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
 # --- one dyad ---------------------------------------------------------------------------------------------------
 
 
-def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) -> Dyad:
+def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
     """Return one stretch as a dyad: cast, acted and voiced."""
     person, frames = stretch.person, stretch.frames
     voice = cast(material.voices, rng)
@@ -367,7 +367,7 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     )
 
 
-def _laid(spans: Doubles, stretch: Stretch, voice: VoiceClip, rng: np.random.Generator) -> tuple[Floats, Floats | None]:
+def _laid(spans: Doubles, stretch: Stretch, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:
     """Return sound and mouth (`voices.lay`) of a voice that speaks in spans (K, 2) of the meeting."""
     said = np.clip(spans - stretch.start_s, 0, stretch.frames * FRAME_S)
     return lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
@@ -377,7 +377,7 @@ def speaker_of(
     stretch: Stretch,
     voice: VoiceClip,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
     laughter: Sequence[Floats] = (),
     smiles: Doubles = NO_SPANS,
 ) -> tuple[Floats, Floats]:
@@ -413,12 +413,12 @@ def attention_of(stretch: Stretch) -> Floats:
     return out
 
 
-def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+def _spans(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     """Return spans (K, 2) of what one agent did, or all."""
     return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
-def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
+def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> tuple[LabelledSpan, ...]:
     """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
     if stretch.person.gaze is None:
         return dwell.looks(stretch.frames * FRAME_S, rng)
@@ -428,7 +428,7 @@ def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tu
     )
 
 
-def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
+def active(spans: Doubles, stretch: Stretch) -> Bools:
     """Return frames (N,) whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
     for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
@@ -455,7 +455,7 @@ _LOST_A_MINUTE: Final = 2.0
 _LOST_S: Final = (0.3, 3.0)
 
 
-def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
+def heard(speech: Floats, voice: VoiceClip, rng: Rng) -> Floats:
     """Return speech (n,) with room, spectral tilt, gain and noise floor."""
     direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
     tilt = np.float32(rng.uniform(*_TILT))
@@ -464,7 +464,7 @@ def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     return np.asarray(np.clip(gain * toned + room(len(speech), voice, rng), -1, 1), np.float32)
 
 
-def seen(motion: Floats, rng: np.random.Generator) -> Floats:
+def seen(motion: Floats, rng: Rng) -> Floats:
     """Return a face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
     frames = len(motion)
     out = motion.copy()

@@ -31,6 +31,7 @@ from sfms_robot.lab.corpora.compose.motions import (
     FADE,
     SHAPE,
     SMILE,
+    Rng,
     edges,
     first_frame,
     held,
@@ -99,7 +100,7 @@ class Acted:
     head_of_gaze_rad: Floats
 
 
-def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
+def act(score: Score, motions: Motions, rng: Rng) -> Acted:
     """Return one listener, whose manners (size and pace of nods, blinks, places of looks) are drawn."""
     motion = np.zeros((score.frames, MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
@@ -124,7 +125,7 @@ def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
 def speaker_motion(
     mouth: Floats,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
     attention: Floats | None = None,
     laughs: Doubles = NO_SPANS,
     nods: Doubles = NO_SPANS,
@@ -175,7 +176,7 @@ def _mirror_image(acted: Acted) -> Acted:
 # --- head -------------------------------------------------------------------------------------------------------
 
 
-def _sway(pose: Floats, motions: Motions, rng: np.random.Generator) -> None:
+def _sway(pose: Floats, motions: Motions, rng: Rng) -> None:
     """Fill a pose (N, 6) with the slow motion of a head at rest, as recorded: about a degree, and millimetres."""
     unit = [piece / (piece.std(axis=0) + 1e-6) for piece in motions.sway]
     size = np.deg2rad(rng.uniform(0.4, 1.1)) * np.array([1.0, 0.8, 1.0], np.float32)
@@ -184,7 +185,7 @@ def _sway(pose: Floats, motions: Motions, rng: np.random.Generator) -> None:
     pose[:, 3:] = rng.uniform(0.2, 0.5) * tiled(slowly, len(pose), rng)
 
 
-def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
+def _talking_head(score: Score, motions: Motions, rng: Rng) -> Floats:
     """Return the head (N, 6) of a person who speaks."""
     talks = np.zeros(score.frames, np.float32)
     for start, end in score.talk:
@@ -212,14 +213,14 @@ class NodManner:
     fall: float
 
 
-def nod_habit(rng: np.random.Generator) -> NodHabit:
+def nod_habit(rng: Rng) -> NodHabit:
     """Draw the habit of a person: about 5 degrees, 1.8 to 3 swings a second."""
     usual = sizes.NOD_DEG[1]
     size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
     return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
 
 
-def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
+def nod_manner(habit: NodHabit, length_s: float, rng: Rng) -> NodManner:
     """Return swings, rate and size of a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12
     degrees.
     """
@@ -243,7 +244,7 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
 
 
 def _swing(
-    pose: Floats, kind: Literal["nod", "shake"], spans: Doubles, motions: Motions, rng: np.random.Generator
+    pose: Floats, kind: Literal["nod", "shake"], spans: Doubles, motions: Motions, rng: Rng
 ) -> list[ListenerEvent]:
     """Add nods or shakes to a pose (N, 6)."""
     habit, events = nod_habit(rng), []
@@ -259,7 +260,7 @@ def _swing(
     return events
 
 
-def _tilt(pose: Floats, spans: Doubles, rng: np.random.Generator) -> list[ListenerEvent]:
+def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> list[ListenerEvent]:
     """Add tilts to a pose (N, 6)."""
     events = []
     for start, end in spans:
@@ -288,7 +289,7 @@ def _look(motion: Floats, targets: Floats, seed: int) -> Floats:
     return head
 
 
-def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
+def _targets(score: Score, rng: Rng) -> tuple[Floats, list[ListenerEvent]]:
     """Return gaze targets (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead, and the gaze shifts."""
     seats: dict[str, tuple[float, float]] = {}
     out = np.zeros((score.frames, 2), np.float32)
@@ -317,7 +318,7 @@ def _shifts(targets: Floats) -> list[ListenerEvent]:
     ]
 
 
-def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
+def _speaker_targets(attention: Floats, rng: Rng) -> Floats:
     """Return where a speaker looks, (N, 2): at the listener or not as given, at random where not known."""
     at_listener = attention > 0.5
     unknown = np.isnan(attention)
@@ -339,13 +340,13 @@ def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
 # --- face -------------------------------------------------------------------------------------------------------
 
 
-def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
+def _idle(motions: Motions, frames: int, rng: Rng) -> Floats:
     """Return the motion of a resting face, lifted so that it hardly ever falls below the neutral."""
     moving = tiled(motions.idle, frames, rng, fade=12)
     return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
 
 
-def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay smiles: own laughs and returned smiles always, laughs of others often, backchannels and nods seldom.
 
     Only a laugh opens the jaw.
@@ -380,7 +381,7 @@ def lay_smile(
     size: float,
     jaw: float,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> Floats:
     """Lay a recorded smile over the face (N, 52) from `start_s` on; return the curve (K, 52)."""
     curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
@@ -392,7 +393,7 @@ def lay_smile(
     return curve
 
 
-def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Raise the brows after half of the questions and with some of the nods."""
     at = [instant for instant in score.asked if rng.random() < 0.5]
     at += [start for start, _ in score.nods if rng.random() < 0.15]
@@ -408,7 +409,7 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
     return events
 
 
-def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay the listener's own words: the mouth of the voice, or some recorded mouth over them, small for an "mm-hm".
 
     The size of an "mm-hm" is how far it opens the jaw.
@@ -431,7 +432,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
     return events
 
 
-def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay blinks at recorded intervals and a personal rate; half wait for a cue (gaze shift, phrase end) nearby."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)

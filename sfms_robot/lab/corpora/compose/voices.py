@@ -17,13 +17,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
-from sfms_robot.lab.corpora.compose.motions import SHAPE, pick
+from sfms_robot.lab.corpora.compose.motions import SHAPE, Rng, pick
 from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.events import runs
+from sfms_robot.signals.events import Bools, runs
 from sfms_robot.signals.tracks import read_track, resample
 
 _SOUNDS: Final = (".wav", ".flac")
@@ -58,7 +58,7 @@ class VoiceClip:
     origin: NDArray[np.int64]
     ends: NDArray[np.int64]
     mouth: Floats | None
-    noise: NDArray[np.float64]
+    noise: Doubles
     recording: Floats
 
 
@@ -99,7 +99,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     return by_split(found)
 
 
-def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
+def laugh(speech: Floats, spans_s: Doubles, laughter: Sequence[Floats], rng: Rng) -> Floats:
     """Return speech (n,) with laughs in the spans (K, 2), or unchanged where no laughter is at hand."""
     out = speech.copy()
     for start_s, end_s in spans_s if laughter else ():
@@ -163,7 +163,7 @@ def _levelled(speech: Floats) -> Floats:
     return np.asarray(np.clip(even * (_LEVEL / np.sqrt(np.mean(even**2))), -1, 1), np.float32)
 
 
-def _lulls(speech: Floats) -> NDArray[np.bool_]:
+def _lulls(speech: Floats) -> Bools:
     """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
     out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
@@ -229,7 +229,7 @@ def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
     return np.stack([np.interp(grid, times_s, column) for column in values.T], axis=1).astype(np.float32)
 
 
-def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _pause_spectrum(audio: Floats, active: Bools) -> Doubles:
     grains = audio[: len(active) * _GRAIN].reshape(-1, _GRAIN)[~active]
     if len(grains) < 8 or np.sqrt(np.mean(grains**2)) < 1e-5:
         return np.ones(_GRAIN // 2 + 1)
@@ -237,9 +237,7 @@ def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.floa
     return np.asarray(spectrum / np.sqrt(np.mean(spectrum**2)), np.float64)
 
 
-def lay(
-    segments_s: NDArray[np.float64], frames: int, voice: VoiceClip, rng: np.random.Generator
-) -> tuple[Floats, Floats | None]:
+def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:
     """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
     audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
     mouth = None if voice.mouth is None else np.zeros((frames, len(SHAPE)), np.float32)
@@ -266,7 +264,7 @@ def _soften(mouth: Floats) -> Floats:
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
-def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
+def room(samples: int, voice: VoiceClip, rng: Rng) -> Floats:
     """Return a noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, that drifts."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
@@ -278,7 +276,7 @@ def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     return np.asarray(coloured * 10 ** (level_db / 20), np.float32)
 
 
-def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
+def reverberant(speech: Floats, rng: Rng) -> Floats:
     """Return speech in a room of 0.12 to 0.4 s reverberation, 6 to 16 dB below the direct sound."""
     length_s = rng.uniform(0.12, 0.4)
     times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
@@ -287,7 +285,7 @@ def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(speech + oaconvolve(speech, tail)[: len(speech)], np.float32)
 
 
-def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
+def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: Rng) -> Floats:
     """Return a mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.

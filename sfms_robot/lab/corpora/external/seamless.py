@@ -33,7 +33,7 @@ from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Pr
 from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
-from sfms_robot.signals.events import runs
+from sfms_robot.signals.events import Bools, runs
 
 LABELS: Final = ("improvised", "naturalistic")
 SPLITS: Final = {"train": "train", "validation": "dev", "test": "test"}
@@ -120,8 +120,8 @@ class SeamlessPerson:
     npz: Path
     wav: Path
     prefix: str
-    valid: NDArray[np.bool_]
-    speaks: NDArray[np.bool_]
+    valid: Bools
+    speaks: Bools
 
 
 def _clips(
@@ -141,7 +141,7 @@ def _clips(
             yield Clip(name=name, frames=end - first, read=read)
 
 
-def stretches(valid: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def stretches(valid: Bools) -> list[tuple[int, int]]:
     """Return half-open [first, end) of frames to learn from: valid, off the edges of invalid blocks, long enough."""
     cut = [(first + EDGE_FRAMES * (first > 0), end - EDGE_FRAMES * (end < len(valid))) for first, end in runs(valid)]
     return [(first, end) for first, end in cut if end - first >= LEAST_FRAMES]
@@ -186,7 +186,7 @@ def _prefix(file: Path) -> str:
     return prefix
 
 
-def _valid(file: Path, prefix: str) -> NDArray[np.bool_]:
+def _valid(file: Path, prefix: str) -> Bools:
     return np.asarray(npz(file, f"{prefix}:{VALID}")[0], np.float32).reshape(-1) > 0.5
 
 
@@ -255,7 +255,7 @@ def _motion(person: SeamlessPerson, mirrored: bool) -> Floats:
     return out
 
 
-def _lag_s(active: NDArray[np.bool_], voice: Floats) -> float:
+def _lag_s(active: Bools, voice: Floats) -> float:
     """Return the delay of a voice after its annotation, (N,) at 30 Hz; 0 where it is not known."""
     heard = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / FPS), bool)
     noted = np.pad(active, (0, max(0, len(heard) - len(active))))[: len(heard)]
