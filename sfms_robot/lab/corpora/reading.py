@@ -228,7 +228,7 @@ def dyad_of(
     said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
     listening = np.ones(frames, bool)
     if audio is not None and said is not None:
-        listening = np.asarray(listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps)), bool)
+        listening = listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps))
     return Dyad(
         name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
         agent_audio=said if own else None,
@@ -237,7 +237,7 @@ def dyad_of(
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
     """Return (frames,) True in frames with speech; False after the end of the sound."""
-    active = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / fps), bool)[:frames]
+    active = voice_activity(voice, AUDIO_HZ, 1 / fps)[:frames]
     return np.pad(active, (0, frames - len(active)))
 
 

@@ -91,10 +91,10 @@ def read_people(folder: Path) -> list[MeetingPerson]:
     agents = defaultdict(list)
     for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
         agents[meeting].append(agent)
-    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in list(words.items())}
+    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in words.items()}
     people = []
-    for row in zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True):
-        meeting, agent, participant, until, has_gaze = row
+    rows = zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True)
+    for meeting, agent, participant, until, has_gaze in rows:
         if float(until or 0) < 60:
             continue
         key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]

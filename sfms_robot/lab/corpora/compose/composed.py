@@ -59,8 +59,10 @@ from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)
 HELD_OUT_SHARE: Final = 1 / 6  # of the training minutes, for validation and for test
-SHARES: Final = {"interaction": 0.5, "speaking": 0.25}  # minutes of the sets that speak, per minute of listening
 Scene = Literal["listening", "interaction"]
+SetName = Scene | Literal["speaking"]
+# Minutes of the sets that speak, per minute of listening.
+SHARES: Final[Mapping[SetName, float]] = {"interaction": 0.5, "speaking": 0.25}
 _SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
@@ -151,7 +153,7 @@ def compose_folder(
     random numbers of its own, so the files are the same with any number. Returns the minutes written per split. Raises
     ConfigError.
     """
-    folders = {"listening": out, **{name: out / name for name in SHARES}}
+    folders: dict[SetName, Path] = {"listening": out, **{name: out / name for name in SHARES}}
     parts = [
         Part(name, split, folder, SHARES.get(name, 1.0) * minutes)
         for name, folder in folders.items()
@@ -180,7 +182,7 @@ def compose_folder(
 class Part:
     """A split of a set, the folder of the set, and the minutes wanted of its training split."""
 
-    name: str
+    name: SetName
     split: Split
     folder: Path
     minutes: float
@@ -223,7 +225,7 @@ def _composed(out: Path) -> set[Path]:
     return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
 
 
-def dyads(material: Mapping[Split, Material], name: str, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
+def dyads(material: Mapping[Split, Material], name: SetName, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
     """Yield the dyads of one split of a set, one by one: for sets that need not fit in memory.
 
     `minutes`: of the training split. Without filmed voices, the set `speaking` has none. Raises ConfigError.
@@ -235,9 +237,8 @@ def dyads(material: Mapping[Split, Material], name: str, split: Split, seed: int
     if name == "speaking":
         yield from speaking.dyads(own.voices, own.motions, own.dwell, [seed, number, 2], wanted)
         return
-    scene: Scene = "interaction" if name == "interaction" else "listening"
-    rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
-    for stretch in choose(stretches(own.people, rng, scene), wanted, rng):
+    rng = np.random.default_rng([seed, number] if name == "listening" else [seed, number, 1])
+    for stretch in choose(stretches(own.people, rng, name), wanted, rng):
         yield compose_one(stretch, own, rng)
 
 

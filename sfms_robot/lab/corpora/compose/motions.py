@@ -97,4 +97,4 @@ def pick(items: Sequence[_Item], rng: Rng) -> _Item:
 
 def over(below: Floats, above: Floats) -> Floats:
     """Combine two activations of the same muscles: their sum while small, saturating at 1, smooth."""
-    return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)
+    return below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1)

@@ -83,7 +83,7 @@ def sent(speech: Floats, rng: Rng) -> Floats:
     gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
     hiss = rng.standard_normal(len(speech), np.float32) * np.float32(10 ** (rng.uniform(-90, -60) / 20))
     floor = hiss if rng.random() < 0.3 else np.float32(0)
-    return np.asarray(np.clip(gain * speech + floor, -1, 1), np.float32)
+    return np.clip(gain * speech + floor, -1, 1)
 
 
 # --- Where listeners look: annotated looks away from the person with the floor, and durations learned from them -----

@@ -143,7 +143,7 @@ def read_voice(file: Path) -> VoiceClip:
     origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
     loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
-    whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
+    whole = np.clip(audio * (_LEVEL / loudness), -1, 1)
     return VoiceClip(
         name=name,
         audio=joined,
