@@ -34,9 +34,9 @@ def measure(say: Callable[[str], None], steps: int = STEPS) -> BenchResult:
     torch.set_num_threads(1)
     try:
         for file in FILES:
-            for name, job, _ in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):
-                rows[f"train.{name}"] = _measured(job, steps)
-                say(f"{name}: {rows[f'train.{name}']['ratio']:.1%} of a step is not the model")
+            for job in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):
+                row = rows[f"train.{job.name}"] = _measured(job, steps)
+                say(f"{job.name}: {row['ratio']:.1%} of a step is not the model")
     finally:
         torch.set_num_threads(threads)
     missed = [name for name, most in MOST_BESIDE.items() if rows[f"train.{name}"]["ratio"] > most]

@@ -57,7 +57,7 @@ UNREADABLE: Final = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, SyntaxError,
     tokenize.TokenError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-_FEATURE: Final = "feature."  # key prefix on disk
+FEATURE: Final = "feature."  # key prefix on disk
 _EVENT: Final = np.dtype(
     [(name, "f8") for name in ("start_s", "duration_s", "size")]
     + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
@@ -115,19 +115,19 @@ class Dyad:
         if not self.fps > 0:
             raise ValueError(f"{self.name}: fps {self.fps:g} must be above 0")
         frames, width = len(self.listener), WIDTHS[self.space]
-        expected: dict[str, tuple[NDArray[Any] | None, tuple[int, ...]]] = {
-            "audio": (self.audio, (samples_of(frames, self.fps),)),
-            "speaker": (self.speaker, (frames, width)),
-            "listener": (self.listener, (frames, width)),
-            "listening": (self.listening, (frames,)),
-            "mel": (self.mel, (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS)),
-            "agent_audio": (self.agent_audio, (samples_of(frames, self.fps),)),
-            "states": (self.states, (frames,)),
-            "head_of_gaze_rad": (self.head_of_gaze_rad, (frames, 3)),
-            "attention": (self.attention, (frames,)),
+        expected: dict[str, tuple[int, ...]] = {
+            "audio": (samples_of(frames, self.fps),),
+            "speaker": (frames, width),
+            "listener": (frames, width),
+            "listening": (frames,),
+            "mel": (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS),
+            "agent_audio": (samples_of(frames, self.fps),),
+            "states": (frames,),
+            "head_of_gaze_rad": (frames, 3),
+            "attention": (frames,),
         }
-        for key, (values, shape) in expected.items():
-            if values is not None and values.shape != shape:
+        for key, shape in expected.items():
+            if (values := getattr(self, key)) is not None and values.shape != shape:
                 raise ValueError(f"{self.name}: {key} has shape {values.shape}, expected {shape}")
         for key, rows in self.features.items():
             if rows.ndim != 2 or len(rows) != frames:
@@ -136,6 +136,11 @@ class Dyad:
             values = getattr(self, key)
             if values is not None and not np.isfinite(values).all():
                 raise ValueError(f"{self.name}: {key} must be finite")
+
+    @property
+    def voice(self) -> Floats | None:
+        """Return the speaker's sound; None for zeros too: they mean a missing microphone, not a silent person."""
+        return self.audio if self.audio is not None and self.audio.any() else None
 
     def mel_rows(self) -> Floats | None:
         """Return the natural log of mel power (4N, 128): `mel`, or made from `audio`; None without sound.
@@ -189,7 +194,7 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
             arrays["events"] = _event_rows(dyad.events)
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
             arrays |= {"space": np.array(dyad.space), "fps": np.array(dyad.fps)}
-        arrays |= {_FEATURE + name: rows for name, rows in dyad.features.items()}
+        arrays |= {FEATURE + name: rows for name, rows in dyad.features.items()}
         np.savez_compressed(folder / f"{dyad.name}.npz", **arrays)  # type: ignore[arg-type]
 
 
@@ -208,15 +213,15 @@ def read(file: Path) -> Dyad:
             optional: dict[str, Any] = {
                 key: arrays[key].astype(read) for key, (_, read) in _OPTIONAL.items() if key in arrays
             }
+            if "space" in arrays:
+                optional |= {"space": str(arrays["space"]), "fps": float(arrays["fps"])}
             return Dyad(
                 name=file.stem,
                 audio=_voice(arrays, "audio"),
                 speaker=arrays["speaker"].astype(np.float32),
                 listener=arrays["listener"].astype(np.float32),
                 listening=arrays["listening"].astype(bool),
-                space=str(arrays["space"]) if "space" in arrays else "arkit58",
-                fps=float(arrays["fps"]) if "fps" in arrays else float(FRAME_HZ),
-                features={key.removeprefix(_FEATURE): arrays[key] for key in arrays if key.startswith(_FEATURE)},
+                features={key.removeprefix(FEATURE): arrays[key] for key in arrays if key.startswith(FEATURE)},
                 agent_audio=_voice(arrays, "agent_audio"),
                 events=_events(arrays["events"]) if "events" in arrays else None,
                 **optional,
@@ -256,14 +261,9 @@ def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
 def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
     return tuple(
         ListenerEvent(
-            str(row["kind"]),
-            float(row["start_s"]),
-            float(row["duration_s"]),
-            float(row["size"]),
-            int(row["swings"]),
-            None if np.isnan(row["target_rad"]).any() else (float(row["target_rad"][0]), float(row["target_rad"][1])),
+            kind, start_s, duration_s, size, swings, None if np.isnan(target).any() else tuple(target.tolist())
         )
-        for row in rows.astype(_EVENT)
+        for start_s, duration_s, size, kind, swings, target in rows.astype(_EVENT).tolist()
     )
 
 

@@ -189,8 +189,8 @@ class Layout:
     Attributes:
         space, fps: Of the motion.
         splits: Names of the splits in a folder, by ours (train, validation, test, ...); empty: another layout.
-        scan: (root, their name of a split, order) -> clips, problems and notes. Reads headers only where the format
-            allows it.
+        scan: (root, their name of a split, whether pose channels stand first) -> clips, problems and notes. Reads
+            headers only where the format allows it.
         below: Folders in which the data may lie, relative to the given one.
         order: Order of the channels in the files as they are shipped; None: there is only one.
         held_out: Share of train that serves as validation where the layout ships none.
@@ -202,7 +202,7 @@ class Layout:
     space: str
     fps: float
     splits: Callable[[Path], Mapping[str, str]]
-    scan: Callable[[Path, str, Order | None], Iterable[Found]]
+    scan: Callable[[Path, str, bool], Iterable[Found]]
     below: tuple[str, ...] = ("", "data")
     order: Order | None = None
     held_out: float = 0.0
@@ -215,7 +215,7 @@ class Layout:
 
     def dataset(self, place: Path, split: str, theirs: str, order: Order | None) -> Dataset:
         """Scan the split that the files call `theirs`. A file that several clips need is one problem."""
-        found = list(self.scan(place, theirs, order))
+        found = list(self.scan(place, theirs, order == "pose-first"))
         listed = enumerate(one for one in found if not isinstance(one, str))
         facts = {"space": self.space, "fps": self.fps, "licence": self.licence, **self.facts(place, theirs)}
         return Dataset(

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from sfms_robot.config.listener import STATES
 from sfms_robot.frames import FRAME_HZ
-from sfms_robot.signals.events import runs
+from sfms_robot.signals.events import Bools, runs
 
-Mask = NDArray[np.bool_]
 STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STATES)}
 UNKNOWN: Final = -1
 ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, where nobody annotated it
@@ -37,14 +36,14 @@ ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, wh
 class Voices:
     """(N,) per frame: who speaks, which of it is feedback (may reach beyond the speech), and whether the agent nods."""
 
-    agent: Mask
-    user: Mask
-    agent_feedback: Mask
-    user_feedback: Mask
-    nods: Mask
+    agent: Bools
+    user: Bools
+    agent_feedback: Bools
+    user_feedback: Bools
+    nods: Bools
 
 
-def of_activity(agent: Mask, user: Mask) -> Voices:
+def of_activity(agent: Bools, user: Bools) -> Voices:
     """Return voice activity alone, with short answers as feedback and without nods."""
     nods = np.zeros(len(agent), bool)
     return Voices(agent, user, short_answers(agent, user), short_answers(user, agent), nods)
@@ -54,7 +53,8 @@ def label(heard: Voices) -> NDArray[np.int8]:
     """Return one state per frame (N,); see the table above."""
     agent, user = heard.agent, heard.user
     told, answered = agent & heard.agent_feedback, user & heard.user_feedback
-    own_turn = _own_turn(agent & ~told, user & ~answered)
+    floor = np.where(agent & ~told, 1, np.where(user & ~answered, -1, 0))
+    own_turn = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)  # the agent had the floor, and has it next
     rules = (  # the first that holds
         (told, "giving_feedback"),
         (agent & answered, "receiving_feedback"),
@@ -68,20 +68,13 @@ def label(heard: Voices) -> NDArray[np.int8]:
     return np.select([rule for rule, _ in rules], [STATE[name] for _, name in rules], STATE["waiting"]).astype(np.int8)
 
 
-def _own_turn(agent: Mask, user: Mask) -> Mask:
-    """Return frames (N,) before and after which the agent is the next to have the floor, at any distance."""
-    floor = np.where(agent, 1, np.where(user, -1, 0))
-    own: Mask = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)
-    return own
-
-
 def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:
     """Return the newest value (N,) that is not 0, up to and with each frame; 0 before the first."""
     newest = np.maximum.accumulate(np.where(floor != 0, np.arange(len(floor)), -1))
     return np.where(newest >= 0, floor[newest], 0)
 
 
-def short_answers(active: Mask, other: Mask) -> Mask:
+def short_answers(active: Bools, other: Bools) -> Bools:
     """Return utterances (N,) under a second that begin in the other's speech before the other continues."""
     out = np.zeros(len(active), bool)
     for start, end in runs(active):

@@ -5,7 +5,6 @@ Nothing is invented: a channel without a source stays at rest. What is lost is m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -24,6 +23,16 @@ CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
 _ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw
 _UNITS: Final = slice(3, 3 + len(FAU_VALUE))  # of seamless27
 _UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
+
+
+FIGURES: Final = {  # of `Residual.told`: what each means
+    "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
+    "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",
+    "expression_lost_share": "rms of the expression that blendshapes do not show, of the whole",
+    "cut_share": "values beyond the range and cut",
+    "stored_pose_deg": "head angles as written: largest difference, degrees",
+    "stored_blendshape": "blendshapes as written: largest difference",
+}
 
 
 @dataclass(kw_only=True)
@@ -79,13 +88,18 @@ def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) ->
         raise ConfigError(f"{dyad.name}: {dyad.space} cannot become arkit58 ({', '.join(CONVERTIBLE)})")
     if flame is not None and dyad.space != "deca56":
         raise ConfigError(f"--flame-matrix: {dyad.space} has no FLAME expression (deca56 has)")
-    speaker, listener = (in_ours(motion, dyad.space, flame) for motion in (dyad.speaker, dyad.listener))
-    ours = replace(dyad, speaker=speaker, listener=listener, space="arkit58")
-    _lost(dyad, listener, residual, flame)
+    ours = in_arkit(dyad, flame)
+    _lost(dyad, ours.listener, residual, flame)
     slower = at_frame_rate(ours)
     if slower is not ours:
         _resampled(ours, slower, residual)
     return slower
+
+
+def in_arkit(dyad: Dyad, flame: FlameMatrix | None = None) -> Dyad:
+    """Return a dyad of a convertible space in arkit58; a speaker's unknown frames stay unknown."""
+    speaker, listener = (in_ours(motion, dyad.space, flame) for motion in (dyad.speaker, dyad.listener))
+    return replace(dyad, speaker=speaker, listener=listener, space="arkit58")
 
 
 def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Floats:
@@ -116,8 +130,9 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
         residual.notes |= dict.fromkeys(filter(None, [limitation("deca56", flame)]))
     else:
         seamless = dyad.space == "seamless27"
-        expression = filed[:, _UNITS if seamless else SPACES[dyad.space].expression]
-        lost = expression - np.clip(expression, -np.inf if seamless else 0.0, FULL if seamless else 1.0)
+        columns, low, high = (_UNITS, -np.inf, FULL) if seamless else (SPACES[dyad.space].expression, 0.0, 1.0)
+        expression = filed[:, columns]
+        lost = expression - np.clip(expression, low, high)
         residual.beyond += int((lost != 0).sum())
         residual.values += expression.size
         if seamless:
@@ -150,18 +165,6 @@ def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
         back = np.interp(theirs_s[inside], ours_s, ours.listener[:, column])
         residual.resampled_rad2 += float(np.square(back - filed.listener[inside, column]).sum())
         residual.resampled += int(inside.sum())
-
-
-def names() -> Mapping[str, str]:
-    """Return the meaning of each figure of `Residual.told`, as text."""
-    return {
-        "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
-        "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",
-        "expression_lost_share": "rms of the expression that blendshapes do not show, of the whole",
-        "cut_share": "values beyond the range and cut",
-        "stored_pose_deg": "head angles as written: largest difference, degrees",
-        "stored_blendshape": "blendshapes as written: largest difference",
-    }
 
 
 # --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------

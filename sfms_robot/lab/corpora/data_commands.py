@@ -6,7 +6,7 @@ Of a checked set every clip is read once, and nothing is skipped in silence.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from sfms_robot.lab.corpora import clips, formats
 from sfms_robot.lab.corpora.clips import SEAMLESS_CHANNELS, Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.compose.composed import compose_folder
-from sfms_robot.lab.corpora.conversion import CONVERTIBLE, Residual, names, to_ours
+from sfms_robot.lab.corpora.conversion import CONVERTIBLE, FIGURES, Residual, to_ours
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
 
@@ -102,9 +102,7 @@ def _checked(layout: Layout, place: Path, split: str, order: Order | None, windo
             problems.append(Problem("swapped order", split, said))
         else:
             notes.append(said)
-    kinds: dict[str, list[Problem]] = {}
-    for problem in (*problems, *tally.missing()):
-        kinds.setdefault(problem.kind, []).append(problem)
+    kinds = _by_kind([*problems, *tally.missing()])
     lengths = checked.lengths
     return {
         "split": split,
@@ -125,6 +123,13 @@ def _checked(layout: Layout, place: Path, split: str, order: Order | None, windo
         "notes": notes,
         "licence": dataset.licence,
     }
+
+
+def _by_kind(problems: Sequence[Problem]) -> dict[str, list[Problem]]:
+    kinds: dict[str, list[Problem]] = {}
+    for problem in problems:
+        kinds.setdefault(problem.kind, []).append(problem)
+    return kinds
 
 
 class _Tally:
@@ -173,12 +178,10 @@ class _Tally:
         mean = total.sum(axis=0) / frames
         spread = np.sqrt(np.maximum(0.0, square.sum(axis=0) / frames - mean**2))
         known = {**SPACE_CHANNELS, "seamless27": SEAMLESS_CHANNELS}
-        figures = zip(*(np.round(each, 5).tolist() for each in (low.min(0), high.max(0), mean, spread)), strict=True)
+        figures = (np.round(each, 5).tolist() for each in (low.min(0), high.max(0), mean, spread))
         titles = known.get(space) or [f"channel_{index}" for index in range(len(mean))]
-        return [
-            dict(zip(("name", "min", "max", "mean", "std"), (name, *row), strict=True))
-            for name, row in zip(titles, figures, strict=True)
-        ]
+        keys = ("name", "min", "max", "mean", "std")
+        return [dict(zip(keys, row, strict=True)) for row in zip(titles, *figures, strict=True)]
 
 
 # --- Behind `data convert`: a data set as its authors lay it out in, dyads as `train` and `evaluate` read them out
@@ -231,7 +234,7 @@ def convert_data(
         "licence": licence,
         "splits": splits,
         "residual": residual.told(),
-        "residual_names": dict(names()),
+        "residual_names": FIGURES,
         "notes": list(residual.notes),
     }
 
@@ -264,11 +267,12 @@ def _converted(
         residual.written(ours, clips.read(out / f"{ours.name}.npz"))
         seconds += len(ours.listener) / ours.fps
         written += 1
-    counts, first = Counter(one.kind for one in problems), {one.kind: one for one in reversed(problems)}
     return {
         "split": dataset.split,
         "clips": written,
         "minutes": round(seconds / 60, 3),
-        "left_out": [{"kind": kind, "count": counts[kind], "first": str(one)} for kind, one in first.items()],
+        "left_out": [
+            {"kind": kind, "count": len(found), "first": str(found[0])} for kind, found in _by_kind(problems).items()
+        ],
         "notes": list(dataset.notes),
     }

@@ -18,16 +18,15 @@ import numpy as np
 from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
-from sfms_robot.lab.corpora.clips import SPLITS, Dyad, read
+from sfms_robot.lab.corpora.clips import FEATURE, SPLITS, read
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt
-from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_ours
+from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_arkit
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
-from sfms_robot.lab.corpora.reading import npz, npz_shapes, pose_last
+from sfms_robot.lab.corpora.reading import npz, npz_shapes
 
 # --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
 
 SOURCE: Final = "source.yaml"  # beside the splits of converted data: their layout and licence
-_FEATURE: Final = "feature."
 
 
 def _stored_splits(place: Path) -> Mapping[str, str]:
@@ -72,7 +71,7 @@ def _stored_facts(place: Path, split: str) -> Mapping[str, Any]:
     return facts
 
 
-def _stored_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def _stored_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     kinds: list[tuple[str, float]] = []
 
     def clip(file: Path) -> Clip:
@@ -80,8 +79,8 @@ def _stored_scan(place: Path, split: str, order: Order | None) -> Iterator[Found
         if kind != kinds[0]:
             raise ClipError.of("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {kinds[0][0]}")
         shapes = npz_shapes(file)
-        features = {key.removeprefix(_FEATURE): partial(_stored_feature, file, key)
-                    for key in shapes if key.startswith(_FEATURE)}  # fmt: skip
+        features = {key.removeprefix(FEATURE): partial(_stored_feature, file, key)
+                    for key in shapes if key.startswith(FEATURE)}  # fmt: skip
         return Clip(name=file.stem, frames=shapes["listening"][0], read=partial(read, file), features=features)
 
     yield from attempt(sorted((place / split).glob("*.npz")), clip)
@@ -159,7 +158,7 @@ def open_dataset(
     What cannot be used is in `problems` and counted in a warning. Raises ConfigError when nothing is left.
     """
     found, place = detect(folder, layout)
-    dataset = _split(found, place, _SPLITS.get(split, split), _checked(order, found))
+    dataset = scan_split(found, place, _SPLITS.get(split, split), order)
     if not dataset.clips:
         why = f": {dataset.problems[0]}" if dataset.problems else ""
         raise ConfigError(f"{place}: no usable clip in {split} ({len(dataset.problems)} problems){why}")
@@ -185,28 +184,20 @@ def open_for(space: str, folder: Path, split: str, order: Order | None = None, f
     if dataset.space != "faceverse58":
         way = "; `sfms-robot data convert` makes arkit58 of it" if dataset.space in CONVERTIBLE else ""
         raise ConfigError(f"{folder}: {dataset.layout} is in {dataset.space}, which cannot become {space}{way}")
-    return dataset.map(_as_arkit, "arkit58")
+    return dataset.map(in_arkit, "arkit58")
 
 
 def scan_split(layout: Layout, place: Path, split: str, order: Order | None = None) -> Dataset:
     """Return one split unchecked, even if empty or in the wrong order: for `data check`."""
-    return _split(layout, place, split, _checked(order, layout))
-
-
-def _checked(order: Order | None, layout: Layout) -> Order | None:
     if order is not None and order not in get_args(Order):
         raise ConfigError(f"--order {order}: expected {' or '.join(get_args(Order))}")
     if order is not None and layout.order is None:
         raise ConfigError(f"--order {order}: {layout.name} files name their channels, there is no order to choose")
-    return order or layout.order
-
-
-def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Dataset:
     theirs = layout.splits(place)
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
     held_out = "validation" not in theirs and layout.held_out
-    whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order)
+    whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order or layout.order)
     if not held_out or split not in ("train", "validation"):
         return whole
     rank = np.random.default_rng(_SEED).permutation(len(whole))
@@ -215,12 +206,6 @@ def _split(layout: Layout, place: Path, split: str, order: Order | None) -> Data
     clips = tuple(clip for clip, use in zip(whole.clips, wanted, strict=True) if use)
     note = f"{layout.name} ships no validation: {layout.held_out:.0%} of train is held out for it"
     return replace(whole, clips=clips, notes=(*whole.notes, note))
-
-
-def _as_arkit(clip: Dyad) -> Dyad:
-    """Return a faceverse58 dyad in arkit58; a speaker's unknown frames stay unknown."""
-    speaker, listener = (in_ours(motion, "faceverse58") for motion in (clip.speaker, clip.listener))
-    return replace(clip, speaker=speaker, listener=listener, space="arkit58")
 
 
 # --- order ------------------------------------------------------------------------------------------------------
@@ -253,13 +238,12 @@ def looks_like(motions: Sequence[Floats], space: str, declared: Order) -> Order 
     filed: Doubles = np.concatenate(motions).astype(np.float64)
     if declared == "pose-first":  # undo what reading did
         filed = np.concatenate([filed[:, -6:], filed[:, :-6]], axis=1)
-    pose = {"pose-first": filed[:, :6], "exp-first": pose_last(filed, False)[:, -6:]}
+    pose: dict[Order, Doubles] = {"pose-first": filed[:, :6], "exp-first": filed[:, -6:]}
     if space == "faceverse58":
-        near = {name: abs(float(np.median(columns[:, 0])) - np.pi) < 0.8 for name, columns in pose.items()}
-        found: list[Order] = [name for name in get_args(Order) if near[name]]
-        return found[0] if len(found) == 1 else None
+        near = [name for name, columns in pose.items() if abs(float(np.median(columns[:, 0])) - np.pi) < 0.8]
+        return near[0] if len(near) == 1 else None
     spread = {name: float(np.sqrt(np.prod(columns[:, 4:6].std(axis=0)))) for name, columns in pose.items()}
     stiller, other = sorted(spread, key=lambda name: spread[name])
     if spread[other] < 1e-6 or spread[stiller] > 0.5 * spread[other]:
         return None
-    return "pose-first" if stiller == "pose-first" else "exp-first"
+    return stiller

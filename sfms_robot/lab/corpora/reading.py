@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import ClipError
+from sfms_robot.lab.corpora.collection import ClipError, Kind
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
 
@@ -96,12 +96,17 @@ def _has(module: str, name: str) -> bool:
         return False
 
 
+def existing(file: Path, kind: Kind = "missing half") -> Path:
+    """Return a file that is there. Raises ClipError, of this kind."""
+    if not file.is_file():
+        raise ClipError.of(kind, file, "no such file")
+    return file
+
+
 def npy(file: Path) -> NDArray[Any]:
     """Map an array on disk into memory. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing half", file, "no such file")
     try:
-        out: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
+        out: NDArray[Any] = np.load(existing(file), mmap_mode="r", allow_pickle=False)
     except UNREADABLE as error:
         raise ClipError.of("unreadable", file, error) from error
     if not isinstance(out, np.ndarray):
@@ -182,9 +187,7 @@ def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: boo
 
 def sound(file: Path, frames: int, fps: float) -> Floats:
     """Return a voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing sound", file, "no such file")
-    audio, wanted = read_audio(file), samples_of(frames, fps)
+    audio, wanted = read_audio(existing(file, "missing sound")), samples_of(frames, fps)
     if wanted - len(audio) > SOUND_SLACK_S * AUDIO_HZ:
         detail = f"{len(audio) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
         raise ClipError.of("lengths differ", file, detail)
@@ -193,8 +196,7 @@ def sound(file: Path, frames: int, fps: float) -> Floats:
 
 def voices_of(*files: Path) -> list[Path]:
     """Return the files of a clip's voices. Raises ClipError if the speaker's, the first, is missing."""
-    if not files[0].is_file():
-        raise ClipError.of("missing sound", files[0], "no such file")
+    existing(files[0], "missing sound")
     return list(files)
 
 
@@ -226,7 +228,7 @@ def dyad_of(
     said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
     listening = np.ones(frames, bool)
     if audio is not None and said is not None:
-        listening = np.asarray(listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps)), bool)
+        listening = listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps))
     return Dyad(
         name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
         agent_audio=said if own else None,
@@ -235,7 +237,7 @@ def dyad_of(
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
     """Return (frames,) True in frames with speech; False after the end of the sound."""
-    active = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / fps), bool)[:frames]
+    active = voice_activity(voice, AUDIO_HZ, 1 / fps)[:frames]
     return np.pad(active, (0, frames - len(active)))
 
 

@@ -282,7 +282,7 @@ def evaluate_listener(
         if isinstance(listener, SfmsListener):
             settings = listener.settings
             corpus = gather(dyads, settings.window_frames, listener.space, listener.frontend, settings)
-            figures |= keyframe_scores(listener.model, corpus, settings)
+            figures |= keyframe_scores(listener.model, corpus)
         rows.append({"name": name, "hop": listener.hop, **figures})
     rows.append({"name": "dyads", **behaviour([dyad.listener for dyad in dyads], dyads)})
     return {

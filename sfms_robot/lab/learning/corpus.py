@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from sfms_robot import config
@@ -31,9 +30,10 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Flo
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.lab.learning.training_loop import write_whole
 from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import control_track
+from sfms_robot.signals.control import COLUMNS, control_track
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
 GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
+# Columns of control rows: an event other than a blink is under way.
+ACTIVE = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
 SOUND_SAMPLE = 20_000  # frames whose sound gives means and deviations
 LEAST_SOUND_SPREAD = 1e-3
 
@@ -71,7 +73,7 @@ class Corpus(Generic[Frames]):
         """Return (N,) bool, True in the first frame of a dyad."""
         firsts = torch.zeros(sum(self.lengths), dtype=torch.bool)
         firsts[torch.tensor([0, *self.lengths[:-1]]).cumsum(0)] = True
-        return firsts.to(getattr(self.frames, fields(self.frames)[0].name).device)
+        return firsts.to(next(iter(vars(self.frames).values())).device)
 
     def by_dyad(self, values: Tensor) -> list[Tensor]:
         """Split values (N, ...) of all frames into those of each dyad."""
@@ -105,13 +107,13 @@ class Corpus(Generic[Frames]):
     def fingerprint(self) -> dict[str, Any]:
         """Return plain data that differ between corpora. The corpus must be on the CPU."""
         digest = hashlib.blake2b(repr((self.lengths, self.scenes)).encode(), digest_size=8)
-        for field in fields(self.frames):
-            digest.update(getattr(self.frames, field.name).contiguous().numpy().data)
+        for tensor in vars(self.frames).values():
+            digest.update(tensor.contiguous().numpy().data)
         return {"dyads": len(self.lengths), "frames": sum(self.lengths), "digest": digest.hexdigest()}
 
 
 def _each(frames: Frames, change: Callable[[Tensor], Tensor]) -> Frames:
-    return replace(frames, **{field.name: change(getattr(frames, field.name)) for field in fields(frames)})
+    return replace(frames, **{name: change(tensor) for name, tensor in vars(frames).items()})
 
 
 def gather(
@@ -156,7 +158,7 @@ def gather(
             (scratch.folder / _INDEX).write_text(json.dumps({"lengths": lengths, "scenes": named}), encoding="utf-8")
         scratch.group.wait()
         return read_staged(one, scratch.folder)
-    joined = {field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(one)}
+    joined = {name: torch.cat([vars(part)[name] for part in parts]) for name in vars(one)}
     return Corpus(replace(one, **joined), tuple(lengths), tuple(named))
 
 
@@ -312,11 +314,11 @@ def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
 
 
 @contextmanager
-def _writing(file: Path, option: str = "--scratch") -> Iterator[None]:
+def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"{option}: {file} cannot be written: {getattr(error, 'strerror', None) or error}") from error
+    except OSError as error:
+        raise ConfigError(f"--scratch: {folder} cannot be written: {error.strerror}") from error
 
 
 # --- Packs: all that a trainer reads of its data, in one file --------------------------------------------------------
@@ -345,24 +347,23 @@ def write_pack(
     }
     about = {"version": PACK_VERSION, "made for": _made_for(listener, window)}
     about |= {split: [corpus.lengths, corpus.scenes] for split, corpus in corpora.items()}
-    part = file.with_suffix(".part")
-    with _writing(file, "--out"):
-        save_file(tensors, part, {"pack": json.dumps(about)})
-        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
-        part.replace(file)
+    write_whole(file, tensors, {"pack": json.dumps(about)})
 
 
-def packed(
+def training_data(
     data: Path,
-    split: str,
     frames: type[Frames],
     listener: config.Sfms | config.Arig,
     window: int,
-    otherwise: Callable[[], Corpus[Frames]],
-) -> Corpus[Frames]:
-    """Return a split of the pack `data`; where that is a folder, what `otherwise` reads. Raises ConfigError."""
+    read: Callable[[str], Corpus[Frames]],
+) -> dict[str, Corpus[Frames]]:
+    """Return the frames of train and validation: of the pack `data`, or as `read` returns a split of a folder.
+
+    Raises ConfigError.
+    """
+    splits = ("train", "validation")
     if not data.is_file():
-        return otherwise()
+        return {split: read(split) for split in splits}
     again = "pack again: sfms-robot train pack"
     try:
         with safe_open(data, framework="pt") as opened:
@@ -372,11 +373,14 @@ def packed(
             for key, ours in _made_for(listener, window).items():
                 if (theirs := about["made for"].get(key)) != ours:
                     raise ConfigError(f"{data}: {key}: expected {ours!r}, got {theirs!r}; {again}")
-            lengths, scenes = about[split]
-            named = {field.name: opened.get_tensor(f"{split}.{field.name}") for field in fields(frames)}
+            found = {}
+            for split in splits:
+                lengths, scenes = about[split]
+                named = {field.name: opened.get_tensor(f"{split}.{field.name}") for field in fields(frames)}
+                found[split] = Corpus(frames(**named), tuple(lengths), tuple(scenes))
+            return found
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{data}: not a pack of training data ({error}); {again}") from error
-    return Corpus(frames(**named), tuple(lengths), tuple(scenes))
 
 
 # --- Slow motion of a head -------------------------------------------------------------------------------------------

@@ -70,41 +70,42 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
 
     Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
     """
-    stages = [_measured(name, job, steps) for name, job, steps in jobs_of(settings)]
+    stages = [_measured(job) for job in jobs_of(settings)]
     hours = {gpu: round(sum(stage["hours"][gpu] for stage in stages), 2) for gpu in GPUS}
     return {"stages": stages, "hours": hours, "assumed": ASSUMED, "rows": [_row(stage) for stage in stages]}
 
 
-def jobs_of(
-    settings: config.Training | config.ArigTraining, device: torch.device = CPU
-) -> Iterator[tuple[str, Job, int]]:
-    """Yield name, job and steps of each stage, on initial weights and made-up frames."""
+def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[Job]:
+    """Yield the job of each stage, on initial weights and made-up frames."""
     torch.manual_seed(settings.seed)
     listener = settings.listener
     space = MotionSpace.of(listener)
     if isinstance(settings, config.ArigTraining):
         phase = settings.training
         student = Student(ArigModel(settings.listener))
-        dyads = _made_up(phase.window_frames + FRAME_HZ, space, settings.listener.events)
+        dyads = _made_up(phase.window_frames + FRAME_HZ, listener)
         corpus = arig.gather(dict.fromkeys(arig.SCENES, dyads), phase.window_frames, space, settings.listener)
-        arig.fit_scales(student.model, corpus, settings.listener.channels)
-        yield "arig", arig_job(settings, student, corpus, corpus, device), phase.steps
+        arig.fit_scales(student.model, corpus)
+        yield arig_job(settings, student, corpus, corpus, CPU)
         return
     window = settings.listener.window_frames
-    dyads = _made_up(2 * window, space, settings.listener.events)
+    dyads = _made_up(2 * window, listener)
     plain = sfms.gather(dyads, window, space, None, settings.listener)
     model = SfmsModel(settings.listener)
-    sfms.fit_scales(model, plain, settings.listener.channels)
-    yield "tokenizer", tokenizer_job(settings, model, plain, plain, device), settings.tokenizer.steps
+    sfms.fit_scales(model, plain)
+    yield tokenizer_job(settings, model, plain, plain, CPU)
     heard = sfms.gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
     fit_sound(model.cpu(), (heard.frames.sound, heard.frames.heard))
-    yield "listener", listener_job(settings, model, heard, heard, device), settings.predictor.steps
+    yield listener_job(settings, model, heard, heard, CPU)
 
 
-def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
-    """Make conversations of noise: the cost of a step does not depend on the content. `ours`: in arkit58."""
-    rng = np.random.default_rng(0)
-    name, rest = ("arkit58", np.full(MOTION_DIM, 0.1)) if ours else (space.name, space.neutral)
+def _made_up(frames: int, listener: config.Sfms | config.Arig) -> list[Dyad]:
+    """Make conversations of noise, in the listener's space, or where it has events in arkit58.
+
+    The cost of a step does not depend on the content.
+    """
+    rng, space = np.random.default_rng(0), MotionSpace.of(listener)
+    name, rest = ("arkit58", np.full(MOTION_DIM, 0.1)) if listener.events else (space.name, space.neutral)
     found = []
     for index in range(_DYADS):
         motion, face = (rng.normal(rest, 0.05, (frames, len(rest))).astype(np.float32) for _ in range(2))
@@ -128,7 +129,7 @@ def _made_up(frames: int, space: MotionSpace, ours: bool) -> list[Dyad]:
     return found
 
 
-def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
+def _measured(job: Job) -> dict[str, Any]:
     """Measure one piece of a batch and the update after it; all pieces of a batch are alike."""
     batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
     samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
@@ -150,8 +151,8 @@ def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
         "drawn": pieces * count.drawn,
     }
     return {
-        "stage": name,
-        "steps": steps,
+        "stage": job.name,
+        "steps": job.phase.steps,
         "batch": batch,
         "window_frames": window,
         "pieces": pieces,
@@ -161,7 +162,7 @@ def _measured(name: str, job: Job, steps: int) -> dict[str, Any]:
         **figures,
         "here_s": round(time.perf_counter() - began_s, 2),
         "here_peak_mb": round(memory_mb("VmHWM"), 1),
-        "hours": {gpu: round(steps * _step_s(figures, of, half) / 3600, 3) for gpu, of in GPUS.items()},
+        "hours": {gpu: round(job.phase.steps * _step_s(figures, of, half) / 3600, 3) for gpu, of in GPUS.items()},
     }
 
 

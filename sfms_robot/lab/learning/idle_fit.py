@@ -1,4 +1,4 @@
-"""Small motion of resting faces that a listener lacks, as `listeners.idle_motion` draws it.
+"""Small motion of resting faces that a listener lacks, as `listeners.idle` draws it.
 
 Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
 the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from sfms_robot.app.progress import tracked
@@ -34,11 +33,10 @@ from sfms_robot.signals.events import runs
 WINDOW: Final = 2 * FRAME_HZ
 FACE_KINDS: Final = ("laugh", "smile", "mm_hm", "brow_raise", "blink")
 MARGIN_FRAMES: Final = 4
-REGIONS: Final = {
-    "brows": ("brow",),
-    "lids": ("eyeSquint", "eyeWide", "eyeBlink"),
-    "mouth": MOUTH,
-}
+REGIONS: Final = [  # rows of blendshapes: brows, lids, mouth
+    np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(begins)])
+    for begins in (("brow",), ("eyeSquint", "eyeWide", "eyeBlink"), MOUTH)
+]
 PATTERNS: Final = 4  # of each region, at most
 LEAST: Final = 0.001  # deviation of a pattern that is worth drawing, in every channel together
 AT: Final = (0.01, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99)  # quantiles
@@ -71,7 +69,7 @@ def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
         raise ValueError("no two seconds in which a face rests")
     lacking = covariances(people) - covariances(listener)  # (IDLE_BANDS, C, C)
     loadings, amplitudes = [], []
-    for rows in map(_of_region, REGIONS):
+    for rows in REGIONS:
         part = lacking[:, rows[:, None], rows]
         power, patterns = np.linalg.eigh(part.sum(0))
         for value, pattern in sorted(zip(power.tolist(), patterns.T, strict=True), key=lambda one: -one[0])[:PATTERNS]:
@@ -92,10 +90,6 @@ def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
     return replace(idle, held=held, shown=shown)
 
 
-def _of_region(region: str) -> NDArray[np.intp]:
-    return np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(REGIONS[region])])
-
-
 def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Floats]) -> tuple[Floats, Floats]:
     """Return quantiles (KNOTS, C) of the listener's windows with the motion they lack, and of people's.
 
@@ -111,7 +105,7 @@ def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Fl
     middle = KNOTS // 2
     steps = np.minimum(np.diff(wanted, axis=0), STEEPEST * np.diff(held, axis=0))
     at = np.concatenate([np.zeros((1, len(BLENDSHAPES))), np.cumsum(steps, axis=0)])
-    for rows in map(_of_region, REGIONS):
+    for rows in REGIONS:
         shown[:, rows] = (at - at[middle] + wanted[middle])[:, rows]
     return held.astype(np.float32), shown.astype(np.float32)
 

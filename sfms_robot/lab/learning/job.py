@@ -22,7 +22,7 @@ Six duties make a resumed run bit-identical on a CPU:
    draws there, or from torch's global one (dropout); never from numpy, the clock or another generator;
  - on a GPU it makes the host wait for nothing: what is chosen is chosen on the CPU and sent, losses are read later;
  - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
-   (`learning.process_group`), and its loss is their mean;
+   (see "Trainer's side" below), and its loss is their mean;
  - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
  - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
  - everything before `fit` follows from the settings and the data, and `identity` names them: plain JSON data, and a
@@ -37,7 +37,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 import torch.distributed as dist
@@ -96,7 +96,8 @@ class ProcessGroup:
         except RuntimeError as error:  # gloo and NCCL raise this and its children
             if self.size == 1 or isinstance(error, torch.cuda.OutOfMemoryError):
                 raise
-            said = f"process {self.rank} of {self.size} has lost another one: {_first_line(error)}"
+            first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+            said = f"process {self.rank} of {self.size} has lost another one: {first_line}"
             raise GroupError(said) from error
 
 
@@ -139,10 +140,6 @@ def _number(name: str, otherwise: int) -> int:
 
 def _device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if dist.get_backend() == "nccl" else torch.device("cpu")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 # --- Trainer's side --------------------------------------------------------------------------------------------------
@@ -194,6 +191,16 @@ def noise_of(generator: torch.Generator, device: torch.device) -> torch.Generato
     own = OwnNoise(device)
     own.manual_seed(int(torch.randint(2**62, (), generator=generator)))
     return own
+
+
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    """Draw numbers of 0..1, on the generator's device."""
+    return torch.rand(shape, generator=generator, device=generator.device)
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    """Draw numbers of mean 0 and deviation 1, on the generator's device."""
+    return torch.randn(shape, generator=generator, device=generator.device)
 
 
 def is_drawn(generator: torch.Generator, *weights: float) -> bool:
@@ -264,6 +271,9 @@ class Run:
         return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
+ALONE: Final = Run()  # one process, on the CPU, from the first step
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainingOutcome:
     """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
@@ -282,15 +292,13 @@ class TrainingOutcome:
 
 Watch = Callable[[Report], None]
 CURVES_EVERY = 10  # steps
-_CURVES = ("loss", "gradient_norm", "learning_rate", "frames_per_s")
 
 
 @contextmanager
 def progress_bar() -> Iterator[Watch]:
     """Show a bar on stderr (stdout is for figures): loss, held-out loss, frames per second, time left."""
-    tasks: dict[str, TaskID] = {}
+    tasks: dict[str, tuple[TaskID, TimeLeft]] = {}
     lines: dict[str, PlainBar] = {}
-    rests: dict[str, TimeLeft] = {}
 
     def plain(report: Report) -> None:
         line = lines.setdefault(report.name, PlainBar(report.name, last=True))
@@ -304,10 +312,9 @@ def progress_bar() -> Iterator[Watch]:
         def watch(report: Report) -> None:
             step = report.position.step
             if report.name not in tasks:
-                tasks[report.name] = bar.add_task(report.name, total=report.steps, figures="", left="")
-                rests[report.name] = TimeLeft()
-            left = rests[report.name](step, report.steps)
-            bar.update(tasks[report.name], completed=step, figures=_figures(report), left=left)
+                tasks[report.name] = bar.add_task(report.name, total=report.steps, figures="", left=""), TimeLeft()
+            task, left = tasks[report.name]
+            bar.update(task, completed=step, figures=_figures(report), left=left(step, report.steps))
 
         yield watch
 
@@ -333,9 +340,8 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
             writers[report.name] = SummaryWriter(str(folder / report.name), purge_step=step)
         curves = {}
         if step % CURVES_EVERY == 0 or report.position.finished:
-            curves = {
-                name: getattr(report, name) for name in ("loss", "gradient_norm", "learning_rate", "frames_per_s")
-            }
+            shown = ("loss", "gradient_norm", "learning_rate", "frames_per_s")
+            curves = {name: getattr(report, name) for name in shown}
         if report.looked and report.position.held_out is not None:
             curves["held_out_loss"] = report.position.held_out
         for name, value in curves.items():

@@ -28,10 +28,10 @@ from sfms_robot.lab.evaluation.rollout import offline_rollout
 from sfms_robot.lab.learning.arig.trainer import corpora as arig_corpora
 from sfms_robot.lab.learning.arig.trainer import train_arig
 from sfms_robot.lab.learning.corpus import Corpus, without_gaze, write_pack
-from sfms_robot.lab.learning.job import Run, Watch, joined, local_rank, progress_bar, tensorboard
+from sfms_robot.lab.learning.job import ALONE, Run, Watch, joined, local_rank, progress_bar, tensorboard
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.sfms.features import gather, tokenise
+from sfms_robot.lab.learning.sfms.features import corpora, gather, tokenise
 from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
 from sfms_robot.lab.learning.training_loop import checkpoint_file
 from sfms_robot.listeners import checkpoint
@@ -109,9 +109,9 @@ def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> 
     settings = load_training(file)
     if isinstance(settings, config.ArigTraining):
         window = settings.training.window_frames
-        found: Mapping[str, Corpus[Any]] = arig_corpora(settings, data, Run())
+        found: Mapping[str, Corpus[Any]] = arig_corpora(settings, data, ALONE)
     else:
-        window, found = settings.listener.window_frames, listener.corpora(settings, data, Run(), order)
+        window, found = settings.listener.window_frames, corpora(settings, data, ALONE, order)
     write_pack(out, found, settings.listener, window)
     counts = {split: {"dyads": len(one.lengths), "frames": sum(one.lengths)} for split, one in found.items()}
     return {"out": str(out), **counts, "bytes": out.stat().st_size}
@@ -170,10 +170,10 @@ def run_of(options: TrainOptions) -> Iterator[Run]:
             device = torch.device("cuda", local_rank())
         group = stack.enter_context(joined(device))
         watches: list[Watch] = []
-        installed = importlib.util.find_spec("tensorboard") is not None
-        if group.first and (options.tensorboard or (options.tensorboard is None and installed)):
-            watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
         if group.first:
+            installed = importlib.util.find_spec("tensorboard") is not None
+            if installed if options.tensorboard is None else options.tensorboard:
+                watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
             watches.append(stack.enter_context(progress_bar()))
         yield Run(
             resume=options.resume,

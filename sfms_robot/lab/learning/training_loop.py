@@ -29,7 +29,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError
-from sfms_robot.lab.learning.job import Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
+from sfms_robot.lab.learning.job import ALONE, Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
 READ_EVERY = 10  # steps of a GPU whose losses are read together: reading one makes the host wait for it
@@ -44,7 +44,7 @@ def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> 
     return torch.optim.AdamW(learned, lr=rate, betas=(0.9, 0.98), weight_decay=decay, fused=fused)
 
 
-def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time.monotonic) -> TrainingOutcome:  # noqa: B008
+def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time.monotonic) -> TrainingOutcome:
     """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
     Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
@@ -74,22 +74,22 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
     job.model.train()
     gradients = Gradients(job, group, pieces, file, run.read_every)
     every = phase.evaluate_every if job.held_out else 0
-    made: list[tuple[Tensor, float]] = []  # of steps that are not read yet: loss and norm, learning rate
+    made: list[Tensor] = []  # loss and norm of steps that are not read yet
     with _interruptions(patient=group.size > 1) as pressed:
         while not position.finished:
             step = position.step + len(made)
-            rate = _set_rates(job, base, step)
-            with _enough_memory(gradients, partial(_saved_at, job, position, made, generator, best), step):
-                made.append((make_step(gradients, step, generator), rate))
+            _set_rates(job, base, step)
+            with _enough_memory(gradients, position, made, generator, best):
+                made.append(make_step(gradients, step, generator))
             looked = every > 0 and ((step + 1) % every == 0 or step + 1 == phase.steps)
             stops = looked or step + 1 == phase.steps or (step + 1) % phase.checkpoint_every == 0
             if not stops and len(made) < gradients.read_every and not (group.size == 1 and pressed()):
                 continue
-            found, interrupted = gradients.read([each for each, _ in made], position.step, pressed())
-            for (loss, norm), (_, rate) in zip(found, made, strict=True):
+            found, interrupted = gradients.read(made, position.step, pressed())
+            for loss, norm in found:
                 position = _moved(position, loss)
-                is_last = position.step == step + 1
-                if is_last and looked:
+                looks = looked and position.step == step + 1  # the last of those that are read
+                if looks:
                     position = _compared(position, group.from_first(partial(_held_out, job)))
                     best = weights_of(job) if position.worse == 0 else best
                 impatient = phase.patience is not None and position.worse >= phase.patience
@@ -97,7 +97,7 @@ def fit(job: Job, out: Path, run: Run = Run(), clock: Callable[[], float] = time
                 now_s = clock()
                 report = Report(
                     name=job.name, steps=phase.steps, position=position, loss=loss, gradient_norm=norm,
-                    learning_rate=rate, looked=is_last and looked,
+                    learning_rate=base[0][0] * schedule(position.step - 1, phase), looked=looks,
                     frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
                 )  # fmt: skip
                 for watch in run.watches:
@@ -143,13 +143,12 @@ def schedule(step: int, phase: config.Phase) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, phase.steps - warm)))
 
 
-def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> float:
-    """Set the rates of `step` from those of the new optimizers; return the first."""
+def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> None:
+    """Set the rates of `step` from those of the new optimizers."""
     share = schedule(step, job.phase)
     for one, rates in zip(job.optimizers, base, strict=True):
         for group, rate in zip(one.param_groups, rates, strict=True):
             group["lr"] = rate * share
-    return base[0][0] * share
 
 
 def make_step(gradients: Gradients, step: int, generator: torch.Generator) -> Tensor:
@@ -178,32 +177,27 @@ def _moved(position: Position, loss: float) -> Position:
 
 
 @contextmanager
-def _enough_memory(gradients: Gradients, save: Callable[[Path], None], step: int) -> Iterator[None]:
-    """Run a step; where the GPU has too little memory, keep the steps before it and raise ModelError."""
+def _enough_memory(
+    gradients: Gradients,
+    position: Position,
+    made: Sequence[Tensor],
+    generator: torch.Generator,
+    best: Weights | None,
+) -> Iterator[None]:
+    """Run a step; where the GPU has too little memory, write a checkpoint of those `made`, and raise ModelError."""
     try:
         yield
     except torch.OutOfMemoryError as error:
         job, file = gradients.job, gradients.file
         for one in job.optimizers:
             one.zero_grad(set_to_none=True)
+        for values in made:
+            position = _moved(position, values.tolist()[0])
+        step = position.step
         if step and gradients.group.first:
-            save(file)
+            save_checkpoint(file, job, position, generator, best)
         few = f"too little memory on the GPU for a batch of {job.phase.batch} at step {step}"
         raise ModelError(f"{job.name}: {few}: begin with --accumulate 2 or more ({_kept(file)})") from error
-
-
-def _saved_at(
-    job: Job,
-    position: Position,
-    made: Sequence[tuple[Tensor, float]],
-    generator: torch.Generator,
-    best: Weights | None,
-    file: Path,
-) -> None:
-    """Write a checkpoint of the steps made so far, read or not."""
-    for values, _ in made:
-        position = _moved(position, values.tolist()[0])
-    save_checkpoint(file, job, position, generator, best)
 
 
 def _kept(file: Path) -> str:
@@ -218,8 +212,7 @@ def _clip(one: torch.optim.Optimizer, norm: float) -> Tensor:
 
 def _held_out(job: Job) -> float:
     """Return the held-out loss; random states and the model's mode stay. Raises ModelError if it is not finite."""
-    if job.held_out is None:
-        raise ValueError(f"{job.name} has nothing held out")
+    assert job.held_out is not None
     job.model.eval()
     devices = [job.device] if job.device.type == "cuda" else []
     with torch.random.fork_rng(devices), torch.no_grad():
@@ -291,7 +284,9 @@ class Gradients:
         self.job, self.group, self.file = job, group, file
         self._pieces, self._samples = pieces, job.phase.batch // pieces
         self.read_every = read_every or (1 if job.device.type == "cpu" else READ_EVERY)
-        self._half = job.phase.precision == "bf16" and multiplies_bf16(job.device)
+        # A processor without instructions for bf16 emulates it, which is slower than fp32.
+        fast = job.device.type == "cuda" or (job.device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
+        self._half = job.phase.precision == "bf16" and fast
         loss: nn.Module = _Loss(job.model, job.loss_of)
         if group.size > 1:  # not every part of a model learns in every phase and step
             with group.talking():
@@ -321,12 +316,12 @@ class Gradients:
             where = f"at step {step} ({_kept(self.file)}; --resume continues)"
             raise GroupError(f"{self.job.name}: {error}; {where}") from error
 
-    def read(self, made: Sequence[Tensor], first: int, pressed: bool) -> tuple[list[tuple[float, float]], bool]:
+    def read(self, made: list[Tensor], first: int, pressed: bool) -> tuple[list[tuple[float, float]], bool]:
         """Return losses and norms of steps from `first` on, and whether Ctrl-C was pressed in any process.
 
         Waits for the device. Raises ModelError for one that is not finite, GroupError.
         """
-        losses, norms = torch.stack(list(made), dim=1).tolist()
+        losses, norms = torch.stack(made, dim=1).tolist()
         with self.talking(first + len(made) - 1):
             *losses, asked = self.group.mean([*losses, float(pressed)])
         found = list(zip(losses, norms, strict=True))
@@ -357,11 +352,6 @@ class _Loss(nn.Module):
 
     def forward(self, step: int, generator: torch.Generator, samples: int) -> Tensor:
         return self._loss_of(step, generator, samples)
-
-
-def multiplies_bf16(device: torch.device) -> bool:
-    """Return whether bf16 is faster than fp32 on this device; a processor without such instructions emulates it."""
-    return device.type == "cuda" or (device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
 
 
 def _seed(seed: int, step: int, piece: int) -> int:
@@ -398,7 +388,7 @@ def digest_of(module: nn.Module) -> str:
 
 
 def save_checkpoint(file: Path, job: Job, position: Position, generator: torch.Generator, best: Weights | None) -> None:
-    """Write a checkpoint, replacing `file` in one move: a crash leaves the old one. Raises ConfigError."""
+    """Write a checkpoint (`write_whole`)."""
     tensors = {f"model.{name}": value for name, value in weights_of(job).items()}
     tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
     for index, one in enumerate(job.optimizers):
@@ -408,7 +398,11 @@ def save_checkpoint(file: Path, job: Job, position: Position, generator: torch.G
     tensors |= {"random.data": generator.get_state(), "random.torch": torch.get_rng_state()}
     if job.device.type == "cuda":
         tensors["random.cuda"] = torch.cuda.get_rng_state(job.device)
-    metadata = {"position": json.dumps(asdict(position)), "identity": json.dumps(job.identity)}
+    write_whole(file, tensors, {"position": json.dumps(asdict(position)), "identity": json.dumps(job.identity)})
+
+
+def write_whole(file: Path, tensors: Weights, metadata: dict[str, str]) -> None:
+    """Write a safetensors file, replacing `file` in one move: a crash leaves the old one. Raises ConfigError."""
     part = file.with_suffix(".part")
     try:
         save_file(tensors, part, metadata)
@@ -482,8 +476,8 @@ def _same(file: Path, theirs: object, ours: object) -> None:
     """Raise ConfigError with the first key whose value differs."""
     then, now = dict(_flat(theirs)), dict(_flat(ours))
     for key in [*now, *then]:
-        if then.get(key, "not given") != now.get(key, "not given"):
-            was, is_now = (values.get(key, "not given") for values in (then, now))
+        was, is_now = (values.get(key, "not given") for values in (then, now))
+        if was != is_now:
             raise ConfigError(
                 f"{file}: belongs to another run: {key} = {was!r} there, {is_now!r} now; "
                 "resume with the same, or leave out --resume"

@@ -96,10 +96,8 @@ def tables(tmp_path_factory):
 
 
 def compose(ami_folder, voices, seed, minutes):
-    parts = {split: [] for split in SPLITS}
-    for split, dyad in composed.dyads(composed.read_material(ami_folder, voices, MOTIONS), seed, minutes):
-        parts[split].append(dyad)
-    return parts
+    material = composed.read_material(ami_folder, voices, MOTIONS)
+    return {split: [*composed.dyads(material, "listening", split, seed, minutes)] for split in SPLITS}
 
 
 @pytest.fixture(scope="module")

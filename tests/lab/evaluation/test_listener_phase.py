@@ -55,7 +55,7 @@ def test_the_context_of_a_window_is_what_a_stream_remembers_there(changes, start
     tokens = torch.zeros(120, 2).long()
     for at in (start, 60 + start):  # the second dyad does not hear the first
         with torch.no_grad():
-            seen = context(one.model, corpus, tokens, torch.tensor([at]), 40, 8)
+            seen = context(one.model, corpus, tokens, torch.tensor([at]))
         heard = memory.speaker
         np.testing.assert_array_equal(seen.heard[0], heard.heard)
         np.testing.assert_array_equal(seen.face_known[0], heard.face_known)
@@ -69,7 +69,7 @@ def augmented(**changes):
     one = listener()
     corpus, tokens = corpus_of(one, dyad()), torch.randint(0, 6, (60, 2), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        seen = context(one.model, corpus, tokens, torch.tensor([0, 3, 8, 12]), 40, 8)
+        seen = context(one.model, corpus, tokens, torch.tensor([0, 3, 8, 12]))
     training = config.parse(config.PredictorTraining, OFF | {"history_noise": 0} | changes, "tiny")
     neutral = torch.full((40, 2), 5)
     return seen, augment(seen, torch.tensor([[5.0, 3.0], [2.0, 2.0]]), neutral, training, torch.Generator())
@@ -104,7 +104,7 @@ def test_recall_and_precision_of_one_who_always_or_never_says_keyframe(bias: flo
     with torch.no_grad():
         for row in (0, one.model.predictor.classes[0]):  # class 0 of both groups
             one.model.predictor.classify.bias[row] = bias
-    scores = keyframe_scores(one.model, corpus, one.settings)
+    scores = keyframe_scores(one.model, corpus)
     assert scores["keyframe_recall"] == recall
     rate = (8 + 4) / 2 / 48  # of the placement
     assert scores["keyframe_precision"] == pytest.approx(recall * rate, rel=0.15)

@@ -73,7 +73,7 @@ def a_student(**changes) -> Student:
 
 def fitted(corpus, **changes) -> ArigModel:
     model = a_student(**changes).model
-    fit_scales(model, corpus, settings().listener.channels)
+    fit_scales(model, corpus)
     return model
 
 
@@ -406,7 +406,7 @@ def test_windows_of_events_have_every_kind_as_often_and_come_of_the_scene_that_w
 
 def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():
     listener = settings(listener={"events": True}).listener
-    weights = channel_weights(listener, config.GroupWeights(head=2.0, brows=0.5))
+    weights = channel_weights(listener.channels, listener.drawn_channels, config.GroupWeights(head=2.0, brows=0.5))
     assert float(weights.sum()) == pytest.approx(1)
     groups = [group_of(name) for name in CHANNELS]
     of = {group: float(weights[[one == group for one in groups]].sum()) for group in set(groups)}
@@ -434,7 +434,7 @@ def of_motion(motion: np.ndarray) -> ArigModel:
         for at in range(0, len(motion) - frames + 1, frames)
     ]
     model = a_student(**SWAYS).model
-    fit_scales(model, gather({"listening": made}, WINDOW, ARKIT, model.settings), settings().listener.channels)
+    fit_scales(model, gather({"listening": made}, WINDOW, ARKIT, model.settings))
     return model
 
 
@@ -458,7 +458,7 @@ def test_who_speaks_is_no_model_of_how_a_listener_sways():
           for name, motion in (("listening", still), ("speaking", lively))}  # fmt: skip
     both, alone = a_student(**SWAYS).model, a_student(**SWAYS).model
     for model, scenes in ((both, of), (alone, {"listening": of["listening"]})):
-        fit_scales(model, gather(scenes, WINDOW, ARKIT, model.settings), model.settings.channels)
+        fit_scales(model, gather(scenes, WINDOW, ARKIT, model.settings))
     assert torch.equal(both.sway_mixture, alone.sway_mixture) and bool(alone.sway_mixture.any())
 
 
@@ -484,7 +484,7 @@ def test_how_far_a_face_goes_at_rest_is_that_of_one_that_nothing_moves():
     said[: (half + 1) * sample] = 0
     still = replace(one, listener=(0.2 + motion).astype(np.float32), events=(brows,), agent_audio=said)
     model = a_student(**SWAYS).model
-    fit_scales(model, gather({"listening": [still] * 3}, WINDOW, ARKIT, model.settings), model.settings.channels)
+    fit_scales(model, gather({"listening": [still] * 3}, WINDOW, ARKIT, model.settings))
     rests = (model.rest_range * model.motion_std)[model.is_drawn & model.is_recalled]
     assert float(rests.max()) < 0.05
 
@@ -493,7 +493,7 @@ def test_a_head_whose_past_is_not_told_is_as_it_was(data):
     model = a_student(**SWAYS).model
     corpus = gather(open_scenes(data, "train"), WINDOW, ARKIT, model.settings)
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:50], WINDOW)
-    fit_scales(model, corpus, settings().listener.channels)
+    fit_scales(model, corpus)
     found, truth = augmented(told, model, history_noise=1.0)
     assert torch.equal(found.agent_motion[..., :6], told.agent_motion[..., :6])
     assert torch.equal(truth[..., :6], told.agent_motion[..., :6])

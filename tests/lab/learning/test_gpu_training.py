@@ -61,7 +61,7 @@ def step_of(data, phase, device):
     whole = settings(TOLD, **phase)
     corpus = gather(open_scenes(data, "train"), 24, MotionSpace("arkit58", np.zeros(58)), whole.listener)
     student = Student(ArigModel(whole.listener))
-    fit_scales(student.model, corpus, whole.listener.channels)
+    fit_scales(student.model, corpus)
     dyad = corpus.cut(torch.tensor([0, 30]), 24)
     student.to(device)
     dyad = Corpus(dyad, (48,), ("listening",)).to(device).frames

@@ -124,7 +124,7 @@ def test_no_border_between_dyads_counts_as_motion():
         joined = torch.cat([getattr(one.frames, name) for one in alone])
         assert torch.equal(getattr(both.frames, name), joined)
     model = SfmsModel(listener)
-    fit_scales(model, both, listener.channels)
+    fit_scales(model, both)
     fastest = max(float(one.steps(one.frames.motion).abs().max()) for one in alone)
     assert float((model.motion_speed * model.motion_std)[:6].max()) <= fastest
     mask = place_all(model.tokenizer, model.standardise(both.frames.motion), both.lengths)
@@ -148,7 +148,7 @@ def test_a_window_begins_with_the_keyframe_that_is_held_there():
     placed[10] = 4
     at = torch.tensor([5, 30])
     with torch.no_grad():
-        seen = context(model, corpus_with_sound(corpus), placed, at, 40, 8, held=held_tokens(placed, [500]))
+        seen = context(model, corpus_with_sound(corpus), placed, at, held=held_tokens(placed, [500]))
     assert seen.tokens[:, 0].tolist() == [[0, 0], [4, 4]]
     torch.testing.assert_close(seen.control[1], corpus.frames.control[30:78])
 
@@ -160,7 +160,7 @@ def corpus_with_sound(corpus):
 
 def test_windows_of_a_tokenizer_begin_with_a_keyframe():
     model, corpus = learner()
-    fit_scales(model, corpus, model.settings.channels)
+    fit_scales(model, corpus)
     draw = batches(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths, 8)
     _, mask = draw(8, torch.Generator().manual_seed(0))
     assert mask.shape == (8, 48, 2) and (mask[:, 0] == 1).all() and mask.mean() < 0.5
@@ -181,7 +181,7 @@ def test_a_stream_that_has_just_begun_was_told_of_nothing_before():
     corpus = corpus_with_sound(corpus)
     corpus = replace(corpus, frames=replace(corpus.frames, control=torch.ones(500, len(COLUMNS))))
     with torch.no_grad():
-        seen = context(model, corpus, torch.zeros(500, 2).long(), torch.arange(6), 40, 8)
+        seen = context(model, corpus, torch.zeros(500, 2).long(), torch.arange(6))
     after = augment(seen, None, torch.full((40, 2), 5), training, torch.Generator().manual_seed(0))
     for row in range(6):
         begun = (after.tokens[row, :40] != 5).any(-1)

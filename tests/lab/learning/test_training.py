@@ -10,7 +10,7 @@ import torch
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNELS, FRAME_SAMPLES, POSE_CHANNELS
+from sfms_robot.frames import BLENDSHAPES, FRAME_SAMPLES, POSE_CHANNELS
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.evaluation.detection import behaviour
@@ -184,7 +184,7 @@ def test_a_plan_that_is_drawn_as_a_whole_is_learned_as_a_whole(hop):
     corpus = gather([dyad("a")], 48, ARKIT, AudioFrontend.of(tiny.listener), tiny.listener)
     model, undecided = SfmsModel(tiny.listener), []
     model.predictor.register_forward_pre_hook(lambda _, seen: undecided.append(seen[0].tokens[:, -8:] == UNDECIDED))
-    listener.held_out_loss(model, corpus, tiny)
+    listener.held_out_loss(model, corpus, tiny.predictor)
     first = torch.cat(undecided)[..., 0]
     assert first[:, -1].all() and first.all() == (hop == 8)
 
@@ -202,7 +202,7 @@ def test_steps_from_one_dyad_into_the_next_are_no_steps():
     """Two people who sit still in different places: nobody moves, however many dyads there are."""
     still = [replace(dyad(name), listener=np.full((300, 58), at, np.float32)) for name, at in (("a", 0.1), ("b", 0.9))]
     model = SfmsModel(settings().listener)
-    fit_scales(model, gather([*still] * 40, 48, ARKIT), CHANNELS)
+    fit_scales(model, gather([*still] * 40, 48, ARKIT))
     assert (model.motion_speed == LEAST_SPEED).all()
 
 
@@ -214,7 +214,7 @@ def test_only_short_dyads_are_refused():
 @pytest.mark.parametrize("placement", ["exact", "static"])
 def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
-    fit_scales(model, corpus, CHANNELS)
+    fit_scales(model, corpus)
     mask = place_all(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths)
     assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
     for part in mask.split(corpus.lengths):
@@ -224,7 +224,7 @@ def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement
 @pytest.mark.parametrize("placement", ["exact", "static"])
 def test_tokens_of_a_window_do_not_depend_on_where_in_a_dyad_it_lies(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
-    fit_scales(model, corpus, CHANNELS)
+    fit_scales(model, corpus)
     motion = model.standardise(corpus.frames.motion)
     dense, starts = keyframe_tokens(model, motion), torch.arange(0, 240, 24)
     own = window_tokens(model, motion, dense, starts)

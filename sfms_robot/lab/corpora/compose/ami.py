@@ -31,7 +31,8 @@ _COLUMNS: Final = {
     "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
 }
 _Rows = dict[str, list[str]]
-_Spans = dict[tuple[str, str], list[tuple[float, float, str]]]
+LabelledSpan = tuple[float, float, str]  # start, end [s], and what or which agent
+_Spans = dict[tuple[str, str], list[LabelledSpan]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,18 +67,18 @@ class MeetingPerson:
     shakes: Doubles
     tilts: Doubles
     unseen: Doubles
-    gaze: tuple[tuple[float, float, str], ...] | None
+    gaze: tuple[LabelledSpan, ...] | None
     laughs: Doubles
     talk: Doubles
     backchannels: Doubles
     others: Doubles
-    floor: tuple[tuple[float, float, str], ...]
+    floor: tuple[LabelledSpan, ...]
     others_laughs: Doubles
     asked: Doubles
     others_backchannels: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
     mm_hms: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
-    others_nods: tuple[tuple[float, float, str], ...] = ()
-    looked_at: tuple[tuple[float, float, str], ...] = ()
+    others_nods: tuple[LabelledSpan, ...] = ()
+    looked_at: tuple[LabelledSpan, ...] = ()
     gaze_known: frozenset[str] = frozenset()
     words: Mapping[str, Doubles] = field(default_factory=dict)
 
@@ -90,10 +91,10 @@ def read_people(folder: Path) -> list[MeetingPerson]:
     agents = defaultdict(list)
     for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
         agents[meeting].append(agent)
-    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in list(words.items())}
+    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in words.items()}
     people = []
-    for row in zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True):
-        meeting, agent, participant, until, has_gaze = row
+    rows = zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True)
+    for meeting, agent, participant, until, has_gaze in rows:
         if float(until or 0) < 60:
             continue
         key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
@@ -165,20 +166,18 @@ def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPer
     return parts
 
 
-def _of_others(
-    spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]
-) -> tuple[tuple[float, float, str], ...]:
+def _of_others(spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]) -> tuple[LabelledSpan, ...]:
     """Return (start, end, agent) of what the others did, by start."""
     return tuple(
         sorted((start, end, other[1]) for other in others for start, end, what in spans[other] if what in wanted)
     )
 
 
-def _spoken(spans: Iterable[tuple[float, float, str]]) -> list[tuple[float, float]]:
+def _spoken(spans: Iterable[LabelledSpan]) -> list[tuple[float, float]]:
     return [(start, end) for start, end, what in spans if what.startswith("w ")]
 
 
-def _pick(spans: Iterable[tuple[float, float, str]], wanted: tuple[str, ...]) -> Doubles:
+def _pick(spans: Iterable[LabelledSpan], wanted: tuple[str, ...]) -> Doubles:
     return np.array([(start, end) for start, end, what in spans if what in wanted], np.float64).reshape(-1, 2)
 
 

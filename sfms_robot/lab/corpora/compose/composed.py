@@ -16,7 +16,7 @@ than they occur in the meetings; a set of enough minutes holds every stretch onc
 
 A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
-the filmed recordings themselves (`speaking.py`). Each is a data set of its own in a folder of that name.
+the filmed recordings themselves (`speaking.py`). Each is a separate data set, in a folder of that name.
 """
 
 from __future__ import annotations
@@ -24,12 +24,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -37,8 +36,9 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubl
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
-from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.motions import Rng, pick
+from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
     VoiceClip,
@@ -54,12 +54,15 @@ from sfms_robot.lab.corpora.compose.voices import (
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes
+from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)
 HELD_OUT_SHARE: Final = 1 / 6  # of the training minutes, for validation and for test
-SHARES: Final = {"interaction": 0.5, "speaking": 0.25}  # minutes of the sets that speak, per minute of listening
 Scene = Literal["listening", "interaction"]
+SetName = Scene | Literal["speaking"]
+# Minutes of the sets that speak, per minute of listening.
+SHARES: Final[Mapping[SetName, float]] = {"interaction": 0.5, "speaking": 0.25}
 _SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
@@ -140,7 +143,8 @@ def compose_folder(
 ) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
-    Beside them, out/interaction and out/speaking are sets of the same form. No filmed voice, no speaking.
+    Two further sets of the same form go into out/interaction and out/speaking; without a filmed voice there is no
+    speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
     ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
@@ -149,62 +153,62 @@ def compose_folder(
     random numbers of its own, so the files are the same with any number. Returns the minutes written per split. Raises
     ConfigError.
     """
-    folders = {"listening": out, **{name: out / name for name in SHARES}}
-    wanted = {name: SHARES.get(name, 1.0) * minutes for name in folders}
+    folders: dict[SetName, Path] = {"listening": out, **{name: out / name for name in SHARES}}
+    parts = [
+        Part(name, split, folder, SHARES.get(name, 1.0) * minutes)
+        for name, folder in folders.items()
+        for split in SPLITS
+    ]
     if not overwrite and (earlier := sorted(file for folder in folders.values() for file in _composed(folder))):
         raise ConfigError(
             f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
         )
-    parts = [(name, split) for name in folders for split in SPLITS]
-    found: dict[tuple[str, Split], list[tuple[Path, float]]] = {}
+    written: dict[Part, dict[Path, float]] = {part: {} for part in parts}
     done = dict.fromkeys(folders, 0.0)
-    for part, file, minute in _written(data, folders, wanted, seed, parts, jobs):
-        found.setdefault(part, []).append((file, minute))
-        done[part[0]] += minute
+    for part, file, minute in _written(data, parts, seed, jobs):
+        written[part][file] = minute
+        done[part.name] += minute
         if told:
-            told(part[0], wanted[part[0]] * (1 + 2 * HELD_OUT_SHARE), done[part[0]])
-    fresh = {file for files in found.values() for file, _ in files}
-    for stale in {file for folder in folders.values() for file in _composed(folder)} - fresh:
+            told(part.name, part.minutes * (1 + 2 * HELD_OUT_SHARE), done[part.name])
+    for stale in {file for folder in folders.values() for file in _composed(folder)}.difference(*written.values()):
         stale.unlink()
-    names = {(name, split): split if name == "listening" else f"{name}_{split}" for name, split in parts}
-    return {names[part]: sum(minute for _, minute in found.get(part, ())) for part in parts}
+    return {
+        part.split if part.name == "listening" else f"{part.name}_{part.split}": sum(files.values())
+        for part, files in written.items()
+    }
 
 
-Part = tuple[str, Split]  # a set and one of its splits
+@dataclass(frozen=True)
+class Part:
+    """A split of a set, the folder of the set, and the minutes wanted of its training split."""
+
+    name: SetName
+    split: Split
+    folder: Path
+    minutes: float
+
+    def write(self, material: Mapping[Split, Material], seed: int) -> Iterator[tuple[Part, Path, float]]:
+        """Write the dyads of the part; yield the file and minutes of each."""
+        for dyad in dyads(material, self.name, self.split, seed, self.minutes):
+            save(self.folder / self.split, [dyad])
+            yield self, self.folder / self.split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
 
 
-def _written(
-    data: Path, folders: Mapping[str, Path], wanted: Mapping[str, float], seed: int, parts: Sequence[Part], jobs: int
-) -> Iterator[tuple[Part, Path, float]]:
+def _written(data: Path, parts: Sequence[Part], seed: int, jobs: int) -> Iterator[tuple[Part, Path, float]]:
     """Yield each dyad once it is written: its part, file and minutes; with several jobs, part by part."""
     if jobs == 1:
-        material = material_of(data)
         for part in parts:
-            for file, minute in write_part(material, part, folders[part[0]], seed, wanted[part[0]]):
-                yield part, file, minute
+            yield from part.write(material_of(data), seed)
         return
     with process_pool(min(jobs, len(parts))) as pool:
-        largest = sorted(parts, key=lambda part: (part[1] != "train", -wanted[part[0]]))
-        of = {pool.submit(_whole_part, data, part, folders[part[0]], seed, wanted[part[0]]): part for part in largest}
-        for ended in as_completed(of):
-            yield from ((of[ended], file, minute) for file, minute in ended.result())
+        largest = sorted(parts, key=lambda part: (part.split != "train", -part.minutes))
+        for ended in as_completed([pool.submit(_whole_part, data, part, seed) for part in largest]):
+            yield from ended.result()
 
 
-def _whole_part(data: Path, part: Part, folder: Path, seed: int, minutes: float) -> list[tuple[Path, float]]:
+def _whole_part(data: Path, part: Part, seed: int) -> list[tuple[Part, Path, float]]:
     """Write a part, in a process of a pool."""
-    return [*write_part(material_of(data), part, folder, seed, minutes)]
-
-
-def write_part(
-    material: Mapping[Split, Material], part: Part, folder: Path, seed: int, minutes: float
-) -> Iterator[tuple[Path, float]]:
-    """Write the dyads of a part; yield the file and minutes of each."""
-    name, only = part
-    scene: Scene = "interaction" if name == "interaction" else "listening"
-    make = monologues if name == "speaking" else partial(dyads, scene=scene)
-    for split, dyad in make(material, seed, minutes, only=only):
-        save(folder / split, [dyad])
-        yield folder / split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
+    return [*part.write(material_of(data), seed)]
 
 
 @lru_cache(maxsize=1)
@@ -221,59 +225,41 @@ def _composed(out: Path) -> set[Path]:
     return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
 
 
-def dyads(
-    material: Mapping[Split, Material],
-    seed: int,
-    minutes: float,
-    scene: Scene = "listening",
-    only: Split | None = None,
-) -> Iterator[tuple[Split, Dyad]]:
-    """Yield dyads one by one, as (split, dyad): for sets that need not fit in memory; `only` of one split.
+def dyads(material: Mapping[Split, Material], name: SetName, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
+    """Yield the dyads of one split of a set, one by one: for sets that need not fit in memory.
 
-    Raises ConfigError.
+    `minutes`: of the training split. Without filmed voices, the set `speaking` has none. Raises ConfigError.
     """
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
-    for number, split in enumerate(SPLITS):
-        if only not in (None, split):
-            continue
-        rng = np.random.default_rng([seed, number] if scene == "listening" else [seed, number, 1])
-        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
-        for stretch in choose(stretches(material[split].people, rng, scene), wanted, rng):
-            yield split, compose_one(stretch, material[split], rng)
+    number, own = SPLITS.index(split), material[split]
+    wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
+    if name == "speaking":
+        yield from speaking.dyads(own.voices, own.motions, own.dwell, [seed, number, 2], wanted)
+        return
+    rng = np.random.default_rng([seed, number] if name == "listening" else [seed, number, 1])
+    for stretch in choose(stretches(own.people, rng, name), wanted, rng):
+        yield compose_one(stretch, own, rng)
 
 
-def monologues(
-    material: Mapping[Split, Material], seed: int, minutes: float, only: Split | None = None
-) -> Iterator[tuple[Split, Dyad]]:
-    """Yield dyads in which only the agent speaks; none for a split without filmed voices; `only` of one split."""
-    for number, split in enumerate(SPLITS):
-        if only not in (None, split):
-            continue
-        wanted = minutes * (1 if split == "train" else HELD_OUT_SHARE)
-        part = material[split]
-        for dyad in speaking.dyads(part.voices, part.motions, part.dwell, [seed, number, 2], wanted):
-            yield split, dyad
-
-
-def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
+def cast(voices: Sequence[VoiceClip], rng: Rng) -> VoiceClip:
     """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
-    return fitting[int(rng.integers(len(fitting)))]
+    return pick(fitting, rng)
 
 
-def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
+def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: Rng) -> VoiceClip | None:
     """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
-    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+    return pick(fitting, rng) if fitting else None
 
 
 # --- which stretches --------------------------------------------------------------------------------------------
 
 
-def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: Scene = "listening") -> list[Stretch]:
+def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listening") -> list[Stretch]:
     """Cut the time of each person into pieces of 30 to 60 s; keep those on camera that fit the scene.
 
     Listening: the person mostly listens. Interaction: the person talks at least a fifth of the time, and so do the
@@ -300,7 +286,7 @@ def stretches(people: Sequence[MeetingPerson], rng: np.random.Generator, scene: 
     return found
 
 
-def choose(found: Sequence[Stretch], minutes: float, rng: np.random.Generator) -> list[Stretch]:
+def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
     """Draw about `minutes` of stretches without repetition, by weight; all of them where there are no more.
 
     Systematic draw along the nod rate: even a small set has the rates of the large one.
@@ -330,12 +316,16 @@ def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
 # --- one dyad ---------------------------------------------------------------------------------------------------
 
 
-def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) -> Dyad:
+def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
     """Return one stretch as a dyad: cast, acted and voiced."""
     person, frames = stretch.person, stretch.frames
     voice = cast(material.voices, rng)
     others, own = active(person.others, stretch), active(person.talk, stretch)
-    said, mouth = _own_words(stretch, own_voice(material.voices, voice, rng), rng.spawn(1)[0])
+    spoken, speaking_rng = own_voice(material.voices, voice, rng), rng.spawn(1)[0]
+    said = mouth = None
+    if spoken is not None:
+        speech, mouth = _laid(person.talk, stretch, spoken, speaking_rng)
+        said = speaking.sent(speech, speaking_rng)
     score = Score(
         frames=frames,
         nods=within(person.nods, stretch),
@@ -378,32 +368,26 @@ def compose_one(stretch: Stretch, material: Material, rng: np.random.Generator) 
     )
 
 
-def _own_words(
-    stretch: Stretch, voice: VoiceClip | None, rng: np.random.Generator
-) -> tuple[Floats | None, Floats | None]:
-    """Return the listener's own voice (N * 640,), as sent to a loudspeaker, and its mouth (N, 52)."""
-    if voice is None:
-        return None, None
-    said = np.clip(stretch.person.talk - stretch.start_s, 0, stretch.frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
-    return speaking.sent(speech, rng), mouth
+def _laid(spans: Doubles, stretch: Stretch, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:
+    """Return sound and mouth (`voices.lay`) of a voice that speaks in spans (K, 2) of the meeting."""
+    said = np.clip(spans - stretch.start_s, 0, stretch.frames * FRAME_S)
+    return lay(said[said[:, 1] > said[:, 0]], stretch.frames, voice, rng)
 
 
 def speaker_of(
     stretch: Stretch,
     voice: VoiceClip,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
     laughter: Sequence[Floats] = (),
-    smiles: Doubles | None = None,
+    smiles: Doubles = NO_SPANS,
 ) -> tuple[Floats, Floats]:
     """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen.
 
     `smiles`: (K, 3) start, end [s] and size of theirs, besides those of laughs.
     """
     person, frames = stretch.person, stretch.frames
-    said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
-    speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
+    speech, mouth = _laid(person.others, stretch, voice, rng)
     laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
     audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
     if rng.random() < _FACELESS:
@@ -430,12 +414,12 @@ def attention_of(stretch: Stretch) -> Floats:
     return out
 
 
-def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+def _spans(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     """Return spans (K, 2) of what one agent did, or all."""
     return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
-def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:
+def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> tuple[LabelledSpan, ...]:
     """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
     if stretch.person.gaze is None:
         return dwell.looks(stretch.frames * FRAME_S, rng)
@@ -445,7 +429,7 @@ def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tu
     )
 
 
-def active(spans: Doubles, stretch: Stretch) -> NDArray[np.bool_]:
+def active(spans: Doubles, stretch: Stretch) -> Bools:
     """Return frames (N,) whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
     for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
@@ -472,7 +456,7 @@ _LOST_A_MINUTE: Final = 2.0
 _LOST_S: Final = (0.3, 3.0)
 
 
-def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
+def heard(speech: Floats, voice: VoiceClip, rng: Rng) -> Floats:
     """Return speech (n,) with room, spectral tilt, gain and noise floor."""
     direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
     tilt = np.float32(rng.uniform(*_TILT))
@@ -481,7 +465,7 @@ def heard(speech: Floats, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     return np.asarray(np.clip(gain * toned + room(len(speech), voice, rng), -1, 1), np.float32)
 
 
-def seen(motion: Floats, rng: np.random.Generator) -> Floats:
+def seen(motion: Floats, rng: Rng) -> Floats:
     """Return a face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
     frames = len(motion)
     out = motion.copy()

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy import signal
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, SMILE_CORNERS, Floats, ListenerEvent
 
+Rng = np.random.Generator
 SHAPE: Final = {name: index for index, name in enumerate(BLENDSHAPES)}
 
 FADE: Final = FRAME_HZ
 SMILE: Final = [SHAPE[name] for name in SMILE_CORNERS]
+_Item = TypeVar("_Item")
 
 
 def slow(pose: Floats, cut_hz: float = 0.8) -> Floats:
@@ -30,7 +32,7 @@ def edges(length: int, ramp: int) -> Floats:
     return np.concatenate([up, np.ones(length - 2 * ramp), up[::-1]]).astype(np.float32)
 
 
-def tiled(pieces: Sequence[Floats], frames: int, rng: np.random.Generator, fade: int = FADE) -> Floats:
+def tiled(pieces: Sequence[Floats], frames: int, rng: Rng, fade: int = FADE) -> Floats:
     """Join random pieces (K, C), each crossfaded over `fade` frames; return (frames, C)."""
     usable = [piece for piece in pieces if len(piece) > 2 * fade] or [max(pieces, key=len)]
     fade = min(fade, min(len(piece) for piece in usable) // 2)
@@ -88,10 +90,11 @@ def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> Listene
     return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
-def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    return pieces[int(rng.integers(len(pieces)))]
+def pick(items: Sequence[_Item], rng: Rng) -> _Item:
+    """Draw one, each as likely as any other."""
+    return items[int(rng.integers(len(items)))]
 
 
 def over(below: Floats, above: Floats) -> Floats:
     """Combine two activations of the same muscles: their sum while small, saturating at 1, smooth."""
-    return np.asarray(below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1), np.float32)
+    return below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1)

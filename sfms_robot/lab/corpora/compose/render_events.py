@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from sfms_robot.lab.corpora.compose.motions import (
     FADE,
     SHAPE,
     SMILE,
+    Rng,
     edges,
     first_frame,
     held,
@@ -53,12 +54,11 @@ _MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
 _TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
 
 
-def _nothing(*shape: int) -> Doubles:
-    return np.zeros(shape)
+NO_SPANS: Final = np.zeros((0, 2))
 
 
-def _spans() -> Doubles:
-    return _nothing(0, 2)
+def _spans(width: int = 2) -> Doubles:
+    return np.zeros((0, width))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +85,9 @@ class Score:
     mm_hms: Doubles = field(default_factory=_spans)
     gaze: tuple[tuple[float, float, str], ...] = ()
     shared_laughs: Doubles = field(default_factory=_spans)
-    smiles: Doubles = field(default_factory=lambda: _nothing(0, 3))
-    asked: Doubles = field(default_factory=lambda: _nothing(0))
-    ends: Doubles = field(default_factory=lambda: _nothing(0))
+    smiles: Doubles = field(default_factory=lambda: _spans(3))
+    asked: Doubles = field(default_factory=lambda: np.zeros(0))
+    ends: Doubles = field(default_factory=lambda: np.zeros(0))
     mouth: Floats | None = None
 
 
@@ -100,15 +100,16 @@ class Acted:
     head_of_gaze_rad: Floats
 
 
-def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
+def act(score: Score, motions: Motions, rng: Rng) -> Acted:
     """Return one listener, whose manners (size and pace of nods, blinks, places of looks) are drawn."""
     motion = np.zeros((score.frames, MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
     targets, looks = _targets(score, rng)
-    pose[:, :3] = _sway(motions, score.frames, rng)
-    pose[:, 3:] = _drift(motions, score.frames, rng)
+    _sway(pose, motions, rng)
     pose += _talking_head(score, motions, rng)
-    events = looks + _gestures(pose, score, motions, rng)
+    events = looks + _swing(pose, "nod", score.nods, motions, rng)
+    events += _swing(pose, "shake", score.shakes, motions, rng)
+    events += _tilt(pose, score.tilts, rng)
     shapes += _idle(motions, score.frames, rng)
     events += _smile(shapes, score, motions, rng)
     events += _raise_brows(shapes, score, motions, rng)
@@ -116,9 +117,7 @@ def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
     cues = np.concatenate([score.ends, [look.start_s for look in looks]])
     events += _blink(shapes, cues, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
-    head, eyes, _ = gaze_kinematics.follow(targets, pose, gaze_kinematics.start(int(rng.integers(2**31))))
-    pose[:, :3] += head
-    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    head = _look(motion, targets, int(rng.integers(2**31)))
     acted = Acted(motion, tuple(sorted(events, key=lambda event: event.start_s)), head)
     return _mirror_image(acted) if rng.random() < 0.5 else acted
 
@@ -126,11 +125,11 @@ def act(score: Score, motions: Motions, rng: np.random.Generator) -> Acted:
 def speaker_motion(
     mouth: Floats,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
     attention: Floats | None = None,
-    laughs: Doubles | None = None,
-    nods: Doubles | None = None,
-    smiles: Doubles | None = None,
+    laughs: Doubles = NO_SPANS,
+    nods: Doubles = NO_SPANS,
+    smiles: Doubles = NO_SPANS,
 ) -> Floats:
     """Return motion (N, 58) of a person who speaks with this mouth (N, 52); head and the rest of the face are recorded.
 
@@ -142,18 +141,16 @@ def speaker_motion(
     motion = np.zeros((len(mouth), MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
     pose += rng.uniform(0.5, 1.1) * tiled(motions.heads, len(mouth), rng)
-    _nod(pose, _spans() if nods is None else nods, motions, rng)
+    _swing(pose, "nod", nods, motions, rng)
     shapes += np.clip(tiled(motions.faces, len(mouth), rng) + rng.uniform(0.8, 1.1) * mouth, 0, 1)
-    for start, end in _spans() if laughs is None else laughs:
+    for start, end in laughs:
         lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
-    for start, end, size in () if smiles is None else smiles.tolist():
+    for start, end, size in smiles.tolist():
         lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
     known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
-    state = gaze_kinematics.start(int(rng.integers(2**31)))
-    head, eyes, _ = gaze_kinematics.follow(_speaker_targets(known, rng), pose, state)
-    pose[:, :3] += head
-    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    seed = int(rng.integers(2**31))
+    _look(motion, _speaker_targets(known, rng), seed)
     return mirrored(motion) if rng.random() < 0.5 else motion
 
 
@@ -179,20 +176,16 @@ def _mirror_image(acted: Acted) -> Acted:
 # --- head -------------------------------------------------------------------------------------------------------
 
 
-def _sway(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
-    """Return idle roll, pitch, yaw: recorded slow motion brought to about a degree."""
+def _sway(pose: Floats, motions: Motions, rng: Rng) -> None:
+    """Fill a pose (N, 6) with the slow motion of a head at rest, as recorded: about a degree, and millimetres."""
     unit = [piece / (piece.std(axis=0) + 1e-6) for piece in motions.sway]
     size = np.deg2rad(rng.uniform(0.4, 1.1)) * np.array([1.0, 0.8, 1.0], np.float32)
-    return np.asarray(tiled(unit, frames, rng, fade=2 * FADE) * size * rng.choice([-1, 1], 3), np.float32)
-
-
-def _drift(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
-    """Return idle x, y, z: millimetres."""
+    pose[:, :3] = tiled(unit, len(pose), rng, fade=2 * FADE) * size * rng.choice([-1, 1], 3)
     slowly = [slow(head[:, 3:], 0.5) for head in motions.heads]
-    return np.asarray(rng.uniform(0.2, 0.5) * tiled(slowly, frames, rng), np.float32)
+    pose[:, 3:] = rng.uniform(0.2, 0.5) * tiled(slowly, len(pose), rng)
 
 
-def _talking_head(score: Score, motions: Motions, rng: np.random.Generator) -> Floats:
+def _talking_head(score: Score, motions: Motions, rng: Rng) -> Floats:
     """Return the head (N, 6) of a person who speaks."""
     talks = np.zeros(score.frames, np.float32)
     for start, end in score.talk:
@@ -220,14 +213,14 @@ class NodManner:
     fall: float
 
 
-def nod_habit(rng: np.random.Generator) -> NodHabit:
+def nod_habit(rng: Rng) -> NodHabit:
     """Draw the habit of a person: about 5 degrees, 1.8 to 3 swings a second."""
     usual = sizes.NOD_DEG[1]
     size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
     return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
 
 
-def nod_manner(habit: NodHabit, length_s: float, rng: np.random.Generator) -> NodManner:
+def nod_manner(habit: NodHabit, length_s: float, rng: Rng) -> NodManner:
     """Return swings, rate and size of a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12
     degrees.
     """
@@ -250,26 +243,27 @@ def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> 
     return out.astype(np.float32)
 
 
-def _nod(pose: Floats, spans: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _swing(
+    pose: Floats, kind: Literal["nod", "shake"], spans: Doubles, motions: Motions, rng: Rng
+) -> list[ListenerEvent]:
+    """Add nods or shakes to a pose (N, 6)."""
     habit, events = nod_habit(rng), []
     for start, end in spans.tolist():
         manner = nod_manner(habit, end - start, rng)
-        curve = nod_curve(manner, pick(motions.nods, rng), start, len(pose))
-        pose[:, 1] += curve
-        events.append(ListenerEvent("nod", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+        if kind == "nod":
+            curve = nod_curve(manner, pick(motions.nods, rng), start, len(pose))
+            pose[:, 1] += curve
+        else:
+            curve = sizes.SHAKE * nod_curve(manner, pick(motions.shakes, rng), start, len(pose))
+            pose[:, 2] += rng.choice([-1, 1]) * curve
+        events.append(ListenerEvent(kind, start, manner.duration_s, float(np.ptp(curve)), manner.swings))
     return events
 
 
-def _gestures(pose: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
-    """Add nods, shakes and tilts to a pose (N, 6)."""
-    events = _nod(pose, score.nods, motions, rng)
-    habit = nod_habit(rng)
-    for start, end in score.shakes.tolist():
-        manner = nod_manner(habit, end - start, rng)
-        curve = sizes.SHAKE * nod_curve(manner, pick(motions.shakes, rng), start, len(pose))
-        pose[:, 2] += rng.choice([-1, 1]) * curve
-        events.append(ListenerEvent("shake", start, manner.duration_s, float(np.ptp(curve)), manner.swings))
-    for start, end in score.tilts:
+def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> list[ListenerEvent]:
+    """Add tilts to a pose (N, 6)."""
+    events = []
+    for start, end in spans:
         curve = np.deg2rad(rng.uniform(*sizes.TILT_DEG)) * edges(max(12, int((end - start) * FRAME_HZ) + 12), 12)
         pose[:, 0] += rng.choice([-1, 1]) * placed(curve, start, len(pose))
         events.append(laid_event("tilt", start, curve, curve.max()))
@@ -287,7 +281,15 @@ def _bend(shape: Floats, length_s: float) -> float:
 # --- gaze -------------------------------------------------------------------------------------------------------
 
 
-def _targets(score: Score, rng: np.random.Generator) -> tuple[Floats, list[ListenerEvent]]:
+def _look(motion: Floats, targets: Floats, seed: int) -> Floats:
+    """Turn eyes and head of a motion (N, 58) to targets (N, 2); return what that adds to its head (N, 3)."""
+    head, eyes, _ = gaze_kinematics.follow(targets, motion[:, POSE], gaze_kinematics.start(seed))
+    motion[:, POSE][:, :3] += head
+    motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
+    return head
+
+
+def _targets(score: Score, rng: Rng) -> tuple[Floats, list[ListenerEvent]]:
     """Return gaze targets (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead, and the gaze shifts."""
     seats: dict[str, tuple[float, float]] = {}
     out = np.zeros((score.frames, 2), np.float32)
@@ -316,7 +318,7 @@ def _shifts(targets: Floats) -> list[ListenerEvent]:
     ]
 
 
-def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
+def _speaker_targets(attention: Floats, rng: Rng) -> Floats:
     """Return where a speaker looks, (N, 2): at the listener or not as given, at random where not known."""
     at_listener = attention > 0.5
     unknown = np.isnan(attention)
@@ -338,13 +340,13 @@ def _speaker_targets(attention: Floats, rng: np.random.Generator) -> Floats:
 # --- face -------------------------------------------------------------------------------------------------------
 
 
-def _idle(motions: Motions, frames: int, rng: np.random.Generator) -> Floats:
+def _idle(motions: Motions, frames: int, rng: Rng) -> Floats:
     """Return the motion of a resting face, lifted so that it hardly ever falls below the neutral."""
     moving = tiled(motions.idle, frames, rng, fade=12)
     return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
 
 
-def _smile(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay smiles: own laughs and returned smiles always, laughs of others often, backchannels and nods seldom.
 
     Only a laugh opens the jaw.
@@ -379,7 +381,7 @@ def lay_smile(
     size: float,
     jaw: float,
     motions: Motions,
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> Floats:
     """Lay a recorded smile over the face (N, 52) from `start_s` on; return the curve (K, 52)."""
     curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
@@ -391,7 +393,7 @@ def lay_smile(
     return curve
 
 
-def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Raise the brows after half of the questions and with some of the nods."""
     at = [instant for instant in score.asked if rng.random() < 0.5]
     at += [start for start, _ in score.nods if rng.random() < 0.15]
@@ -407,7 +409,7 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: np.random.
     return events
 
 
-def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay the listener's own words: the mouth of the voice, or some recorded mouth over them, small for an "mm-hm".
 
     The size of an "mm-hm" is how far it opens the jaw.
@@ -430,7 +432,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: np.random.Genera
     return events
 
 
-def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: np.random.Generator) -> list[ListenerEvent]:
+def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> list[ListenerEvent]:
     """Lay blinks at recorded intervals and a personal rate; half wait for a cue (gaze shift, phrase end) nearby."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)

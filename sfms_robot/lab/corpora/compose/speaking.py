@@ -15,7 +15,8 @@ import numpy as np
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson
+from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
@@ -44,7 +45,7 @@ def dyads(
         frames, count = frames - len(dyad.listener), count + 1
 
 
-def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.random.Generator) -> Dyad:
+def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: Rng) -> Dyad:
     """Return a piece of a filmed recording. Raises ValueError for a voice that was not filmed."""
     if voice.mouth is None:
         raise ValueError(f"{voice.name} was not filmed")
@@ -77,26 +78,21 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: np.ra
     )
 
 
-def sent(speech: Floats, rng: np.random.Generator) -> Floats:
+def sent(speech: Floats, rng: Rng) -> Floats:
     """Return speech as a program sends it to a loudspeaker: some level, and silence that is digital or nearly so."""
     gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
     hiss = rng.standard_normal(len(speech), np.float32) * np.float32(10 ** (rng.uniform(-90, -60) / 20))
     floor = hiss if rng.random() < 0.3 else np.float32(0)
-    return np.asarray(np.clip(gain * speech + floor, -1, 1), np.float32)
+    return np.clip(gain * speech + floor, -1, 1)
 
 
-# --- Where listeners look: annotated looks away from whoever has the floor, and how long people look, learned from them
+# --- Where listeners look: annotated looks away from the person with the floor, and durations learned from them -----
 #
 # Across a table with papers people look away a lot more than in front of one face, and watch slides for minutes: a
-# share
-# of the looks is kept, and none lasts longer than a look aside by lot of those who had no table between them
-# (`signals.event_sizes`), which is what a listener's own events go by. What is drawn where nobody annotated gaze goes
-# by
-# these kept ones, at somebody and away in turns, each as long as some annotated one was. That they do not hang on what
-# is
-# heard is ours.
-
-Look = tuple[float, float, str]  # start, end, where (`acting.Score.gaze`)
+# share of the looks is kept, and none lasts longer than a look aside drawn for people without a table between them
+# (`signals.event_sizes`), which is what a listener's own events go by. Where gaze was not annotated, looks are drawn
+# from these kept ones: at the person and away in turns, each as long as some annotated one was. That they do not
+# depend on what is heard is ours.
 
 _KEPT: Final = 0.4
 _NEAR_S: Final = 300.0  # no look is longer
@@ -110,16 +106,16 @@ class Dwell:
     at_s: tuple[float, ...]
     away: tuple[tuple[float, str], ...]
 
-    def looks(self, length_s: float, rng: np.random.Generator) -> tuple[Look, ...]:
+    def looks(self, length_s: float, rng: Rng) -> tuple[LabelledSpan, ...]:
         """Draw looks away in `length_s` seconds; none where nothing was learned."""
-        found: list[Look] = []
+        found: list[LabelledSpan] = []
         if not self.at_s or not self.away:
             return ()
-        at = float(rng.uniform(0, 1)) * self.at_s[int(rng.integers(len(self.at_s)))]
+        at = float(rng.uniform(0, 1)) * pick(self.at_s, rng)
         while at < length_s:
-            lasts_s, where = self.away[int(rng.integers(len(self.away)))]
+            lasts_s, where = pick(self.away, rng)
             found.append((at, min(at + lasts_s, length_s), where))
-            at += lasts_s + self.at_s[int(rng.integers(len(self.at_s)))]
+            at += lasts_s + pick(self.at_s, rng)
         return tuple(found)
 
 
@@ -135,9 +131,9 @@ def learn_dwell(people: Sequence[MeetingPerson]) -> Dwell:
     return Dwell(tuple(lasts for lasts in at_s if lasts > 0), tuple(elsewhere))
 
 
-def away(person: MeetingPerson, start_s: float, end_s: float, rng: np.random.Generator) -> list[Look]:
+def away(person: MeetingPerson, start_s: float, end_s: float, rng: Rng) -> list[LabelledSpan]:
     """Return a person's kept looks away between two times of the meeting."""
-    found: list[Look] = []
+    found: list[LabelledSpan] = []
     near = [(a, b, who) for a, b, who in person.floor if a < end_s + _NEAR_S and b > start_s - _NEAR_S]
     floor = {agent: np.array([(a, b) for a, b, who in near if who == agent]) for agent in {who for _, _, who in near}}
     for start, end, target in person.gaze or ():

@@ -17,13 +17,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
+from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
-from sfms_robot.lab.corpora.compose.motions import SHAPE
+from sfms_robot.lab.corpora.compose.motions import SHAPE, Rng, pick
 from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.events import runs
+from sfms_robot.signals.events import Bools, runs
 from sfms_robot.signals.tracks import read_track, resample
 
 _SOUNDS: Final = (".wav", ".flac")
@@ -58,7 +58,7 @@ class VoiceClip:
     origin: NDArray[np.int64]
     ends: NDArray[np.int64]
     mouth: Floats | None
-    noise: NDArray[np.float64]
+    noise: Doubles
     recording: Floats
 
 
@@ -88,35 +88,36 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
         rows = columns(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
-        said = list(
-            zip(rows["clip"], map(float, rows["start_s"]), map(float, rows["end_s"]), rows["kind"], strict=True)
-        )
-        for (clip, start, end, _), text in zip(said, rows["text"], strict=True):
-            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind in said)
+        starts_s, ends_s = (map(float, rows[name]) for name in ("start_s", "end_s"))
+        said = list(zip(rows["clip"], starts_s, ends_s, rows["kind"], rows["text"], strict=True))
+        for clip, start, end, _, text in said:
+            spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind, _ in said)
             if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
                 audio = read_audio(folder / clip)[int(start * AUDIO_HZ) : int(end * AUDIO_HZ)]
-                found.append((split_of_voice(Path(clip).stem), _eased(audio * (_LEVEL / np.sqrt(np.mean(audio**2))))))
+                levelled = np.clip(audio * (_LEVEL / np.sqrt(np.mean(audio**2))), -1, 1)
+                found.append((split_of_voice(Path(clip).stem), _eased(levelled)))
     return by_split(found)
 
 
-def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Floats], rng: np.random.Generator) -> Floats:
+def laugh(speech: Floats, spans_s: Doubles, laughter: Sequence[Floats], rng: Rng) -> Floats:
     """Return speech (n,) with laughs in the spans (K, 2), or unchanged where no laughter is at hand."""
     out = speech.copy()
     for start_s, end_s in spans_s if laughter else ():
         at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
         while end - at > _FADE:
-            piece = laughter[int(rng.integers(len(laughter)))][: end - at]
+            piece = pick(laughter, rng)[: end - at]
             out[at : at + len(piece)] += np.float32(rng.uniform(0.5, 1.2)) * _eased(piece)
             at += len(piece)
     return out
 
 
-def _eased(sound: Floats) -> Floats:
+def _eased(sound: Floats, longest: int = _FADE) -> Floats:
+    """Return sound (n,) that fades in and out over `longest` samples, or over half of it."""
     ramp = np.ones(len(sound), np.float32)
-    fade = min(_FADE, len(sound) // 2)
+    fade = min(longest, len(sound) // 2)
     ramp[:fade] = np.linspace(0, 1, fade)
     ramp[len(ramp) - fade :] = np.linspace(1, 0, fade)
-    return np.asarray(np.clip(sound, -1, 1) * ramp, np.float32)
+    return sound * ramp
 
 
 def read_voice(file: Path) -> VoiceClip:
@@ -131,22 +132,18 @@ def read_voice(file: Path) -> VoiceClip:
         raise ConfigError(f"{file}: no speech found in it")
     pieces, breaks, total = [], [], 0
     for number, (start, end) in enumerate(speech):
-        piece = audio[start:end].copy()
-        piece[:_JOIN] *= np.linspace(0, 1, _JOIN, dtype=np.float32)
-        piece[-_JOIN:] *= np.linspace(1, 0, _JOIN, dtype=np.float32)
-        pieces.append(piece)
-        total += len(piece)
+        pieces.append(_eased(audio[start:end], _JOIN))
+        total += len(pieces[-1])
         if number + 1 == len(speech) or speech[number + 1][0] - end >= _PHRASE:
             breaks.append(total)
-    joined = np.concatenate(pieces)
-    joined = _levelled(joined)
+    joined = _levelled(np.concatenate(pieces))
     keep = ~_lulls(joined)
     ends = np.cumsum(keep)[np.array(breaks) // _GRAIN - 1] * _GRAIN
     joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
     origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
     name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
     loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
-    whole = np.asarray(np.clip(audio * (_LEVEL / loudness), -1, 1), np.float32)
+    whole = np.clip(audio * (_LEVEL / loudness), -1, 1)
     return VoiceClip(
         name=name,
         audio=joined,
@@ -166,7 +163,7 @@ def _levelled(speech: Floats) -> Floats:
     return np.asarray(np.clip(even * (_LEVEL / np.sqrt(np.mean(even**2))), -1, 1), np.float32)
 
 
-def _lulls(speech: Floats) -> NDArray[np.bool_]:
+def _lulls(speech: Floats) -> Bools:
     """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
     out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
@@ -232,7 +229,7 @@ def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
     return np.stack([np.interp(grid, times_s, column) for column in values.T], axis=1).astype(np.float32)
 
 
-def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _pause_spectrum(audio: Floats, active: Bools) -> Doubles:
     grains = audio[: len(active) * _GRAIN].reshape(-1, _GRAIN)[~active]
     if len(grains) < 8 or np.sqrt(np.mean(grains**2)) < 1e-5:
         return np.ones(_GRAIN // 2 + 1)
@@ -240,9 +237,7 @@ def _pause_spectrum(audio: Floats, active: NDArray[np.bool_]) -> NDArray[np.floa
     return np.asarray(spectrum / np.sqrt(np.mean(spectrum**2)), np.float64)
 
 
-def lay(
-    segments_s: NDArray[np.float64], frames: int, voice: VoiceClip, rng: np.random.Generator
-) -> tuple[Floats, Floats | None]:
+def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:
     """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
     audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
     mouth = None if voice.mouth is None else np.zeros((frames, len(SHAPE)), np.float32)
@@ -254,10 +249,7 @@ def lay(
         # Recordings go on where they were, a phrase or two further: the same words do not come at once again.
         last = (last + int(rng.integers(1, 4))) % len(voice.ends)
         index = np.arange(voice.ends[last] - (end - start), voice.ends[last]) % len(voice.audio)
-        piece = voice.audio[index] * np.float32(rng.uniform(0.8, 1.25))
-        piece[:_FADE] *= np.linspace(0, 1, _FADE, dtype=np.float32)
-        piece[-_FADE:] *= np.linspace(1, 0, _FADE, dtype=np.float32)
-        audio[start:end] = piece
+        audio[start:end] = _eased(voice.audio[index] * np.float32(rng.uniform(0.8, 1.25)))
         if mouth is not None and voice.mouth is not None:
             covered = np.arange(start // FRAME_SAMPLES, end // FRAME_SAMPLES)  # frames that end inside
             spoken = index[(covered + 1) * FRAME_SAMPLES - 1 - start] // _GRAIN
@@ -272,7 +264,7 @@ def _soften(mouth: Floats) -> Floats:
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
-def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
+def room(samples: int, voice: VoiceClip, rng: Rng) -> Floats:
     """Return a noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, that drifts."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
@@ -284,7 +276,7 @@ def room(samples: int, voice: VoiceClip, rng: np.random.Generator) -> Floats:
     return np.asarray(coloured * 10 ** (level_db / 20), np.float32)
 
 
-def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
+def reverberant(speech: Floats, rng: Rng) -> Floats:
     """Return speech in a room of 0.12 to 0.4 s reverberation, 6 to 16 dB below the direct sound."""
     length_s = rng.uniform(0.12, 0.4)
     times = np.arange(int(length_s * AUDIO_HZ)) / AUDIO_HZ
@@ -293,12 +285,12 @@ def reverberant(speech: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(speech + oaconvolve(speech, tail)[: len(speech)], np.float32)
 
 
-def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.random.Generator) -> Floats:
+def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: Rng) -> Floats:
     """Return a mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """
-    source = talk[int(rng.integers(len(talk)))]
+    source = pick(talk, rng)
     piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
     power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
     level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)

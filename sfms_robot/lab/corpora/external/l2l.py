@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt, guarded
 from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, numbers, pose_last, torch_load, track
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 
@@ -51,13 +51,13 @@ def splits(place: Path) -> Mapping[str, str]:
     return {split: split for split in ("train", "test") if any((one / split).is_dir() for one in _subjects(place))}
 
 
-def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     for subject in _subjects(place):
         if subject != place and subject.name == UNUSED:
             yield f"{UNUSED} is left out, as the reference does: give its own folder to use it"
         elif (subject / split).is_dir():
             try:
-                yield from _direction(subject.name, subject / split, order == "pose-first")
+                yield from _direction(subject.name, subject / split, pose_first)
             except ClipError as error:
                 yield error.problem
 
@@ -148,7 +148,7 @@ def lm_splits(place: Path) -> Mapping[str, str]:
     return {ours: theirs for ours, theirs in SPLITS.items() if _segments(place, theirs)}
 
 
-def lm_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def lm_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     for file in _segments(place, split):
         try:
             segments = torch_load(file)

@@ -26,8 +26,8 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
-from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, pose_last, table, track, voices_of
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt
+from sfms_robot.lab.corpora.reading import dyad_of, existing, frames_of, npy, pose_last, table, track, voices_of
 
 SPACE: Final = "faceverse58"
 FPS, FPS_2025 = 25.0, 30.0
@@ -53,7 +53,7 @@ def splits(faces: str, place: Path) -> Mapping[str, str]:
     return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / faces).is_dir()}
 
 
-def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     pairs = _pairs(place / f"{split}.csv")
     folder = place / split
     heard = (folder / SOUNDS).is_dir()
@@ -68,7 +68,7 @@ def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
         frames = min(FRAMES, frames_of(pair[1], *(npy(file).shape for file in faces), slack=1))
         voices = voices_of(*sounds) if heard else []
         name = pair[1].replace("/", "+")
-        read = partial(_read, name, faces, voices, frames, FPS, order == "pose-first")
+        read = partial(_read, name, faces, voices, frames, FPS, pose_first)
         people = zip(("speaker_attributes", "attributes"), pair, strict=True)
         features = {feature: partial(attributes, folder, person, frames) for feature, person in people}
         return Clip(name=name, frames=frames, read=read, features=features)
@@ -76,7 +76,7 @@ def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
     yield from attempt(pairs + [(listener, speaker) for speaker, listener in pairs], clip)
 
 
-def scan_2025(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def scan_2025(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     folder = place / split
     roles = [folder / FACES_2025 / role for role in ("speaker", "listener")]
     heard = (folder / "audio").is_dir()
@@ -92,7 +92,7 @@ def scan_2025(place: Path, split: str, order: Order | None) -> Iterator[Found]:
             feature: partial(_feature, folder / kind / role / f"{path}.npy", frames, width)
             for feature, (kind, role, width) in FEATURES_2025.items()
         }
-        read = partial(_read, name, faces, voices, frames, FPS_2025, order == "pose-first")
+        read = partial(_read, name, faces, voices, frames, FPS_2025, pose_first)
         return Clip(name=name, frames=frames, read=read, features=features)
 
     names = {str(file.relative_to(role).with_suffix("")) for role in roles for file in role.rglob("*.npy")}
@@ -118,9 +118,8 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
     """Return (frames, 25) of one clip, as the challenge labels it. Raises ClipError."""
     cleaned = "/".join(CLEANED.get(part, part) for part in clip.split("/"))
     files = [folder / EMOTIONS / f"{name}.csv" for name in (clip, cleaned)]
-    file = next((file for file in files if file.is_file()), None)
-    if file is None:
-        raise ClipError.of("missing feature", files[0], "no such file")
+    file = next((file for file in files if file.is_file()), files[0])
+    existing(file, "missing feature")
     try:
         rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2)
     except ValueError as error:
@@ -130,9 +129,7 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
 
 def _feature(file: Path, frames: int, width: int) -> Floats:
     """Return (frames, width); the last row again where a feature ends a frame or two early. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing feature", file, "no such file")
-    values = npy(file)
+    values = npy(existing(file, "missing feature"))
     had = min(frames, frames_of(str(file), values.shape, (frames, width)))
     return np.pad(track(str(file), values, had, width), ((0, frames - had), (0, 0)), mode="edge")
 

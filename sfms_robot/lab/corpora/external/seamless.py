@@ -29,11 +29,11 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, UNREADABLE, WIDTHS, WITHOUT_SHAPE, WITHOUT_UNIT, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, Problem, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Problem, guarded
 from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
-from sfms_robot.signals.events import runs
+from sfms_robot.signals.events import Bools, runs
 
 LABELS: Final = ("improvised", "naturalistic")
 SPLITS: Final = {"train": "train", "validation": "dev", "test": "test"}
@@ -80,7 +80,7 @@ def splits(place: Path) -> Mapping[str, str]:
     return {ours: theirs for ours, theirs in SPLITS.items() if any(_archives(place, theirs, one) for one in patterns)}
 
 
-def scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     files, seen = _files(place, split), Counter[str]()
     interactions: dict[str, list[str]] = defaultdict(list)
     for name in files:
@@ -120,8 +120,8 @@ class SeamlessPerson:
     npz: Path
     wav: Path
     prefix: str
-    valid: NDArray[np.bool_]
-    speaks: NDArray[np.bool_]
+    valid: Bools
+    speaks: Bools
 
 
 def _clips(
@@ -141,7 +141,7 @@ def _clips(
             yield Clip(name=name, frames=end - first, read=read)
 
 
-def stretches(valid: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def stretches(valid: Bools) -> list[tuple[int, int]]:
     """Return half-open [first, end) of frames to learn from: valid, off the edges of invalid blocks, long enough."""
     cut = [(first + EDGE_FRAMES * (first > 0), end - EDGE_FRAMES * (end < len(valid))) for first, end in runs(valid)]
     return [(first, end) for first, end in cut if end - first >= LEAST_FRAMES]
@@ -186,7 +186,7 @@ def _prefix(file: Path) -> str:
     return prefix
 
 
-def _valid(file: Path, prefix: str) -> NDArray[np.bool_]:
+def _valid(file: Path, prefix: str) -> Bools:
     return np.asarray(npz(file, f"{prefix}:{VALID}")[0], np.float32).reshape(-1) > 0.5
 
 
@@ -230,7 +230,7 @@ def _read(name: str, pair: Sequence[SeamlessPerson], first: int, frames: int, mi
             raise ClipError.of("time stamps", person.wav, detail)
     return Dyad(
         name=name, audio=voices[0], speaker=speaker, listener=listener,
-        listening=np.asarray(listening_mask(speaks[0], FPS, speaks[1]), bool), space=SPACE, fps=FPS,
+        listening=listening_mask(speaks[0], FPS, speaks[1]), space=SPACE, fps=FPS,
         agent_audio=voices[1],
     )  # fmt: skip
 
@@ -255,9 +255,9 @@ def _motion(person: SeamlessPerson, mirrored: bool) -> Floats:
     return out
 
 
-def _lag_s(active: NDArray[np.bool_], voice: Floats) -> float:
+def _lag_s(active: Bools, voice: Floats) -> float:
     """Return the delay of a voice after its annotation, (N,) at 30 Hz; 0 where it is not known."""
-    heard = np.asarray(voice_activity(voice, AUDIO_HZ, 1 / FPS), bool)
+    heard = voice_activity(voice, AUDIO_HZ, 1 / FPS)
     noted = np.pad(active, (0, max(0, len(heard) - len(active))))[: len(heard)]
     reach = int(_LAGS_S * FPS)
     if min(noted.sum(), (~noted).sum(), heard.sum(), (~heard).sum()) < reach or len(noted) < 4 * reach:

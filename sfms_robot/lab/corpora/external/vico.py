@@ -16,15 +16,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt, guarded
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt, guarded
 from sfms_robot.lab.corpora.reading import (
     dyad_of,
+    existing,
     frames_of,
     npy,
     numbers,
@@ -47,9 +47,7 @@ def _splits(listed: Callable[[Path], Mapping[str, str]], place: Path) -> Mapping
 
 def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
     """Return one array of a pickled dict. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing half", file, "no such file")
-    arrays = guarded(str(file), lambda: load(file))
+    arrays = guarded(str(existing(file)), lambda: load(file))
     if not isinstance(arrays, dict) or key not in arrays:
         raise ClipError.of("missing half", file, f"has no {key}")
     return guarded(str(file), lambda: numbers(arrays, key))
@@ -82,7 +80,7 @@ def _listed(place: Path) -> dict[str, str]:
     return {Path(row[1]).stem: row[-1].strip() for row in rows}
 
 
-def dim_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def dim_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     listed = _listed(place)
     if _list_file(place) is None:
         yield f"{place}: no {LIST} there or above: all clips count as train"
@@ -95,7 +93,7 @@ def dim_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
         frames = _frames(name, "deca56", *((file, key, _rows(file, unpickle, key)) for key in keys))
 
         def read() -> Dyad:
-            pair = [(f"{file} {key}", pose_last(_rows(file, unpickle, key), order != "exp-first")) for key in keys]
+            pair = [(f"{file} {key}", pose_last(_rows(file, unpickle, key), pose_first)) for key in keys]
             return dyad_of(name, pair, frames, "deca56", FPS)
 
         return Clip(name=name, frames=frames, read=read, features={"hubert": partial(_hubert, file, frames)})
@@ -132,7 +130,7 @@ def _uuids(place: Path) -> dict[str, str]:
     return {row["uuid"]: row.get("data_split") or row.get("split") or "train" for row in rows if row.get("uuid")}
 
 
-def vico_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
+def vico_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     def faces(name: str) -> list[tuple[Path, NDArray[Any]]]:
         files = [place / "features" / "video_feats" / f"{name}.{role}.bin" for role in ROLES]
         return [(file, _rows(file, torch_load, _VECTORS)) for file in files]
@@ -151,9 +149,7 @@ def vico_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
 
 
 def _mfcc45(file: Path, frames: int) -> Floats:
-    if not file.is_file():
-        raise ClipError.of("missing feature", file, "no such file")
-    return track(str(file), np.asarray(npy(file)), frames, 45)
+    return track(str(file), npy(existing(file, "missing feature")), frames, 45)
 
 
 VICO: Final = Layout(

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, LATERAL_POSE
+from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
 from sfms_robot.lab.corpora.clips import Dyad as Conversation
 from sfms_robot.lab.corpora.collection import Dataset
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
@@ -104,8 +104,8 @@ def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> 
     """Return the frames of one conversation. Raises ConfigError for a motion space, sound or events that do not fit."""
     frames, width = len(dyad.listener), audio_frontend.WIDTHS[settings.sound]
     face, seen, motion, sway, control = shared_frames(dyad, space, settings)
-    user, user_voiced, heard = _audio_features(dyad, "user", width)
-    agent, agent_voiced, says = _audio_features(dyad, "agent", width)
+    user, user_voiced, heard = _audio_features(dyad, dyad.voice, "wav2vec2", width, dyad.mel)
+    agent, agent_voiced, says = _audio_features(dyad, dyad.agent_audio, "agent_wav2vec2", width)
     states = torch.from_numpy((np.full(frames, UNKNOWN) if dyad.states is None else dyad.states).astype(np.int64))
     if settings.events:
         quiet = torch.where((states == FEEDBACK) & ~agent_voiced, LISTENING, states)
@@ -125,27 +125,26 @@ def frames_of(dyad: Conversation, space: MotionSpace, settings: config.Arig) -> 
     )
 
 
-def _audio_features(dyad: Conversation, track: str, width: int) -> tuple[Tensor, Tensor, bool]:
-    """Return features (N, A) in half precision, speech (N,), and whether there is a track.
+def _audio_features(
+    dyad: Conversation, audio: Floats | None, shipped: str, width: int, mel_rows: Floats | None = None
+) -> tuple[Tensor, Tensor, bool]:
+    """Return features (N, A) of a track in half precision, speech (N,), and whether there is a track.
 
-    A user's track of zeros means a missing microphone; an agent's means a silent robot. wav2vec2 features come with the
-    data, as features `wav2vec2` and `agent_wav2vec2`, and take the place of the mel rows.
+    Without a user's track the microphone is missing; zeros in an agent's mean a silent robot. wav2vec2 features come
+    with the data, as the feature `shipped`, and take the place of the mel rows.
     """
-    frames = len(dyad.listener)
-    audio = dyad.audio if track == "user" else dyad.agent_audio
-    if track == "user" and audio is not None and not audio.any():
-        audio = None
-    shipped = dyad.features.get("wav2vec2" if track == "user" else "agent_wav2vec2")
-    if width != audio_frontend.WIDTHS["mel"] and shipped is not None:
-        place = np.zeros((frames, phase.FEATURES), np.float32) if audio is None else phase.of_audio(audio)
-        rows = np.concatenate([shipped, place], axis=1).astype(np.float32)
-        voiced = np.zeros(frames, bool) if audio is None else np.array(phase.hear(levels_db(audio)))
-    elif width != audio_frontend.WIDTHS["mel"] and audio is not None:
+    frames, wide = len(dyad.listener), width != audio_frontend.WIDTHS["mel"]
+    if wide and shipped in dyad.features:
+        place, voiced = np.zeros((frames, phase.FEATURES), np.float32), np.zeros(frames, bool)
+        if audio is not None:
+            place, voiced = phase.of_audio(audio), np.array(phase.hear(levels_db(audio)))
+        rows = np.concatenate([dyad.features[shipped], place], axis=1).astype(np.float32)
+    elif wide and audio is not None:
         raise ConfigError(f"{dyad.name}: sound = wav2vec2 needs the feature wav2vec2, agent_wav2vec2 with the data")
     elif audio is not None and dyad.fps == FRAME_HZ:
         rows, voiced = audio_frontend.track(audio)
-    elif track == "user" and dyad.mel is not None:
-        rows, voiced = audio_frontend.of_mel(dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
+    elif mel_rows is not None:
+        rows, voiced = audio_frontend.of_mel(mel_rows.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS))
     else:
         return torch.zeros(frames, width, dtype=torch.half), torch.zeros(frames, dtype=torch.bool), False
     return torch.from_numpy(rows).half(), torch.from_numpy(voiced), True
@@ -223,9 +222,9 @@ def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
     states.possible.copy_((share >= RARE) | (share == share.amax(-1, keepdim=True)))
 
 
-def fit_scales(model: ArigModel, corpus: ArigCorpus, channels: Sequence[str]) -> None:
+def fit_scales(model: ArigModel, corpus: ArigCorpus) -> None:
     """Set means and deviations of motion and sound, and the range that the sampler keeps to."""
-    frames = corpus.frames
+    frames, channels = corpus.frames, model.settings.channels
     mean, spread = motion_scales(frames.agent_motion, channels)
     if frames.user_seen.any():  # what is not drawn, or made apart, is seen all the same
         whole = model.is_drawn & model.is_recalled

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -28,8 +28,8 @@ from sfms_robot.lab.learning.arig.features import (
     gather,
     open_scenes,
 )
-from sfms_robot.lab.learning.corpus import packed
-from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
+from sfms_robot.lab.learning.corpus import ACTIVE, training_data
+from sfms_robot.lab.learning.job import ALONE, Job, Run, is_drawn, noise_of, normal, uniform
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
@@ -38,7 +38,6 @@ from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.layers import weighted_mean
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
-from sfms_robot.signals.control import COLUMNS
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
 
@@ -47,7 +46,7 @@ def train_arig(
     settings: config.ArigTraining,
     data: Path,
     out: Path,
-    run: Run = Run(),  # noqa: B008
+    run: Run = ALONE,
 ) -> dict[str, Any]:
     """Train on `data`/train (and its speaking/ and interaction/) and write `out`/config.yaml and model.safetensors.
 
@@ -59,7 +58,7 @@ def train_arig(
     torch.manual_seed(settings.seed)
     student = Student(ArigModel(listener))
     corpus, held_out = corpora(settings, data, run).values()
-    fit_scales(student.model, corpus, listener.channels)
+    fit_scales(student.model, corpus)
     job = arig_job(settings, student, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     if run.group.first:
@@ -75,16 +74,13 @@ def train_arig(
 
 
 def corpora(settings: config.ArigTraining, data: Path, run: Run) -> dict[str, ArigCorpus]:
-    """Return the frames of training and validation, from a folder or a pack."""
+    """Return the frames of train and validation, from a folder or a pack."""
     listener, window = settings.listener, settings.training.window_frames
 
     def read(split: str) -> ArigCorpus:
         return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run.staging(split))
 
-    return {
-        split: packed(data, split, LabelledDyad, listener, window, partial(read, split))
-        for split in ("train", "validation")
-    }
+    return training_data(data, LabelledDyad, listener, window, read)
 
 
 def arig_job(
@@ -139,9 +135,8 @@ def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: in
     control, found = corpus.frames.control, {}
     if control is None or not control.shape[-1]:
         return {}
-    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
-    before = torch.zeros(len(control) + 1, len(active), dtype=torch.int32)  # frames with one, before each frame
-    before[1:] = (control[:, active] > 0).cumsum(0)
+    before = torch.zeros(len(control) + 1, len(ACTIVE), dtype=torch.int32)  # frames with one, before each frame
+    before[1:] = (control[:, ACTIVE] > 0).cumsum(0)
     for scene, firsts in starts.items():
         has = before[firsts + window] > before[firsts]
         found[scene] = [firsts[one] for one in has.unbind(1) if one.any()]
@@ -245,7 +240,9 @@ def loss_parts(
     model = student.model
     weights = None
     if phase.group_weights is not None:
-        weights = sent(channel_weights(model.settings, phase.group_weights), truth.device)
+        listener = model.settings
+        weights = channel_weights(listener.channels, listener.drawn_channels, phase.group_weights)
+        weights = sent(weights, truth.device)
     before = previous_states(states, phase.state_noise, generator, len(model.settings.states))
     found = model.condition(told, None if phase.own_states else before)
     target = model.standardise(truth[:, 1:])
@@ -274,13 +271,9 @@ def group_of(channel: str) -> str:
     return next(group for group, begins in GROUPS.items() if channel.startswith(begins))
 
 
-def channel_weights(settings: config.Arig, groups: config.GroupWeights) -> Tensor:
-    """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are drawn."""
-    return _weights(settings.channels, settings.drawn_channels, groups)
-
-
 @lru_cache(maxsize=8)
-def _weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: config.GroupWeights) -> Tensor:
+def channel_weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: config.GroupWeights) -> Tensor:
+    """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are `drawn`."""
     members = Counter(group_of(name) for name in drawn)
     weights = torch.zeros(len(channels))
     for index, name in enumerate(channels):
@@ -301,12 +294,12 @@ def augment(
     in every window, and all of it is taken back at once.
     """
     b, n = dyad.user_heard.shape
-    device, place = dyad.agent_motion.device, generator.device
+    device = dyad.agent_motion.device
 
     def dropped(share: float) -> Tensor:
         if not is_drawn(generator, share):
             return torch.zeros(b, 1, dtype=torch.bool, device=device)
-        return (torch.rand(b, 1, generator=generator, device=place) < share).to(device)
+        return (uniform(generator, b, 1) < share).to(device)
 
     deaf, blind = dropped(phase.drop_audio), dropped(phase.drop_face)
     silent = dropped(phase.silent_user)
@@ -318,8 +311,8 @@ def augment(
     spoken = dyad.voiced[..., :1] & sent(_lips(model.settings.channels), device)
     missed = torch.zeros((), device=device)
     if is_drawn(generator, phase.speaking_noise):
-        missed = torch.rand(b, 1, 1, generator=generator, device=place) * phase.speaking_noise
-        missed = missed * torch.randn(b, n, model.channels, generator=generator, device=place)
+        missed = uniform(generator, b, 1, 1) * phase.speaking_noise
+        missed = missed * normal(generator, b, n, model.channels)
         missed = missed.to(device) * model.motion_std
     told = replace(
         dyad,
@@ -369,13 +362,13 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
     off = torch.zeros(b, n, model.sound_width, device=place)
     if model.settings.sound != "mel" or not is_drawn(generator, phase.gain_db, phase.colour_db, phase.grain_db):
         return off
-    size = torch.rand(b, 1, 2, generator=generator, device=place) * mel.LN_PER_DB
-    waves = torch.randn(b, 1, COLOURS, generator=generator, device=place) / COLOURS**0.5
+    size = uniform(generator, b, 1, 2) * mel.LN_PER_DB
+    waves = normal(generator, b, 1, COLOURS) / COLOURS**0.5
     colour = waves @ sent(_colours(), place)
     grain = torch.zeros((), device=place).expand(b, n, mel.ROWS_PER_FRAME, mel.MEL_BINS)
     if is_drawn(generator, phase.grain_db):
-        grain = torch.randn(grain.shape, generator=generator, device=place)
-    gain = torch.rand(b, 1, 1, generator=generator, device=place) * 2 - 1
+        grain = normal(generator, *grain.shape)
+    gain = uniform(generator, b, 1, 1) * 2 - 1
     bands = gain * mel.LN_PER_DB * phase.gain_db + size[..., :1] * phase.colour_db * colour
     off[..., :MEL_WIDTH] = (bands[:, :, None] + size[..., 1:2, None] * phase.grain_db * grain).flatten(2)
     return off
@@ -393,7 +386,7 @@ def _in_a_room(
     b, n = sound.shape[:2]
     quieter = sound
     if is_drawn(generator, phase.quiet_room):
-        share, lot = (torch.rand(b, 1, 1, generator=generator, device=generator.device) for _ in range(2))
+        share, lot = (uniform(generator, b, 1, 1) for _ in range(2))
         bands = sound[..., :MEL_WIDTH]
         less = (share * (lot < phase.quiet_room)).to(sound.device) * (bands - math.log(mel.FLOOR)).clamp(min=0)
         quieter = torch.cat([torch.where(voiced, bands, bands - less), sound[..., MEL_WIDTH:]], dim=-1)
@@ -412,11 +405,11 @@ def _wander(
     place = generator.device
     if not is_drawn(generator, phase.history_noise):
         return torch.zeros(b, n, 1, device=place), torch.zeros(b, n, 1, device=place)
-    size = torch.rand(b, 1, 1, generator=generator, device=place) * phase.history_noise
-    size = size * (torch.rand(b, 1, 1, generator=generator, device=place) >= COLD)
-    jumps = torch.randn(b, n, channels, generator=generator, device=place)
-    jumps = _glided(jumps * (torch.rand(b, n, 1, generator=generator, device=place) < JUMPS), generator)
-    fast = torch.randn(b, n, channels, generator=generator, device=place)
+    size = uniform(generator, b, 1, 1) * phase.history_noise
+    size = size * (uniform(generator, b, 1, 1) >= COLD)
+    jumps = normal(generator, b, n, channels)
+    jumps = _glided(jumps * (uniform(generator, b, n, 1) < JUMPS), generator)
+    fast = normal(generator, b, n, channels)
     return size * decayed(jumps), size * fast
 
 
@@ -459,5 +452,5 @@ def previous_states(states: Tensor, share: float, generator: torch.Generator, co
     if not is_drawn(generator, share):
         return known
     drawn = torch.randint(count, states.shape, generator=generator, device=generator.device).to(states.device)
-    replaced = (torch.rand(states.shape, generator=generator, device=generator.device) < share).to(states.device)
+    replaced = (uniform(generator, *states.shape) < share).to(states.device)
     return torch.where(replaced, drawn, known)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,15 +16,18 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, Floats
 from sfms_robot.lab.corpora.clips import Dyad, at_rate
+from sfms_robot.lab.corpora.collection import Order
+from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
     Corpus,
     fit_sway,
     motion_scales,
     shared_frames,
+    training_data,
     windows,
 )
-from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.lab.learning.job import Run, Scratch, uniform
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.idle import LATERAL, among_head
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
@@ -35,6 +40,8 @@ from sfms_robot.signals.voice_activity import mel_levels_db
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
 LEAST_SPEED = 0.05  # deviations a frame
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +68,29 @@ class SfmsFrames:
 
 
 SfmsCorpus = Corpus[SfmsFrames]
+
+
+def corpora(
+    settings: config.Training, data: Path, run: Run, order: Order | None, heard: bool = True
+) -> dict[str, SfmsCorpus]:
+    """Return the frames of train and validation, from a folder or a pack.
+
+    `order`: of the channels in the files, if not the layout's own (`open_dataset`). `heard`: with the speaker's sound,
+    which a tokenizer does without.
+    """
+    listener, space = settings.listener, MotionSpace.of(settings.listener)
+    frontend = AudioFrontend.of(listener) if heard else None
+
+    def read(split: str) -> SfmsCorpus:
+        dyads = open_for(space.name, data, split, order, [listener.audio] if heard else ())
+        if dyads.fps != FRAME_HZ and split == "train" and not heard:  # said once, in the first of two phases
+            log.warning(
+                "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
+                data, dyads.fps, FRAME_HZ,
+            )  # fmt: skip
+        return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
+
+    return training_data(data, SfmsFrames, listener, listener.window_frames, read)
 
 
 def gather(
@@ -103,8 +133,7 @@ def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor,
     frames = len(dyad.listener)
     if frontend is None:
         return torch.zeros(frames, 0, 0, dtype=torch.half), torch.zeros(frames, 0)
-    audio = dyad.audio if dyad.audio is not None and dyad.audio.any() else None  # zeros are no voice, not a still one
-    found: Floats | None = dyad.features.get(frontend.audio)
+    audio, found = dyad.voice, dyad.features.get(frontend.audio)
     if found is None and frontend.audio == "mel" and (audio is not None or dyad.mel is not None):
         found = dyad.mel_rows()
     elif found is None and audio is not None:
@@ -127,8 +156,9 @@ def _whole(audio: Floats) -> Floats:
     return np.pad(audio, (0, -len(audio) % FRAME_SAMPLES))
 
 
-def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) -> None:
+def fit_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
     """Set the means, deviations and speeds of the model's motion, and its sway where that is apart."""
+    channels = model.settings.channels
     mean, spread = motion_scales(corpus.frames.motion, channels)
     model.motion_mean.copy_(mean)
     model.motion_std.copy_(spread)
@@ -138,13 +168,16 @@ def fit_scales(model: SfmsModel, corpus: SfmsCorpus, channels: Sequence[str]) ->
         fit_sway(model, corpus.by_dyad(corpus.frames.sway), among_head(channels, LATERAL))
 
 
+def standard_motion(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
+    """Return the standardised motion (N, C) of a corpus, on the model's device."""
+    return model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+
+
 def context(
     model: SfmsModel,
     corpus: SfmsCorpus,
     tokens: Tensor,
     starts: Tensor,
-    past: int,
-    future: int,
     louder: Tensor | None = None,
     held: Tensor | None = None,
 ) -> Context[Tensor]:
@@ -155,6 +188,7 @@ def context(
     `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
     """
     frames, device = corpus.frames, model.motion_mean.device
+    past, future = model.settings.past_frames, model.settings.future_frames
     starts = starts.to(frames.heard.device)
     looked_at = torch.arange(-1, past, device=starts.device)  # one frame more: convolution looks back on it
     index = (starts[:, None] + looked_at).clamp(min=0)
@@ -162,7 +196,7 @@ def context(
     heard[:, 0] &= ~corpus.begins[starts]
     heard, sound = heard.to(device), frames.sound[index].to(device).float()
     if louder is not None:
-        sound = sound + louder.view(-1, 1, 1, 1)
+        sound = sound + louder.to(device, non_blocking=True).view(-1, 1, 1, 1)
     sound = torch.where(heard[..., None, None], model.standardise_sound(sound), 0.0)
     own = windows(tokens, starts, past) if tokens.ndim == 2 else tokens[:, :past].clone()
     if held is not None:
@@ -224,7 +258,7 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
 @torch.no_grad()
 def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Return the tokens (N, G) of every listener in the corpus."""
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standard_motion(model, corpus)
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
 
@@ -284,7 +318,7 @@ def without_last_keyframes(
     b, t, groups = tokens.shape
     row, frame = torch.arange(b, device=tokens.device)[:, None], torch.arange(t, device=tokens.device)
     recent = (frame >= first[:, None] - MISSED_FRAMES) & (frame < first[:, None])
-    chosen = torch.rand(b, 1, groups, generator=generator, device=generator.device).to(tokens.device) < share
+    chosen = (uniform(generator, b, 1, groups) < share).to(tokens.device)
     left = torch.where(recent[..., None] & chosen, 0, tokens)
     last = last_keyframes(left).at[row[:, 0], first - 1][..., 0]  # (B, G)
     off = motion[row, last.clamp(min=0)] - motion[row[:, 0], first][:, None]  # (B, G, C)

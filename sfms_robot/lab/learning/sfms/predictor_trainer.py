@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,16 +14,15 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
-from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import fit_sound, packed, windows
-from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
+from sfms_robot.lab.learning.corpus import ACTIVE, fit_sound, windows
+from sfms_robot.lab.learning.job import ALONE, Job, Run, is_drawn, noise_of, uniform
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
-    SfmsFrames,
     context,
-    gather,
+    corpora,
     held_tokens,
     keyframe_tokens,
+    standard_motion,
     tokenise,
     window_tokens,
     without_last_keyframes,
@@ -32,12 +30,10 @@ from sfms_robot.lab.learning.sfms.features import (
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
 from sfms_robot.lab.learning.training_loop import digest_of, fit, optimizer
 from sfms_robot.listeners import checkpoint
-from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
 from sfms_robot.listeners.sfms.quantizer import Grid, codes_to_indices, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
 
 TokensOf = Literal["dyads", "windows"]
@@ -48,19 +44,19 @@ def train_listener(
     settings: config.Training,
     data: Path,
     out: Path,
-    run: Run = Run(),  # noqa: B008
+    run: Run = ALONE,
     order: Order | None = None,
 ) -> dict[str, Any]:
     """Train on `data`/train with `out`/tokenizer.safetensors and write `out`/config.yaml and model.safetensors.
 
-    Sampling is calibrated afterwards, by roll-outs (`evaluation.sampling_calibration`).
+    Sampling is calibrated afterwards, by roll-outs (`train_runs.calibrate`).
 
-    `order`: of the channels in the files, if not the layout's own (`open_dataset`).
+    `order`: of `features.corpora`.
 
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
     """
-    listener = settings.listener
+    listener, phase = settings.listener, settings.predictor
     corpus, held_out = corpora(settings, data, run, order).values()
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
@@ -68,26 +64,14 @@ def train_listener(
     fit_sound(model, (corpus.frames.sound, corpus.frames.heard))
     job = listener_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
-    last = held_out_loss(model, held_out.to(run.device), settings) if outcome.held_out is None else outcome.held_out
+    last = outcome.held_out
+    if last is None:
+        last = held_out_loss(model, held_out.to(run.device), phase)
     if run.group.first:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
-    scores = keyframe_scores(model.cpu(), held_out, listener, settings.predictor.tokens)
+    scores = keyframe_scores(model.cpu(), held_out, phase.tokens)
     return {**asdict(outcome), "held_out_loss": last, **scores}
-
-
-def corpora(settings: config.Training, data: Path, run: Run, order: Order | None) -> dict[str, SfmsCorpus]:
-    """Return the frames of training and validation, from a folder or a pack."""
-    listener, space = settings.listener, MotionSpace.of(settings.listener)
-
-    def read(split: str) -> SfmsCorpus:
-        dyads, frontend = open_for(space.name, data, split, order, [listener.audio]), AudioFrontend.of(listener)
-        return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
-
-    return {
-        split: packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
-        for split in ("train", "validation")
-    }
 
 
 def listener_job(
@@ -103,8 +87,8 @@ def listener_job(
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
-    tokens_at, held = placed_tokens(model, corpus, tokens, listener, phase.tokens)
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    tokens_at, held = placed_tokens(model, corpus, tokens, phase.tokens)
+    motion = standard_motion(model, corpus)
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
     codebook = model.tokenizer.quantizer.codebook
     levels = codebook.levels if isinstance(codebook, Grid) else None
@@ -113,13 +97,14 @@ def listener_job(
     def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
         chosen = starts[torch.randint(len(starts), (batch,), generator=generator)]
         if phase.event_windows and len(eventful):
-            busy = torch.rand(batch, generator=generator) < phase.event_windows
+            busy = uniform(generator, batch) < phase.event_windows
             chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
-        gain = _louder(phase, batch, generator, device) if listener.audio == "mel" else None
+        # Microphones differ.
+        louder = (uniform(generator, batch) * 2 - 1) * phase.gain_db * LN_PER_DB if listener.audio == "mel" else None
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
         own = tokens_at(chosen)
-        seen = context(model, corpus, own, chosen, listener.past_frames, listener.future_frames, louder=gain, held=held)
+        seen = context(model, corpus, own, chosen, louder, held)
         seen = augment(seen, levels, neutral, phase, noise)
         target = own[:, listener.past_frames :]
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
@@ -135,14 +120,14 @@ def listener_job(
                 share=phase.missed_keyframes,
                 generator=noise,
             )
-        return _loss(model, seen, meant, count, settings)
+        return _loss(model, seen, meant, count, phase)
 
     return Job(
         name="listener",
         model=model,
         optimizers=[optimizer(model.predictor.parameters(), phase.learning_rate, phase.weight_decay)],
         loss_of=loss_of,
-        held_out=lambda: held_out_loss(model, held_out, settings, held_out_tokens),
+        held_out=lambda: held_out_loss(model, held_out, phase, held_out_tokens),
         frames_per_step=phase.batch * listener.window_frames,
         phase=phase,
         seed=settings.seed,
@@ -156,31 +141,24 @@ def listener_job(
     )
 
 
-def _louder(phase: config.PredictorTraining, batch: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Draw how much louder (B,) each window is, in logarithms of power: microphones differ."""
-    gain = (torch.rand(batch, generator=generator) * 2 - 1) * phase.gain_db * LN_PER_DB
-    return gain.to(device, non_blocking=True)
-
-
 def placed_tokens(
-    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, listener: config.Sfms, placed: TokensOf
+    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, placed: TokensOf
 ) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
     """Return the tokens (B, T, G) of windows by their first frames, and those held (N, G) at a window's first frame.
 
     `tokens` (N, G) are those of whole dyads; `placed`: `PredictorTraining.tokens`.
     """
     if placed == "dyads":
-        held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
-        return lambda starts: windows(tokens, starts, listener.window_frames), held
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+        held = held_tokens(tokens, corpus.lengths) if model.settings.placement == "penalised" else None
+        return lambda starts: windows(tokens, starts, model.settings.window_frames), held
+    motion = standard_motion(model, corpus)
     dense = keyframe_tokens(model, motion)
     return lambda starts: window_tokens(model, motion, dense, starts), None
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
     """Return those of the `starts` in whose future an event other than a blink is under way."""
-    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
-    busy = (corpus.frames.control[:, active] > 0).any(-1)
+    busy = (corpus.frames.control[:, ACTIVE] > 0).any(-1)
     return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
 
 
@@ -206,24 +184,26 @@ def _drawn(listener: config.Sfms, target: Tensor, generator: torch.Generator) ->
     return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator)
 
 
-def _loss(model: SfmsModel, seen: Context[Tensor], meant: Tensor, count: Tensor, settings: config.Training) -> Tensor:
+def _loss(
+    model: SfmsModel, seen: Context[Tensor], meant: Tensor, count: Tensor, phase: config.PredictorTraining
+) -> Tensor:
     """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames, of the CPU, drawn already.
 
     `meant` (B, P + H, G): tokens of the past, in place of those in `seen`, and of the future.
     """
-    training, h = settings.predictor, settings.listener.future_frames
+    h = model.settings.future_frames
     target = meant[:, -h:]
     counted = torch.arange(h) >= count  # (B, H)
     drawn = ~counted.to(target.device, non_blocking=True)
     future = torch.where(drawn[..., None], target, UNDECIDED)
     logits = model.predictor.teacher_forced(seen._replace(tokens=torch.cat([meant[:, :-h], future], dim=1)), target)
-    weights = [training.group_weights.get(name, 1.0) for name in settings.listener.groups]
-    loss = next_tokens(logits.unbind(-2), target, counted, training.transition_weight, weights)
-    if training.dtw_weight:
+    weights = [phase.group_weights.get(name, 1.0) for name in model.settings.groups]
+    loss = next_tokens(logits.unbind(-2), target, counted, phase.transition_weight, weights)
+    if phase.dtw_weight:
         key = (target > 0).float()
         expected = 1 - torch.softmax(logits, dim=-1)[..., 0]
         expected = torch.where(drawn[..., None], key, expected)
-        loss = loss + training.dtw_weight * keyframe_dtw(expected, key, training.dtw_gamma)
+        loss = loss + phase.dtw_weight * keyframe_dtw(expected, key, phase.dtw_gamma)
     return loss
 
 
@@ -237,15 +217,11 @@ def augment(
     """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G)."""
     b, p = seen.heard.shape
     device = seen.tokens.device
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator, device=generator.device).to(device)
-
-    heard = seen.heard & (uniform(b, 1) >= training.drop_audio)
-    known = seen.face_known & (uniform(b, 1) >= training.drop_face)
+    heard = seen.heard & (uniform(generator, b, 1) >= training.drop_audio).to(device)
+    known = seen.face_known & (uniform(generator, b, 1) >= training.drop_face).to(device)
     past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
-    cold = uniform(b, 1) < training.neutral_prefix
+    cold = (uniform(generator, b, 1) < training.neutral_prefix).to(device)
     cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=generator.device).to(device)
     frame = torch.arange(p, device=device)
     before = cold & (frame < cut)
@@ -265,7 +241,7 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
     if not is_drawn(generator, share):
         return tokens
     place = generator.device
-    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator, device=place).to(tokens.device) < share)
+    changed = (tokens > 0) & (uniform(generator, *tokens.shape) < share).to(tokens.device)
     if levels is None:
         return torch.where(changed, 0, tokens)
     codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
@@ -279,16 +255,16 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 
 @torch.no_grad()
 def held_out_loss(
-    model: SfmsModel, corpus: SfmsCorpus, settings: config.Training, tokens: Tensor | None = None
+    model: SfmsModel, corpus: SfmsCorpus, phase: config.PredictorTraining, tokens: Tensor | None = None
 ) -> float:
     """Return the loss, not augmented, on windows drawn with a fixed seed; `tokens` (N, G) of the corpus if known."""
     model.eval()
     tokens = tokenise(model, corpus) if tokens is None else tokens
     generator = torch.Generator().manual_seed(0)
     losses = []
-    for seen, target in some_windows(model, corpus, tokens, settings.listener, generator, settings.predictor.tokens):
+    for seen, target in some_windows(model, corpus, tokens, generator, phase.tokens):
         meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
-        losses.append(float(_loss(model, seen, meant, _drawn(settings.listener, target, generator), settings)))
+        losses.append(float(_loss(model, seen, meant, _drawn(model.settings, target, generator), phase)))
     return sum(losses) / len(losses)
 
 
@@ -296,24 +272,20 @@ def some_windows(
     model: SfmsModel,
     corpus: SfmsCorpus,
     tokens: Tensor,
-    listener: config.Sfms,
     generator: torch.Generator,
     placed: TokensOf = "dyads",
 ) -> Iterator[tuple[Context[Tensor], Tensor]]:
     """Yield batches of contexts and the tokens (B, H, G) that came next; `placed`: `PredictorTraining.tokens`."""
-    starts = corpus.starts(listener.window_frames)
-    past, future = listener.past_frames, listener.future_frames
-    tokens_at, held = placed_tokens(model, corpus, tokens, listener, placed)
+    starts = corpus.starts(model.settings.window_frames)
+    tokens_at, held = placed_tokens(model, corpus, tokens, placed)
     for _ in range(HELD_OUT_BATCHES):
         chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
         own = tokens_at(chosen)
-        yield context(model, corpus, own, chosen, past, future, held=held), own[:, past:]
+        yield context(model, corpus, own, chosen, held=held), own[:, model.settings.past_frames :]
 
 
 @torch.no_grad()
-def keyframe_scores(
-    model: SfmsModel, corpus: SfmsCorpus, listener: config.Sfms, placed: TokensOf = "dyads"
-) -> dict[str, float]:
+def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dyads") -> dict[str, float]:
     """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
 
     All groups and future frames pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
@@ -321,7 +293,7 @@ def keyframe_scores(
     model.eval()
     tokens = tokenise(model, corpus)
     hit = said = true = 0
-    for seen, target in some_windows(model, corpus, tokens, listener, torch.Generator().manual_seed(0), placed):
+    for seen, target in some_windows(model, corpus, tokens, torch.Generator().manual_seed(0), placed):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
@@ -355,8 +327,8 @@ def next_tokens(
 # --- Soft dynamic time warping (Cuturi and Blondel, ICML 2017): a DTW whose minima are soft, so that it has a gradient
 #
 # The predictor's loss takes it on the keyframe indicator (IV-D3, "binary soft dynamic time warping"): a keyframe that
-# is
-# expected one frame late costs less than one that is not expected at all. The paper gives neither smoothing nor weight.
+# is expected one frame late costs less than one that is not expected at all. The paper gives neither smoothing nor
+# weight.
 
 
 def soft_dtw(cost: Tensor, gamma: float) -> Tensor:

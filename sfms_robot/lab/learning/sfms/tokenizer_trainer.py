@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +13,10 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ
 from sfms_robot.lab.corpora.collection import Order
-from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import first_frames, packed, windows
-from sfms_robot.lab.learning.job import Job, LossOf, Run, noise_of
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, SfmsFrames, fit_scales, gather, place_all
+from sfms_robot.lab.learning.corpus import first_frames, windows
+from sfms_robot.lab.learning.job import ALONE, Job, LossOf, Run, noise_of, normal, uniform
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, corpora, fit_scales, place_all, standard_motion
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -36,49 +32,33 @@ from sfms_robot.listeners.sfms.placement import (
     tracks,
 )
 from sfms_robot.listeners.sfms.quantizer import Codebook
-from sfms_robot.listeners.space import MotionSpace
 
 WEIGHTS = "tokenizer.safetensors"
 DRAWS = 2  # placements tried per window; the better one is the target of the masking loss
 CHUNK = 32  # windows placed and encoded at a time
-
-log = logging.getLogger(__name__)
 
 
 def train_tokenizer(
     settings: config.Training,
     data: Path,
     out: Path,
-    run: Run = Run(),  # noqa: B008
+    run: Run = ALONE,
     order: Order | None = None,
 ) -> dict[str, Any]:
     """Train on `data`/train and write `out`/tokenizer.safetensors; its predictor is as good as new.
 
-    `order`: of the channels in the files, if not the layout's own (`open_dataset`).
+    `order`: of `features.corpora`.
 
     Returns the figures of the run and the held-out error. Ctrl-C leaves a checkpoint in `out`, from which
     `run.resume` continues; the weights are written when the run is finished.
     """
-    listener, space = settings.listener, MotionSpace.of(settings.listener)
+    listener = settings.listener
     if listener.quantizer == "vq" and run.group.size * (run.accumulate or 1) > 1:
         raise ConfigError("listener.quantizer = 'vq' moves its codes beside gradients: one process, one piece a step")
-
-    def read(split: str) -> SfmsCorpus:
-        dyads = open_for(space.name, data, split, order)
-        if dyads.fps != FRAME_HZ and split == "train":
-            log.warning(
-                "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
-                data, dyads.fps, FRAME_HZ,
-            )  # fmt: skip
-        return gather(dyads, listener.window_frames, space, None, listener, run.staging(split))
-
-    corpus, held_out = (
-        packed(data, split, SfmsFrames, listener, listener.window_frames, partial(read, split))
-        for split in ("train", "validation")
-    )
+    corpus, held_out = corpora(settings, data, run, order, heard=False).values()
     torch.manual_seed(settings.seed)
     model = SfmsModel(listener)
-    fit_scales(model, corpus, listener.channels)
+    fit_scales(model, corpus)
     job = tokenizer_job(settings, model, corpus, held_out, run.device)
     outcome = fit(job, out, run)
     if run.group.first:
@@ -95,7 +75,7 @@ def tokenizer_job(
     fingerprint = corpus.fingerprint()
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standard_motion(model, corpus)
     return Job(
         name="tokenizer",
         model=model,
@@ -130,7 +110,7 @@ def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
     """
     if not gain:
         return batch
-    factor = torch.exp(gain * torch.randn(len(batch), 1, 1, generator=generator))
+    factor = torch.exp(gain * normal(generator, len(batch), 1, 1))
     return batch * factor.to(batch.device, non_blocking=True)
 
 
@@ -249,7 +229,7 @@ def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Return consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
     return windows(
-        model.standardise(corpus.frames.motion.to(model.motion_mean.device)),
+        standard_motion(model, corpus),
         first_frames(corpus.lengths, window, window),
         window,
     )
@@ -287,10 +267,9 @@ def reconstruction_error(model: SfmsModel, corpus: SfmsCorpus, strategy: Strateg
 # --- What conditional keyframe scores learn from: a teacher that knows how every choice would end -----------------
 #
 # The score network chooses keyframes for some tracks by itself, now and then by chance, and at each state it came
-# through
-# the teacher says, for every frame, the error of the best mask of k keyframes that holds what is chosen and this frame
-# (`exact.completion_errors`). The scores learn to prefer what costs least in the end. Because the states are the
-# network's own, it learns to get out of its own mistakes.
+# through the teacher says, for every frame, the error of the best mask of k keyframes that holds what is chosen and
+# this frame (`piecewise_linear.completion_errors`). The scores learn to prefer what costs least in the end. Because the
+# states are the network's own, it learns to get out of its own mistakes.
 #
 # Why not equation (13) alone: through Algorithm 1 a score hears only of the draw it took part in, and the loss stalls
 # above evenly placed keyframes. The teacher's error is that of linear interpolation, which the inpainter starts from.
@@ -348,8 +327,8 @@ def states(
         chosen.append(mask[here])
         remaining.append(to_come[here])
         logits = score(track, mask, to_come.clamp(min=1))
-        noise = -torch.log(-torch.log(_uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
-        drawn = _uniform(n, generator, mask.device) < EXPLORED
+        noise = -torch.log(-torch.log(uniform(generator, n, t).to(mask.device).clamp(1e-7, 1 - 1e-7)))
+        drawn = uniform(generator, n).to(mask.device) < EXPLORED
         picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
         mask = mask.scatter(1, picked, 1.0)
     return torch.cat(rows), torch.cat(chosen), torch.cat(remaining)
@@ -366,15 +345,10 @@ def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
     return ((errors - least) / (least + FLOOR)).masked_fill(chosen > 0.5, torch.inf)
 
 
-def _uniform(shape: int | tuple[int, int], generator: torch.Generator, device: torch.device) -> Tensor:
-    return torch.rand(shape, generator=generator, device=generator.device).to(device)
-
-
 # --- Keyframe masks for training: fresh for every batch, or, where that is slow, from a bank placed beforehand ----
 #
 # Conditional scores (`learned`) learn from the exact masks, and so do the codes and the inpainter beside them: their
-# own
-# masks differ little from their teacher's once they are learned, and need not be placed anew each step.
+# own masks differ little from their teacher's once they are learned, and need not be placed again each step.
 
 FEW_GROUPS = 8  # up to so many, exact masks of a batch take less time than its step
 MOST_WINDOWS = 2000  # of which masks are kept; more overlap than that teaches little
