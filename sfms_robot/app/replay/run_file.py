@@ -20,8 +20,7 @@ from mcap.stream_reader import StreamReader
 from sfms_robot.app.listen.report import LONG, Report
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Doubles, Floats
-from sfms_robot.ranges import Bools
+from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Bools, Doubles, Floats
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.recorder import ROS2_TOPICS, RUN_FILE, parts_of
 from sfms_robot.signals.ros2_messages import STRING, from_cdr

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.config.listener import STATES
-from sfms_robot.frames import FRAME_HZ
-from sfms_robot.signals.events import Bools, runs
+from sfms_robot.frames import FRAME_HZ, Bools
+from sfms_robot.signals.events import runs
 
 STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STATES)}
 UNKNOWN: Final = -1

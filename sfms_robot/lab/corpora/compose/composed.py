@@ -32,7 +32,7 @@ import numpy as np
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
@@ -54,7 +54,6 @@ from sfms_robot.lab.corpora.compose.voices import (
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes
-from sfms_robot.signals.events import Bools
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 LENGTH_S: Final = (30.0, 60.0)

@@ -17,13 +17,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Bools, Doubles, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.lab.corpora.compose.motions import SHAPE, Rng, pick
 from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.events import Bools, runs
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.tracks import read_track, resample
 
 _SOUNDS: Final = (".wav", ".flac")

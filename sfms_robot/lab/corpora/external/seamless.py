@@ -27,13 +27,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.frames import AUDIO_HZ, Bools, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, UNREADABLE, WIDTHS, WITHOUT_SHAPE, WITHOUT_UNIT, Dyad, samples_of
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Problem, guarded
 from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
-from sfms_robot.signals.events import Bools, runs
+from sfms_robot.signals.events import runs
 
 LABELS: Final = ("improvised", "naturalistic")
 SPLITS: Final = {"train": "train", "validation": "dev", "test": "test"}
