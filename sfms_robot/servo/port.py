@@ -134,7 +134,7 @@ class SerialPort:
 
     def __init__(self, device: str, baud: int, clock: Clock, rs485: Rs485 | None = None) -> None:
         self.name = device
-        self.now_s, self.wait_until = clock.now_s, clock.wait_until
+        self._clock = clock
         self._serial = _open(device, baud)
         try:
             self._io = serial_io(self._serial, device, rs485)
@@ -161,6 +161,12 @@ class SerialPort:
             self._serial.reset_input_buffer()
         except DEVICE_ERRORS as error:
             raise BusError(f"{self.name}: cannot be read any more: {error}") from error
+
+    def now_s(self) -> float:
+        return self._clock.now_s()
+
+    def wait_until(self, time_s: float) -> None:
+        self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
         if _is_socket(self.name) and baud != self._serial.baudrate:
