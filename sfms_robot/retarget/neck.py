@@ -193,4 +193,5 @@ def shrunk(servos_rad: Doubles, low_rad: Doubles, high_rad: Doubles) -> Doubles:
         over = np.where(servos_rad > high_rad, high_rad / servos_rad, 1.0)
         under = np.where(servos_rad < low_rad, low_rad / servos_rad, 1.0)
     factor = np.minimum(over, under).min(axis=-1, keepdims=True)
-    return np.clip(servos_rad * factor, low_rad, high_rad)
+    scaled_rad: Doubles = np.clip(servos_rad * factor, low_rad, high_rad)
+    return scaled_rad

@@ -154,7 +154,6 @@ class Recorder(Observer):
         self._put(replace(seen, readings=dict(seen.readings)))
 
     def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
-        """Queue a tick, a frame of the person or a plan of the listener."""
         if self._closed:
             return
         try:
@@ -162,7 +161,13 @@ class Recorder(Observer):
         except queue.Full:
             self._dropped += 1
 
-    heard = planned = _put
+    def heard(self, frame: SpeakerFrame) -> None:
+        """Queue a frame of the person."""
+        self._put(frame)
+
+    def planned(self, plan: Plan) -> None:
+        """Queue a plan of the listener."""
+        self._put(plan)
 
     def close(self) -> None:
         """Write what is queued and finish the file. Idempotent."""

@@ -320,7 +320,8 @@ def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
 def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
     """Return (N,): others spoke in the last 2 s, the participant is silent and in view."""
     others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
-    return listening_mask(others, FRAME_HZ, own) & ~unseen
+    listening: Bools = listening_mask(others, FRAME_HZ, own) & ~unseen
+    return listening
 
 
 def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
