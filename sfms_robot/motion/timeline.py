@@ -175,21 +175,21 @@ class PlanTimeline:
 
         `now_s` is the time of the tick; instants after it are leads.
         """
-        state, curve = _ticked(now_s, state), state.curve
+        curve, limit_s = state.curve, _lead_limit_s(now_s, state)
         played_s = max(state.played_s, float(times_s.max()) - (curve.delay_s if curve else 0.0))
         if curve is None:
-            return np.zeros((len(times_s), MOTION_DIM), np.float32), replace(state, played_s=played_s)
+            after = replace(state, played_s=played_s, now_s=now_s, lead_limit_s=limit_s)
+            return np.zeros((len(times_s), MOTION_DIM), np.float32), after
         instants_s, which = _distinct(times_s)
         asked_s = instants_s - curve.delay_s
         around_s = np.concatenate([asked_s, asked_s - self._widening_s, asked_s + self._widening_s])
         motion = _motion(curve, around_s)
         blinks = motion[:, BLINKS].reshape(3, len(asked_s), -1).max(axis=0)
         motion[: len(asked_s), BLINKS] = np.maximum(blinks, self._near(curve, asked_s))
-        held = bool(played_s > curve.knots.times_s[-1])
-        eased = now_s - curve.delay_s - curve.made_at_s > STALL_S
-        return motion.astype(np.float32).take(which, axis=0), replace(
-            state, played_s=played_s, held=state.held + held, eased=state.eased + eased
-        )
+        held = state.held + bool(played_s > curve.knots.times_s[-1])
+        eased = state.eased + (now_s - curve.delay_s - curve.made_at_s > STALL_S)
+        after = replace(state, played_s=played_s, held=held, eased=eased, now_s=now_s, lead_limit_s=limit_s)
+        return motion.astype(np.float32).take(which, axis=0), after
 
     def _near(self, curve: Curve, asked_s: Doubles) -> Doubles:
         """Return the blink (N, 2) of a frame close enough to be widened to each instant, 0 without one."""
@@ -201,11 +201,11 @@ class PlanTimeline:
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
 
 
-def _ticked(now_s: float, state: TimelineState) -> TimelineState:
-    """Return the state at the next tick, its limit of leads a little nearer to the time left of plans."""
+def _lead_limit_s(now_s: float, state: TimelineState) -> float:
+    """Return the limit of leads at the next tick, a little nearer to the time left of plans."""
     dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
     limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
-    return replace(state, now_s=now_s, lead_limit_s=max(limit_s, 0.0))
+    return max(limit_s, 0.0)
 
 
 def _distinct(times_s: Doubles) -> tuple[Doubles, Indices]:
