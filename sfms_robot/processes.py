@@ -369,7 +369,13 @@ class Supervised:
                 if self.phase == "running" and alive and self.phase_s > limits.steady_s:
                     self._failed, self._pause_s = False, limits.pause_s
         if self.phase == "backing off" and self._time_s >= self._restart_at_s:
-            self._restart()
+            self.restarts += 1
+            try:
+                self.child = self._start()
+            except OSError as error:  # no more processes, no more memory
+                self.fail(str(error))
+            else:
+                self.enter("starting")
 
     def fail(self, why: str) -> None:
         """Kill the child; the check after the pause starts another, unless there were too many."""
@@ -396,15 +402,6 @@ class Supervised:
         elif self.hung and not hung:
             log.info("%s: answers again", self._name)
         self.hung = hung
-
-    def _restart(self) -> None:
-        self.restarts += 1
-        try:
-            self.child = self._start()
-        except OSError as error:  # no more processes, no more memory
-            self.fail(str(error))
-            return
-        self.enter("starting")
 
 
 # --- Child ------------------------------------------------------------------------------------------------------------

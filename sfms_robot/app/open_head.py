@@ -176,7 +176,7 @@ def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -
         return head
     overlay, sha256 = load_overlay(head), head_hash(name)
     if port == SIM:
-        layers = layered(head, overlay.model_copy(update={"calibrate": None, "stored": None}), sha256)
+        layers = layered(head, overlay.replaced(calibrate=None, stored=None), sha256)
     else:
         servos = identify(head, overlay.measured, devices(head, port), clock, kept)
         layers = layered(head, overlay, sha256, servos)
@@ -337,7 +337,7 @@ def build_one(
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
         if not where.virtual:  # a busy computer would trip it, and no servo is in danger
-            config = config.model_copy(update={"watchdog_ms": 0})
+            config = config.replaced(watchdog_ms=0)
     return family.build(
         name,
         servos,

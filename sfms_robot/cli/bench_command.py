@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Literal
 
 from typer import Argument, Exit, Option
 
-from sfms_robot.cli.show import JSON, Result, print_rows, show
+from sfms_robot.cli.show import JSON, Result, aside, print_rows, show
 from sfms_robot.lab.bench import ALL, BENCHES
 
 EPILOG = "\n\n".join(
@@ -57,7 +56,7 @@ def bench(
     found = run_bench(
         name,
         {key: value for key, value in options.items() if value is not None},
-        lambda line: print(line, file=sys.stderr),
+        aside,
     )
     if write is not None:
         from sfms_robot.lab.bench.measure import write_page

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Literal
 
 from typer import Option
 
-from sfms_robot.cli.show import print_json
+from sfms_robot.cli.show import aside, print_json
 
 
 def emulate(
@@ -58,5 +57,5 @@ def emulate(
         else:
             for bus, chain in running.items():
                 print(chain.device if len(running) == 1 else f"{bus}={chain.device}", flush=True)
-                print(f"control socket of {bus}: {chain.control}", file=sys.stderr)
+                aside(f"control socket of {bus}: {chain.control}")
         until_stopped(running)

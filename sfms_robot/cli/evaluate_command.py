@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from typer import BadParameter, Option, Typer
 
 from sfms_robot.cli.run_command import MAX_SEED
-from sfms_robot.cli.show import JSON, Result, print_report, print_rows, say, show
+from sfms_robot.cli.show import JSON, Result, aside, print_report, print_rows, say, show
 from sfms_robot.cli.train_command import ORDER, Order, interruptible
 
 app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
@@ -338,7 +337,7 @@ def people(
 
     def ask(url: str, taken: int | None) -> None:
         note = "" if taken is None else f" (port {taken} is taken)"
-        print(f"people answer at {url}{note}; Ctrl-C ends", file=sys.stderr, flush=True)
+        aside(f"people answer at {url}{note}; Ctrl-C ends")
 
     try:
         people_study.serve(study, view, ask)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Result, cell, counted, print_rows, say, show
+from sfms_robot.cli.show import JSON, Result, aside, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, TorqueError
 
 PACKAGES = Option(
@@ -207,7 +207,7 @@ def calibrate(
     print()  # ends the line of the last question
     show(outcome.as_dict(), json, heading="{head}: {exit}, written to {file}")
     if outcome.torque_unconfirmed:
-        print(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}", file=sys.stderr)
+        aside(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}")
     if outcome.problems:
         raise Exit(ConfigError.exit_code)
     if outcome.torque_unconfirmed:

@@ -26,7 +26,7 @@ from sfms_robot.cli import (
     servo_command,
     train_command,
 )
-from sfms_robot.cli.show import print_json
+from sfms_robot.cli.show import aside, print_json
 from sfms_robot.errors import INTERRUPTED, NOTE, ConfigError, RobotError, optional
 
 NAME = "sfms-robot"
@@ -203,5 +203,5 @@ def _flagged(path: str, words: Sequence[str]) -> str:
 
 def _said(code: int, problem: str) -> tuple[int, str]:
     with suppress(OSError):
-        print(f"{NAME}: {problem}", file=sys.stderr)
+        aside(f"{NAME}: {problem}")
     return code, problem

@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 import os
 import signal
-import sys
 import threading
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -14,7 +13,7 @@ from typing import Literal
 
 from typer import Argument, Context, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Result, print_json, show
+from sfms_robot.cli.show import JSON, Result, aside, print_json, show
 from sfms_robot.data import listener_names
 from sfms_robot.errors import ConfigError
 
@@ -40,7 +39,7 @@ def fleet(context: Context, zenoh: Path | None = _ZENOH, insecure: bool = _INSEC
         tiles = [tile(str(each.get("name")), each) for each in found.states()]
     show({"heads": tiles, "malformed": found.malformed}, json)
     if not tiles:
-        print("no head answers (start one with: sfms-robot run --fleet NAME)", file=sys.stderr)
+        aside("no head answers (start one with: sfms-robot run --fleet NAME)")
 
 
 @app.command()
@@ -86,7 +85,7 @@ def page(
         if json:
             print_json({"version": 1, "url": served.url})
         else:
-            print(f"fleet: {served.url}", file=sys.stderr, flush=True)
+            aside(f"fleet: {served.url}")
         threading.Event().wait()
 
 
@@ -103,7 +102,7 @@ def _show_answers(answers: Sequence[Result], asked: Sequence[str], json: bool) -
     show({"answers": list(answers), "silent": silent}, json, printed)
     if silent or not answers:
         if not answers and not silent:
-            print("no head answers", file=sys.stderr)
+            aside("no head answers")
         raise Exit(1)
 
 
@@ -153,7 +152,7 @@ def serve(
     figures = serve_until(
         served,
         over,
-        lambda line: print(line, file=sys.stderr, flush=True),
+        aside,
         router=zenoh,
         insecure=insecure,
         metrics=metrics,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from typer import Argument, Option
 
 from sfms_robot.cli.head_command import PACKAGES
-from sfms_robot.cli.show import JSON, Result, cell, counted, print_report, say, show
+from sfms_robot.cli.show import JSON, Result, aside, cell, counted, print_report, say, show
 from sfms_robot.data import head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError
 
@@ -316,7 +315,7 @@ def demo(
         from sfms_robot.app.listen.panel import live_panel
 
         if seeds is not None:
-            found = app.compare_seeds(options, seeds, lambda row: print(_line(row), file=sys.stderr))
+            found = app.compare_seeds(options, seeds, lambda row: aside(_line(row)))
         else:
             found = app.demo(options, out, None if json else live_panel, page)
     show(found, json, _print_demo)
@@ -332,7 +331,7 @@ def _print_demo(found: Result) -> None:
     print(_line(found))
     print(f"look at {' and '.join(found['pictures'])}" if found["pictures"] else f"recorded in {found['folder']}")
     if found["missing"]:
-        print(found["missing"], file=sys.stderr)
+        aside(found["missing"])
 
 
 def _line(seen: Result) -> str:
@@ -392,7 +391,7 @@ def _view(folder: Path, view: str) -> None:
     with closing(page):
         page.wait()
         show_recording(folder, page)
-        print(f"page: {page} (Ctrl-C ends it)", file=sys.stderr)
+        aside(f"page: {page} (Ctrl-C ends it)")
         open_browser(page.url)
         with suppress(KeyboardInterrupt):
             wait_for_visitors(page)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Row, counted, print_json, print_rows, show, with_shared_options
+from sfms_robot.cli.show import JSON, Row, aside, counted, print_json, print_rows, show, with_shared_options
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def ping(on: Wiring, ids: str = IDS) -> None:
                 rows.append({"id": servo, **unknown, "note": "", "answers": False})
     _show(rows, {"servos": rows}, on.json)
     if not all(row["answers"] for row in rows):
-        sys.exit(BusError.exit_code)
+        raise Exit(BusError.exit_code)
 
 
 @app.command()
@@ -225,8 +225,8 @@ def release(
     title = f"torque off: {len(rows) - len(left)} of {len(rows)}"
     _show(rows, {"released": rows, "torque_unconfirmed": left}, json, title)
     if left:
-        print(f"torque is not confirmed off: {', '.join(left)}; switch off their supply", file=sys.stderr)
-        sys.exit(BusError.exit_code)
+        aside(f"torque is not confirmed off: {', '.join(left)}; switch off their supply")
+        raise Exit(BusError.exit_code)
 
 
 @app.command()

@@ -71,7 +71,7 @@ def show(
     else:
         print_report(result, heading, keys, note)
     if result.get("error"):
-        print(f"sfms-robot: {result['error']}", file=sys.stderr)
+        aside(f"sfms-robot: {result['error']}")
     if result.get("exit_code"):
         raise Exit(result["exit_code"])
 
@@ -134,6 +134,11 @@ def screen() -> Console:
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _UNBROKEN
     return console
+
+
+def aside(line: str) -> None:
+    """Print one line to stderr, beside the result."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def say(line: str, style: str = "") -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Result, cell, print_rows, say, show, with_shared_options
+from sfms_robot.cli.show import JSON, Result, aside, cell, print_rows, say, show, with_shared_options
 from sfms_robot.data import listener_names
 from sfms_robot.errors import INTERRUPTED, ConfigError
 
@@ -123,7 +123,7 @@ def _train(work: Callable[[TrainOptions], dict[str, Any]], flags: PhaseFlags, ch
     if not figures:  # of a process that is not the first of its group
         return
     if figures["resumed_at"] == figures["steps"]:
-        print(f"sfms-robot: had already finished at step {figures['steps']}", file=sys.stderr)
+        aside(f"sfms-robot: had already finished at step {figures['steps']}")
     show(figures, flags.json)
 
 
@@ -132,7 +132,7 @@ def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
         return train()
     except KeyboardInterrupt as stopped:
-        print(f"sfms-robot: {stopped if stopped.args else 'interrupted'}", file=sys.stderr)
+        aside(f"sfms-robot: {stopped if stopped.args else 'interrupted'}")
         sys.exit(INTERRUPTED)
 
 

@@ -76,6 +76,10 @@ class Model(BaseModel):
             details += [_detail(each["msg"], each["loc"], each["input"]) for each in error.errors()]
         raise ValidationError.from_exception_data(cls.__name__, details)
 
+    def replaced(self, **values: Any) -> Self:
+        """Return the section with other values. Nothing is validated: see `parse`."""
+        return self.model_copy(update=values)
+
     @model_validator(mode="after")
     def _without_contradictions(self) -> Self:
         for problem in self.contradictions():

@@ -265,8 +265,8 @@ def held_back(head: Head, joints: Collection[str] | None = None) -> Head:
         slow = {key: PACE * value for key, value in head.limits[joint.limits]}
         limits[joint.limits + _SUFFIX] = LimitClass(**slow)
         ends = {"min_deg": rest + TRAVEL * (joint.min_deg - rest), "max_deg": rest + TRAVEL * (joint.max_deg - rest)}
-        held[name] = joint.model_copy(update={**ends, "limits": joint.limits + _SUFFIX})
-    return head.model_copy(update={"limits": limits, "joints": held})
+        held[name] = joint.replaced(**ends, limits=joint.limits + _SUFFIX)
+    return head.replaced(limits=limits, joints=held)
 
 
 # --- Drives: every joint's own as one plain expression, with sharing, mirrors and folds worked out ------------------
@@ -297,8 +297,8 @@ def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Express
     """Return the expression with every shared one in the place of its name."""
     if node.use is not None:
         shared = _inlined(expressions[node.use], expressions)
-        plain = node.model_copy(update={"use": None})
-        return shared if node == Expression(use=node.use) else plain.model_copy(update={"sum": (shared,)})
+        plain = node.replaced(use=None)
+        return shared if node == Expression(use=node.use) else plain.replaced(sum=(shared,))
     if node.group is None:
         return node
     return node.model_copy(update={node.group: tuple(_inlined(part, expressions) for part in node.parts)})
@@ -308,9 +308,9 @@ def mirrored(node: Expression) -> Expression:
     """Return the expression of the other side of the face."""
     if node.channel in LATERAL_POSE:
         turned = Expression(channel=node.channel, gain=-1)
-        return node.model_copy(update={"channel": None, "sum": (turned,)})
+        return node.replaced(channel=None, sum=(turned,))
     if node.channel is not None:
-        return node.model_copy(update={"channel": other_side(node.channel)})
+        return node.replaced(channel=other_side(node.channel))
     assert node.group is not None
     return node.model_copy(update={node.group: tuple(mirrored(part) for part in node.parts)})
 

@@ -134,7 +134,7 @@ class Overlay(Model):
         """Return the overlay with more registers of one joint recorded."""
         before = self.confirmed(sha256)
         joints = {**before, joint: {**before.get(joint, {}), **stored}}
-        return self.model_copy(update={"stored": StoredLayer(head_sha256=sha256, joints=joints)})
+        return self.replaced(stored=StoredLayer(head_sha256=sha256, joints=joints))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,13 +238,13 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
         notes.append(f"the fit of {fit.date} is not used: {OLD_FILE}")
     elif fit is not None:
         fitted = frozenset(fit.joints)
-        drives = {name: {"drive": fit.joints[name].drive} for name in fitted}
-        checked = {name: head.joints[name].model_copy(update=drive) for name, drive in drives.items()}
-        if wrong := problems(head.model_copy(update={"joints": {**head.joints, **checked}})):
+        drives = {name: learnt.drive for name, learnt in fit.joints.items()}
+        checked = {name: head.joints[name].replaced(drive=drive) for name, drive in drives.items()}
+        if wrong := problems(head.replaced(joints={**head.joints, **checked})):
             raise ConfigError(f"{overlay_file(head.name)}: fit: {wrong[0]}")
-        joints |= {name: joints[name].model_copy(update=drive) for name, drive in drives.items()}
+        joints |= {name: joints[name].replaced(drive=drive) for name, drive in drives.items()}
     return Layered(
-        head=head.model_copy(update={"joints": joints}),
+        head=head.replaced(joints=joints),
         calibrated=frozenset(overlay.measured) - frozenset(refused),
         refused=refused,
         fitted=fitted,
@@ -262,13 +262,13 @@ def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Jo
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
     joint = declared(joint, found.stored, usual or Safety())
-    return joint.model_copy(update={"zero_ticks": zero_ticks, "sign": found.sign, **ends})
+    return joint.replaced(zero_ticks=zero_ticks, sign=found.sign, **ends)
 
 
 def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
     """Return the joint with zero and direction that count as made for these registers of its servo."""
-    update = {"stored": {**usual.merged(joint.safety).stored, **stored}}
-    return joint.model_copy(update={"safety": (joint.safety or Safety()).model_copy(update=update)})
+    stored = {**usual.merged(joint.safety).stored, **stored}
+    return joint.replaced(safety=(joint.safety or Safety()).replaced(stored=stored))
 
 
 def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bool = False) -> Path:
@@ -288,7 +288,7 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
         with suppress(ConfigError, yaml.YAMLError):
             edited = parse(Head, yaml.safe_load(text), own)
             wanted = {key: head.safety_of(key) for key in head.joints}
-            wanted[joint] = wanted[joint].model_copy(update={"stored": stored})
+            wanted[joint] = wanted[joint].replaced(stored=stored)
             if {key: edited.safety_of(key) for key in edited.joints} == wanted:
                 _replace(own.resolve(), text)
                 return own

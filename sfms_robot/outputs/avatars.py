@@ -32,8 +32,6 @@ from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Facts, Output, OutputFrame
 from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, directions
 
-VMC_PORT: Final = 39539  # what the protocol gives receivers
-LIVE_LINK_PORT: Final = 11111
 SUBJECT: Final = "sfms-robot"  # as Unreal lists it
 LARGEST_PACKET: Final = 1400  # bytes, so that no network cuts it in two
 _EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
@@ -125,7 +123,7 @@ def unity_quaternion(roll: float, pitch: float, yaw: float, share: float = 1.0) 
 class VmcOutput(UdpOutput):
     """VMC, in bundles of up to `LARGEST_PACKET` bytes. All messages have one length for good: numbers are filled in."""
 
-    kind, usual_port = "vmc", VMC_PORT
+    kind, usual_port = "vmc", 39539  # the port that the protocol gives receivers
     advice = "start the avatar software and switch on its VMC receiver, or check the port"
     _bundled = True
 
@@ -179,7 +177,7 @@ _ORDER: Final = [CHANNEL_INDEX[name] for name in (*ORDERS["live_link_udp"], "yaw
 class LiveLinkOutput(UdpOutput):
     """Live Link Face's packets. Frames are counted from midnight on, as the app does."""
 
-    kind, usual_port, rate_hz = "live-link", LIVE_LINK_PORT, float(_RATE)
+    kind, usual_port, rate_hz = "live-link", 11111, float(_RATE)
     advice = "start Unreal with its Live Link plug-in, or check the port"
 
     def __init__(self, argument: str = "") -> None:

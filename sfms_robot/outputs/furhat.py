@@ -28,7 +28,6 @@ from sfms_robot.outputs.avatars import eye_directions
 from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
 from sfms_robot.ports import ChannelLimit, OutputFrame
 
-PORT: Final = 9000
 KEY: Final = "FURHAT_KEY"
 
 _OWN: Final = ("blinking", "microexpressions", "head_sway")  # of the robot
@@ -56,7 +55,7 @@ class Furhat(WebSocketOutput):
 
     kind = "furhat"
     neutral_s = 1.0  # of the way to neutral
-    usual_port = PORT
+    usual_port = 9000
     path = "/v1/events"
     absent = "name the robot's host and switch on its Realtime API"
     rate_hz = 50.0  # the maker's example sends faces every 20 ms

@@ -37,7 +37,6 @@ from sfms_robot.ports import ChannelLimit, Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
 
-PORT: Final = 8000
 RATE_HZ: Final = 50.0  # more than 100 targets a second overload a daemon
 _SETTLE_S: Final = 0.2  # until the daemon takes targets again after the way to neutral
 _KNOWN_MAJOR: Final = "1"  # version of the daemon
@@ -140,7 +139,7 @@ def _correlations(goals: Doubles, angles: Doubles) -> Doubles | None:
 class ReachyDaemon(WebSocketOutput):
     """An output to the daemon. It checks, at first and once a second, that the robot can be driven."""
 
-    usual_port = PORT
+    usual_port = 8000
     path = "/ws/sdk"
     absent = "start reachy-mini-daemon, or name its host"
     rate_hz = RATE_HZ

@@ -33,7 +33,6 @@ from sfms_robot.outputs.websocket_peer import Message, WebSocketOutput, WebSocke
 from sfms_robot.ports import Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
-PORT: Final = 8001
 PLUGIN: Final = {"pluginName": "sfms-robot", "pluginDeveloper": "sfms-robot"}
 GROW_S: Final = 1.0  # of weight, once access is given
 ANSWER_S: Final = 5.0  # longest wait for an answer, except for the user's
@@ -91,7 +90,7 @@ class VtubeStudio(WebSocketOutput):
 
     kind = "vtube-studio"
     mode = "set"
-    usual_port = PORT
+    usual_port = 8001
     absent = "start VTube Studio and switch on the plug-in API in its settings"
     answers = False  # its silence is judged by its answers
 

@@ -117,7 +117,7 @@ def calibrate_on(
     try:
         if (old := overlay.calibrate) is not None and old.head_sha256 != sha256 and old.joints:
             kept = old.joints if guide.keeps_old() else {}
-            overlay = overlay.model_copy(update={"calibrate": CalibrateLayer(head_sha256=sha256, joints=kept)})
+            overlay = overlay.replaced(calibrate=CalibrateLayer(head_sha256=sha256, joints=kept))
         holds = layered(head, overlay, sha256, servos).calibrated
         outcome.before = [joint for joint in wanted if joint in holds and not again]
         todo = [joint for joint in wanted if joint not in outcome.before]
@@ -148,7 +148,7 @@ def calibrate_on(
                 say(f"  left out: {reason}")
                 continue
             layer = CalibrateLayer(head_sha256=sha256, joints={**overlay.measured, joint: found})
-            overlay = overlay.model_copy(update={"calibrate": layer})
+            overlay = overlay.replaced(calibrate=layer)
             if overlay.stored is not None:
                 overlay = overlay.recorded(sha256, joint, found.stored)
             save_overlay(overlay, file)
@@ -352,11 +352,11 @@ def probe(
     servo that is not what the head says.
     """
     joint, safety = head.joints[name], head.safety_of(name)
-    safety = safety.model_copy(update={"stop": "release", "stored": {**safety.stored, **stored}})
-    joint = joint.model_copy(update={"safety": safety, **_whole_travel(joint)})
+    safety = safety.replaced(stop="release", stored={**safety.stored, **stored})
+    joint = joint.replaced(safety=safety, **_whole_travel(joint))
     # A person thinks longer than a watchdog waits.
-    config = head.buses[joint.bus].model_copy(update={"watchdog_ms": 0})
-    alone = head.model_copy(update={"joints": {name: joint}, "buses": {joint.bus: config}})
+    config = head.buses[joint.bus].replaced(watchdog_ms=0)
+    alone = head.replaced(joints={name: joint}, buses={joint.bus: config})
     bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True, doctor=doctor)
     try:
         bus.connect()

@@ -109,7 +109,7 @@ def fit_head(name: str, recording: Path) -> Report:
     practice = run.about.get("port") == SIM
     file = check_writable(overlay_file(shipped.name, practice))
     overlay = load_overlay(shipped, file)
-    head = layered(shipped, overlay.model_copy(update={"fit": None}), sha256).head
+    head = layered(shipped, overlay.replaced(fit=None), sha256).head
     angles_rad, shapes, delay_s = read_pairs(head, recording, run)
     units = Units.of(head)
     has, looks = units.values(angles_rad), looks_like(head, shapes)
@@ -128,7 +128,7 @@ def fit_head(name: str, recording: Path) -> Report:
         note=f"{len(has)} frames of {recording.name}",
         joints={joint: Fitted(drive=drive) for joint, drive in learnt.items()},
     )
-    layered(shipped, changed := overlay.model_copy(update={"fit": layer}), sha256)  # refuses what is not sound
+    layered(shipped, changed := overlay.replaced(fit=layer), sha256)  # refuses what is not sound
     save_overlay(changed, file)
     both = {key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")}
     facts = {"head": head.name, "frames": len(has), "delay_s": delay_s, **both, "joints": rows}

@@ -13,7 +13,8 @@ from itertools import chain
 from shlex import quote
 from typing import Any, Final, Literal, cast
 
-from sfms_robot.app.servo.serial_line import SIM, FoundServo
+from sfms_robot.app.options import SIM
+from sfms_robot.app.servo.serial_line import FoundServo
 from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
 from sfms_robot.config.firmware import user_maps

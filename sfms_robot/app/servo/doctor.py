@@ -12,6 +12,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, Final, cast
 
+from sfms_robot.app.options import SIM
 from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.app.servo.diagnosis import (
     SEVERITIES,
@@ -33,7 +34,6 @@ from sfms_robot.app.servo.diagnosis import (
     wire_budget,
 )
 from sfms_robot.app.servo.serial_line import (
-    SIM,
     Confirm,
     FoundServo,
     Row,

@@ -15,6 +15,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, Final
 
+from sfms_robot.app.options import SIM
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
@@ -29,7 +30,6 @@ from sfms_robot.servo.registers import Field, Table
 Confirm = Callable[[str], bool]
 Row = dict[str, Any]  # of a table, and of --json
 
-SIM: Final = "sim"
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
 TRIES: Final = 3
 
