@@ -129,7 +129,12 @@ class AudioFile:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._file = _open(self.path)
+        self._file = _opened(self.path)
+        try:
+            _check(self._file, self.path)
+        except BaseException:
+            self._file.close()
+            raise
         self.length = int(self._file.frames * AUDIO_HZ / self._file.samplerate + 0.5)
         self._mix = Downmix(str(path))
         self.rewind()
@@ -179,16 +184,6 @@ def read_audio(path: Path | str) -> Floats:
     """Return a whole sound file as (n,) mono 16 kHz, -1..1. Raises ConfigError as `AudioFile`."""
     with closing(AudioFile(path)) as file:
         return file.read(file.length + _BLOCK)
-
-
-def _open(path: Path) -> soundfile.SoundFile:
-    file = _opened(path)
-    try:
-        _check(file, path)
-    except BaseException:
-        file.close()
-        raise
-    return file
 
 
 def _opened(path: Path) -> soundfile.SoundFile:

@@ -227,11 +227,11 @@ def _columns(file: Path, header: Sequence[str]) -> tuple[dict[str, _Column], boo
 
 def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: _Columns) -> Doubles:
     """Return motion (N, 58) in radians and 0..1: units that no name declares are decided over all rows."""
-    open_angles = [CHANNEL_INDEX[name] for name in _ANGLES if name in columns and math.isnan(columns[name].factor)]
-    undecided = motion.copy()
-    undecided[:, [CHANNEL_INDEX[name] for name in _ANGLES if CHANNEL_INDEX[name] not in open_angles]] *= 0.0
+    is_open = np.array([name in columns and math.isnan(columns[name].factor) for name in _ANGLES])
+    undecided, angles = motion.copy(), slice(0, len(_ANGLES))
+    undecided[:, angles] *= is_open
     units = units_of(undecided, times_s)
-    motion[:, open_angles] *= units.angle
+    motion[:, angles] *= np.where(is_open, units.angle, 1.0)
     motion[:, SHAPES] *= units.shape
     if units.line:
         logger.warning("%s: %s, by what a head can do (names with a unit: headYaw_deg, yaw_rad)", file, units.line)
