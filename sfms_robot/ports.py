@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles, Floats, ListenerEvent, Plan, Reading, Sighting, SpeakerFrame
+from sfms_robot.frames import Doubles, Floats, Ints, ListenerEvent, Plan, Reading, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
 STOP_S: Final = 0.5  # that `Bus.stop` takes at most
@@ -152,10 +151,10 @@ class PlanFeed(Protocol):
 class TickConversion(Protocol):
     """Conversion between joint angles of one bus and servo ticks: zero, sign, ratio (`motion.calibration`)."""
 
-    def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
+    def to_ticks(self, angles_rad: Doubles) -> Ints:
         """Return the nearest ticks (J,) inside the position limits, also after rounding."""
 
-    def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
+    def to_rad(self, ticks: Ints) -> Doubles:
         """Return the angles (J,) of servo positions, also of those outside the limits."""
 
 
@@ -182,7 +181,7 @@ class Bus(Protocol):
         servo answers; ServoError when a servo contradicts the head's file.
         """
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch torque on without a jump: goal := present, verified, then torque. Return the held angles, rad (J,).
 
         The angles are in the order of `joints`; that of an absent joint is 0 rad, or the end of its range nearest to

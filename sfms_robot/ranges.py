@@ -14,11 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles
-
-Bools = NDArray[np.bool_]
+from sfms_robot.frames import Bools, Doubles
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Bools, Doubles, Ints
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JointLimits
 
@@ -24,7 +23,7 @@ class AuditState:
     """The last three angles (3, J), oldest first, the last ticks (J,), and the counts so far (ticks x joints)."""
 
     recent_rad: Doubles
-    ticks: NDArray[np.int64]
+    ticks: Ints
     violations: int = 0
     clamped: int = 0
 
@@ -42,7 +41,7 @@ class CommandAudit:
         """Return the state at rest at `angles_rad` (J,), the start of the limiter."""
         return AuditState(np.tile(angles_rad, (3, 1)), self._calibration.to_ticks(angles_rad))
 
-    def restart(self, joints: NDArray[np.bool_], angles_rad: Doubles, state: AuditState) -> AuditState:
+    def restart(self, joints: Bools, angles_rad: Doubles, state: AuditState) -> AuditState:
         """Return the state with some `joints` (J,) at rest at `angles_rad` (J,); their way there was not commanded."""
         recent = np.where(joints, angles_rad, state.recent_rad)
         ticks = np.where(joints, self._calibration.to_ticks(angles_rad), state.ticks)

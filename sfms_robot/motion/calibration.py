@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.config import Joint
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Doubles, Ints
 
 _ROUNDING_TICKS = 1e-6  # a limit this close to a whole tick is that tick
 
@@ -50,17 +50,17 @@ class Calibration:
             if first > last:
                 raise ConfigError(f"joints.{name}: min_deg..max_deg holds no tick of the servo")
 
-    def to_ticks(self, angles_rad: Doubles) -> NDArray[np.int64]:
+    def to_ticks(self, angles_rad: Doubles) -> Ints:
         """Return the nearest ticks (J,) inside the limits. Raises ValueError for an angle that is not finite."""
         finite = np.isfinite(angles_rad)
         if np.count_nonzero(finite) < finite.size:
             raise ValueError(f"joint {int(np.argmin(finite))} angle is not finite: {angles_rad}")
         ticks = self.ticks_per_rad * angles_rad
         ticks += self.zero_ticks
-        inside: NDArray[np.float64] = np.minimum(np.maximum(np.rint(ticks), self.low_ticks), self.high_ticks)
+        inside: Doubles = np.minimum(np.maximum(np.rint(ticks), self.low_ticks), self.high_ticks)
         return inside.astype(np.int64)
 
-    def to_rad(self, ticks: NDArray[np.int64]) -> Doubles:
+    def to_rad(self, ticks: Ints) -> Doubles:
         """Return angles (J,) of servo positions, also of those outside the limits."""
         angles: Doubles = (ticks - self.zero_ticks) / self.ticks_per_rad
         return angles

@@ -33,9 +33,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from sfms_robot.config import Head
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Bools, Doubles
 from sfms_robot.motion.jerk_step import FASTEST, SLACK, Bound, Chase, State, Stop, lawful, moves_in
-from sfms_robot.ranges import Bools, Range
+from sfms_robot.ranges import Range
 from sfms_robot.signals.minimum_jerk import minimum_jerk
 
 _HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6

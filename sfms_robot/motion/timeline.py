@@ -32,7 +32,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from sfms_robot.frames import (
     BLINKS,
@@ -44,6 +43,7 @@ from sfms_robot.frames import (
     SHAPES,
     Doubles,
     Floats,
+    Indices,
     Plan,
 )
 from sfms_robot.signals.minimum_jerk import ease
@@ -208,7 +208,7 @@ def _ticked(now_s: float, state: TimelineState) -> TimelineState:
     return replace(state, now_s=now_s, lead_limit_s=max(limit_s, 0.0))
 
 
-def _distinct(times_s: Doubles) -> tuple[Doubles, NDArray[np.intp]]:
+def _distinct(times_s: Doubles) -> tuple[Doubles, Indices]:
     """Return the instants, each once, and the place of each of (N,) among them: joints share their leads."""
     seen: dict[float, int] = {}
     which = [seen.setdefault(time_s, len(seen)) for time_s in times_s.tolist()]

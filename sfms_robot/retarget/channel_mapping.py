@@ -21,14 +21,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Indices
 
-Indices = NDArray[np.intp]
 Tree = tuple[int, Expression]  # joint, node
 
 STILL = Expression(channel=CHANNELS[0], gain=0.0)
@@ -299,7 +297,7 @@ class _Level:
     """Nodes whose children lie side by side one level below, from `starts` on; `kinds`: groups and masks of nodes."""
 
     starts: Indices
-    kinds: tuple[tuple[np.ufunc, NDArray[np.bool_]], ...]
+    kinds: tuple[tuple[np.ufunc, Bools], ...]
     shape: _Shape
 
     def __call__(self, below: Doubles) -> Doubles:

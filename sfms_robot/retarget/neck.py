@@ -14,10 +14,9 @@ from functools import reduce
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config.kinematics import SerialNeck, Split
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Bools, Doubles
 from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
@@ -42,7 +41,7 @@ class Solved:
     """
 
     angles_rad: Doubles
-    reached: NDArray[np.bool_]
+    reached: Bools
     residual_rad: Doubles
     residual_m: Doubles
     shown: Doubles

@@ -21,11 +21,10 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
-from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Doubles, Floats
+from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Bools, Doubles, Floats
 from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.spaces import channel_of, motion_of
@@ -38,8 +37,6 @@ HEAD_S: Final = 0.6  # a head turn that follows it
 HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
 LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
 _NEVER_S: Final = -math.inf
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)

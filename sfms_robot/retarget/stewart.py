@@ -24,11 +24,10 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import POSE_CHANNELS, Doubles
+from sfms_robot.frames import POSE_CHANNELS, Bools, Doubles
 from sfms_robot.retarget.neck import Ranges, Solved, checked, low_pass
 from sfms_robot.signals import rotations
 
@@ -43,7 +42,7 @@ BLOCK: Final = 500  # poses at a time, for the memory that their pieces take
 PIECES: Final = 32
 PASSES: Final = 6  # to a billionth of the way: 32 ** 6 = 2 ** 30
 
-Reachable = Callable[[Doubles], NDArray[np.bool_]]  # poses (n, 6) -> (n,)
+Reachable = Callable[[Doubles], Bools]  # poses (n, 6) -> (n,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +181,7 @@ class Stewart:
     def turns_body(self) -> bool:
         return self._body is not None
 
-    def reachable(self, poses: Doubles) -> NDArray[np.bool_]:
+    def reachable(self, poses: Doubles) -> Bools:
         """Return True (n,) for the poses (n, 6), seen from the body, that the platform can take."""
         cranks = self.geometry.inverse(poses, DEAD_CENTRE)
         inside = (cranks >= self._low) & (cranks <= self._high)  # False for NaN
@@ -245,7 +244,7 @@ class Stewart:
         )
 
 
-def nearest(poses: Doubles, reachable: Reachable) -> tuple[Doubles, NDArray[np.bool_]]:
+def nearest(poses: Doubles, reachable: Reachable) -> tuple[Doubles, Bools]:
     """Return the nearest poses (n, 6) that can be reached, straight back toward home, and which were reached (n,).
 
     Home, the zero pose, is inside the reach. Along the straight line home -> wanted pose (in roll, pitch, yaw, x, y, z)

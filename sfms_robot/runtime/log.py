@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import FRAME_S, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.runtime.clock import TickPace, TickTime
 from sfms_robot.runtime.states import RunState
@@ -150,7 +149,7 @@ class RunLog:
         """Start the audit where torque came on, `held_rad` (J,)."""
         self.audited = self.audit.start(held_rad)
 
-    def restart(self, joints: NDArray[np.bool_], held_rad: Doubles) -> None:
+    def restart(self, joints: Bools, held_rad: Doubles) -> None:
         """Restart the audit of some `joints` (J,) that were away and hold `held_rad` (J,) now."""
         self.audited = self.audit.restart(joints, held_rad, self.audited)
 

@@ -18,10 +18,9 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats, Reading
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Reading
 from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
@@ -71,7 +70,7 @@ class Parts:
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False
     halt: HaltLatch = field(default_factory=HaltLatch)
-    holds: NDArray[np.bool_] | None = None
+    holds: Bools | None = None
     heat: HeatGuard | None = None
     ignored: frozenset[str] = frozenset()
     missing: Callable[[], Sequence[str]] = tuple
@@ -100,7 +99,7 @@ class LoopState:
     goals_rad: Doubles
     retargeter: Any
     heat: Heat
-    released: NDArray[np.bool_]
+    released: Bools
     life: LifeState = LifeState()
     presence: Presence = field(default_factory=Presence.start)
     run: RunState = RunState()
@@ -337,7 +336,7 @@ def _halted(parts: Parts, now_s: float, state: LoopState) -> tuple[LoopState, Ti
     return replace(state, limiter=limiter, goals_rad=goals_rad, released=released, stands=stands), command
 
 
-def _let_go(parts: Parts, which: NDArray[np.bool_]) -> None:
+def _let_go(parts: Parts, which: Bools) -> None:
     parts.bus.release([joint for joint, each in zip(parts.retargeter.joints, which, strict=True) if each])
 
 
@@ -363,7 +362,7 @@ def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state:
 
 
 def _eased_in_from(
-    parts: Parts, log: RunLog, stands_rad: Doubles, which: NDArray[np.bool_], state: LoopState, now_s: float
+    parts: Parts, log: RunLog, stands_rad: Doubles, which: Bools, state: LoopState, now_s: float
 ) -> LoopState:
     """Return the state in which `which` (J,) joints ease in from standing at `stands_rad` (J,), from `now_s` on."""
     log.restart(which, stands_rad)

@@ -13,11 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import NOTE, BusError, PacketError, PortError, RobotError, ServoError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Indices, Ints, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.ranges import Range
 from sfms_robot.servo.policy import BusServo
@@ -81,7 +80,7 @@ class Goals:
         """Return whether a goal lies in the range in force of a servo."""
         return bool(self.own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
 
-    def ticks(self, goals_rad: Doubles, sent: NDArray[np.intp]) -> NDArray[np.int64]:
+    def ticks(self, goals_rad: Doubles, sent: Indices) -> Ints:
         """Convert goals (J,) to ticks (J,). Those at the indices `sent` (n,) are to be sent, and are checked.
 
         The range in force of a joint that is sent shrinks to its goal; the others keep theirs. Raises ValueError, with
@@ -110,7 +109,7 @@ class Goals:
         return ticks
 
 
-def tick_ranges(servos: Sequence[BusServo], conversion: TickConversion) -> NDArray[np.int64]:
+def tick_ranges(servos: Sequence[BusServo], conversion: TickConversion) -> Ints:
     """Return the lowest and the highest goal of each joint: (2, J) ticks."""
     ends = np.array([(servo.min_rad, servo.max_rad) for servo in servos]).T
     return np.sort([conversion.to_ticks(end) for end in ends], axis=0)
@@ -300,7 +299,7 @@ class AbsentBus:
 
     connect = write = release = resume = torque_off = stop = close = _nothing
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Return 0 rad for every joint, or the end of its range nearest to 0."""
         return np.array([self._held[joint] for joint in joints])
 

@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.errors import BusError, RobotError
 from sfms_robot.frames import Doubles, Reading
@@ -155,7 +154,7 @@ class CompositeBus:
             self.close()
             raise
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Enable joints as `ports.Bus`, one bus after the other, for supplies that cannot start many at once.
 
         A bus that has a thread continues in a new one. Joints of a bus that has failed count as absent.

@@ -22,7 +22,6 @@ from contextlib import closing
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
@@ -154,7 +153,7 @@ class PulseBus(WireBus[RateLimitedPort]):
                 output.pulse = pulses[output.channel]
         return pulses is not None
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
 
         Blocks for 0.7 s a joint, and a few answers. Raises ConfigError unless the user has confirmed that joints may

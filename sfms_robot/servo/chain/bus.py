@@ -25,11 +25,10 @@ from threading import RLock
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import BusConfig, Faults
 from sfms_robot.errors import BusError, PacketError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Indices, Ints, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
@@ -105,7 +104,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque)
         self._enabled = False
-        self._places: NDArray[np.intp] = _NO_PLACES  # members that get goals
+        self._places: Indices = _NO_PLACES  # members that get goals
         self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
         self._arrived: list[Member] = []  # members that came to hold a position in this poll
         self._stamp_s = 0.0
@@ -122,7 +121,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._goal_type = np.dtype([("id", np.uint8), ("goal", kind)]) if simple else None
         self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
-        self._fed: NDArray[np.intp] | None = None  # places whose watchdogs are armed
+        self._fed: Indices | None = None  # places whose watchdogs are armed
 
     @property
     def capabilities(self) -> Mapping[str, frozenset[str]]:
@@ -170,7 +169,7 @@ class ChainBus(WireBus[RegisterLink]):
     def _coming_back(self) -> list[Startup]:
         return [member.startup for member in self._members if member.comes_back]
 
-    def enable(self, joints: Sequence[str]) -> NDArray[np.float64]:
+    def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch torque on for `joints` without a jump, one after the other; return the angles held, rad.
 
         For a joint whose servo has not answered since `connect`: 0 rad, or the end of its range nearest to that, so
@@ -375,7 +374,7 @@ class ChainBus(WireBus[RegisterLink]):
             except PacketError as error:  # this one cannot be built: the next may
                 self._count_error(error)
 
-    def _send(self, link: RegisterLink, places: NDArray[np.intp], ticks: NDArray[np.int64]) -> None:
+    def _send(self, link: RegisterLink, places: Indices, ticks: Ints) -> None:
         """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
         goal, now_s = self._telemetry.goal, link.port.now_s()
         ids = self._ids[places]

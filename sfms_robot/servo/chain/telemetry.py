@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Ints, Reading
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.registers import Field, Table, span_of
 
@@ -96,7 +96,7 @@ class Telemetry:
         self._columns = [column for column in columns if np.isfinite(column[3]).any()]
         self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
         self._conversion = conversion
-        self.ticks: NDArray[np.int64] = np.zeros(len(tables), np.int64)
+        self.ticks: Ints = np.zeros(len(tables), np.int64)
         self.seen_s = np.full(len(tables), -np.inf)
         self.extra = np.full((len(_EXTRA), len(tables)), np.nan)
 
