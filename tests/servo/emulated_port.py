@@ -28,8 +28,7 @@ def startups_on(port, servos, conversion):
     """The startups of these servos over `port`, and what runs them all through."""
     table = servos[0].table
     link, kind = link_on(port, table), Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
-    pairs = zip(servos, needs_of(servos, conversion), strict=True)
-    startups = [kind(servo, needs, {}) for servo, needs in pairs]
+    startups = [kind(servo, needs, {}) for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)]
     for each in startups:
         each.attach(link)
     return startups, lambda: start_up("face", link, startups, port.baud)

@@ -1,6 +1,7 @@
 """One servo's states: the arrows of the diagram in docs/safety.md. Without a wire, times are given."""
 
 import logging
+from typing import get_args
 
 import pytest
 from emulated_port import bus_servo
@@ -11,9 +12,9 @@ from sfms_robot.servo.chain import member as rules
 from sfms_robot.servo.chain.member import LONGEST_PAUSE_S, Member, MemberState, Notices
 from sfms_robot.servo.chain.startup import Silent
 
-OVERLOAD = 1 << 5
-STANDS = 2100
-OFF, ONLINE, REDUCED, FAULTY, LIMP, SILENT, RETURNING, REBOOTING, REJOINING, GIVEN_UP, RELEASED = MemberState
+OVERLOAD, STANDS = 1 << 5, 2100
+STATES = get_args(MemberState)
+OFF, ONLINE, REDUCED, FAULTY, LIMP, SILENT, RETURNING, REBOOTING, REJOINING, GIVEN_UP, RELEASED = STATES
 
 
 class Way:
@@ -159,7 +160,7 @@ def test_rejoining_to_online_by_a_goal_near_to_where_it_stands(member):
     run(member, 1.0)
     assert member.rejoined and not member.accepts(STANDS + 50) and not member.gets_goals
     assert member.accepts(STANDS + 5)
-    assert member.state is ONLINE and member.gets_goals
+    assert member.state == ONLINE and member.gets_goals
 
 
 def test_returning_goes_on_after_a_silence_of_its_own(member):
@@ -169,48 +170,48 @@ def test_returning_goes_on_after_a_silence_of_its_own(member):
     run(member, 1.0)
     refuses(member)
     run(member, 1.0 + rules.RETRY_S - 0.01)
-    assert member.state is RETURNING
+    assert member.state == RETURNING
     run(member, 1.0 + rules.RETRY_S)
-    assert member.state is REJOINING
+    assert member.state == REJOINING
 
 
-@pytest.mark.parametrize("before", [state for state in MemberState if state is not OFF])
+@pytest.mark.parametrize("before", [state for state in STATES if state != OFF])
 def test_every_state_but_off_to_released_and_back_by_enable(member, before):
     member.state = before
     member.released()
-    assert member.state is RELEASED and not member.gets_goals
+    assert member.state == RELEASED and not member.gets_goals
     assert member.to_release and member.job is None and not member.waits
     member.take_torque(False, 1.0)
     assert not member.to_release and member.fault is None
     fails(member)
-    assert member.state is RELEASED  # whatever it says of itself
+    assert member.state == RELEASED  # whatever it says of itself
     member.gone()
     assert member.to_release  # who knows what it does now
     member.enabled()
-    assert member.state is ONLINE
+    assert member.state == ONLINE
 
 
-@pytest.mark.parametrize("before", list(MemberState))
+@pytest.mark.parametrize("before", STATES)
 def test_called_back_it_returns_from_every_state_in_which_it_neither_goes_on_nor_comes(member, before):
     fails(member)  # a fault that is there before and after: it is not acted upon again
     member.state, mine = before, member._named
     member.called_back(1.0)
     if before in (OFF, FAULTY, LIMP, GIVEN_UP, RELEASED):
-        assert member.state is RETURNING and member.recalled
+        assert member.state == RETURNING and member.recalled
         run(member, 1.0)
-        assert member.state is REJOINING and member.recalled and member.fault == "overload" and mine
+        assert member.state == REJOINING and member.recalled and member.fault == "overload" and mine
         assert member.accepts(STANDS)
         fails(member, 1.1)
-        assert member.state is ONLINE
+        assert member.state == ONLINE
     else:
-        assert member.state is before and member.startup.asked == []
+        assert member.state == before and member.startup.asked == []
 
 
-@pytest.mark.parametrize("state", list(MemberState))
+@pytest.mark.parametrize("state", STATES)
 def test_from_any_state_to_off_by_stop(member, state):
     member.state = state
     member.stopped()
-    assert member.state is OFF and member.job is None and not member.to_release
+    assert member.state == OFF and member.job is None and not member.to_release
 
 
 def test_limp_is_to_be_released_until_the_servo_says_so_and_again_after_a_silence():
@@ -224,7 +225,7 @@ def test_limp_is_to_be_released_until_the_servo_says_so_and_again_after_a_silenc
     member.take_torque(False, 0.2)
     assert not member.to_release
     silent(member, 1.0)
-    assert member.state is LIMP and member.to_release
+    assert member.state == LIMP and member.to_release
 
 
 def test_loose_contact_is_said_once_in_ten_seconds_with_a_count(caplog):

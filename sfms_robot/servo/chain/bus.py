@@ -32,7 +32,7 @@ from sfms_robot.frames import Doubles, Indices, Ints, Reading
 from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
-from sfms_robot.servo.chain.member import ONLINE, REJOINING, Member, Notices
+from sfms_robot.servo.chain.member import Member, Notices
 from sfms_robot.servo.chain.poll import TURN_S, StatusPoll
 from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
 from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
@@ -406,7 +406,7 @@ class ChainBus(WireBus[RegisterLink]):
 
     def _update_places(self) -> None:
         """Find the members that get goals; the array stays the same object while it has the same content."""
-        self._rejoining = [member for member in self._members if member.state is REJOINING]
+        self._rejoining = [member for member in self._members if member.state == "rejoining"]
         places = [member.index for member in self._members if member.gets_goals]
         if self._places.tolist() != places:
             self._places = np.array(places, np.intp)
@@ -464,7 +464,7 @@ class ChainBus(WireBus[RegisterLink]):
     def _bring_back(self, link: RegisterLink, now_s: float) -> None:
         """Take a poll's share of the jobs of members on their way back; a silence ends it."""
         left, longest = _EXCHANGES, link.framing.reads(1, LONGEST_READ)
-        for member in [member for member in self._members if member.state is not ONLINE]:
+        for member in [member for member in self._members if member.state != "online"]:
             while left and member.waits and member.due(now_s):
                 if not link.grants("return", longest, alone=True, late_s=AWAY_LATE_S):
                     return

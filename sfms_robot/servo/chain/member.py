@@ -22,8 +22,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from enum import Enum
-from typing import Final
+from typing import Final, Literal
 
 from sfms_robot.config import Faults
 from sfms_robot.errors import ServoError
@@ -50,31 +49,24 @@ FORGET_S: Final = 60.0
 NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands continues from there
 
 
-class MemberState(Enum):
-    """The states of a member; see the module."""
-
-    __hash__ = object.__hash__  # each is one object; Enum's own hash is Python code, run a hundred times a tick
-
-    OFF = "off"
-    ONLINE = "online"
-    REDUCED = "reduced"
-    FAULTY = "faulty"
-    LIMP = "limp"
-    SILENT = "silent"
-    RETURNING = "returning"
-    REBOOTING = "rebooting"
-    REJOINING = "rejoining"
-    GIVEN_UP = "given up"
-    RELEASED = "released"
-
-
-ONLINE: Final = MemberState.ONLINE  # through the class each is a call, for every servo in every tick
-REDUCED: Final = MemberState.REDUCED
-REJOINING: Final = MemberState.REJOINING
-_DRIVEN: Final = frozenset({ONLINE, REDUCED})  # get goals
-POWERED: Final = _DRIVEN | {MemberState.FAULTY, MemberState.REJOINING}  # torque is wanted, and was seen
-_LIMP: Final = frozenset({MemberState.LIMP, MemberState.GIVEN_UP, MemberState.RELEASED})  # torque off is wanted
-_COMING: Final = frozenset({MemberState.RETURNING, MemberState.REBOOTING})
+MemberState = Literal[  # see the module
+    "off",
+    "online",
+    "reduced",
+    "faulty",
+    "limp",
+    "silent",
+    "returning",
+    "rebooting",
+    "rejoining",
+    "given up",
+    "released",
+]
+_States = frozenset[MemberState]
+_DRIVEN: Final[_States] = frozenset({"online", "reduced"})  # get goals
+POWERED: Final[_States] = _DRIVEN | {"faulty", "rejoining"}  # torque is wanted, and was seen
+_LIMP: Final[_States] = frozenset({"limp", "given up", "released"})  # torque off is wanted
+_COMING: Final[_States] = frozenset({"returning", "rebooting"})
 
 
 class Notices:
@@ -140,7 +132,7 @@ class Member:
         self.servo = startup.servo
         self.id = self.servo.id
         self.identified = False
-        self.state = MemberState.OFF
+        self.state: MemberState = "off"
         self.torque_seen: bool | None = None
         self.job: Steps[int] | None = None
         self.job_due_s = 0.0
@@ -199,7 +191,7 @@ class Member:
 
     def connected(self, there: bool) -> None:
         """Note that `connect` has identified and prepared it, or (not `there`) that it did not answer."""
-        self._reset(MemberState.OFF)
+        self._reset("off")
         self._forget_silence(there)
         self.identified, self.torque_seen = there, None if there else False
         if not there:
@@ -208,29 +200,29 @@ class Member:
     def enabled(self) -> None:
         """Note that `enable` switched torque on, and saw it. Faults it had before are not acted upon again."""
         self._drop_job()
-        self.state, self._trouble, self.mismatch = MemberState.ONLINE, None, None
+        self.state, self._trouble, self.mismatch = "online", None, None
         self.identified = self.torque_seen = True
         self._attempts_s.clear()
 
     def awaited(self) -> None:
         """Note that `enable` wants it, and it is absent: it is brought in when it appears."""
-        self._reset(MemberState.SILENT)
+        self._reset("silent")
         self._trouble = NO_ANSWER
 
     def stopped(self) -> None:
         """Note that no torque is wanted any more; `stop` switches it off."""
         self._drop_job()
-        self.state = MemberState.OFF
+        self.state = "off"
 
     def released(self) -> None:
         """Ask for torque off until `enable`; the poll writes it."""
-        if self.state is not MemberState.OFF:
+        if self.state != "off":
             self._release(math.inf)
-            self.state = MemberState.RELEASED
+            self.state = "released"
 
     def called_back(self, now_s: float) -> None:
         """Bring it back as if it had been away, unless it is driven or on its way; its faults count as known."""
-        if self.state in _DRIVEN | _COMING | {MemberState.REJOINING, MemberState.SILENT}:
+        if self.state in _DRIVEN | _COMING | {"rejoining", "silent"}:
             return
         self._attempts_s.clear()
         if self.listed:
@@ -268,7 +260,7 @@ class Member:
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self.probe_s = now_s + self._pause_s
         self._log_silence(now_s, again=False)
-        if self.state is not MemberState.REBOOTING:  # a servo that reboots does not answer
+        if self.state != "rebooting":  # a servo that reboots does not answer
             self.gone()
 
     def hurry(self, now_s: float) -> None:
@@ -277,12 +269,12 @@ class Member:
 
     def gone(self) -> None:
         """Note that it does not answer, and not because of one lost packet; or that the port is gone."""
-        if self.state in _DRIVEN | _COMING | {MemberState.REJOINING}:
+        if self.state in _DRIVEN | _COMING | {"rejoining"}:
             self._drop_job()
-            self.state = MemberState.SILENT
+            self.state = "silent"
             self.torque_seen = None
             self._trouble = self._trouble or NO_ANSWER
-        elif self.state in _LIMP or self.state is MemberState.FAULTY:
+        elif self.state in _LIMP or self.state == "faulty":
             self.torque_seen = None  # it may have changed
 
     def back(self, now_s: float) -> None:
@@ -290,7 +282,7 @@ class Member:
         if self._logged_silent:
             self._logged_silent = False
             self._notices.add(self.servo, "answers again", logging.INFO)
-        if self.state is MemberState.SILENT:
+        if self.state == "silent":
             self._return(now_s)
         elif self._trouble == NO_ANSWER:
             self._trouble = None
@@ -323,7 +315,7 @@ class Member:
                 log.info("%s reports %s, which this head's configuration allows", self.servo, name)
         new = set(names) - set(self._named)
         # One that stays out keeps its reason, also a past one.
-        if names or self.state not in _LIMP | {MemberState.FAULTY}:
+        if names or self.state not in _LIMP | {"faulty"}:
             self._named = names
         if new:
             self._report(", ".join(names))
@@ -351,7 +343,7 @@ class Member:
                 self._blame(TORQUE_ON)
             elif self._trouble == TORQUE_ON:
                 self._trouble = None
-        elif self.state is MemberState.SILENT and not on and self.identified:
+        elif self.state == "silent" and not on and self.identified:
             self._report(TORQUE_LOST)  # it was away because it restarted
         elif self.state in POWERED and not on:
             if self._named:
@@ -369,7 +361,7 @@ class Member:
 
     def distrust(self, fault: str, now_s: float) -> None:
         """Start it up as if it had been away: something may have happened unseen."""
-        if self.state in _DRIVEN | {MemberState.REJOINING}:
+        if self.state in _DRIVEN | {"rejoining"}:
             self._trouble = fault
             self._return(now_s)
 
@@ -377,7 +369,7 @@ class Member:
 
     def due(self, now_s: float) -> bool:
         """Return whether its job may take a step; a limp one whose time is over begins one."""
-        if self.state is MemberState.LIMP and now_s >= self._back_s and self.torque_seen is False:
+        if self.state == "limp" and now_s >= self._back_s and self.torque_seen is False:
             self._back_s = math.inf
             self._try_again(now_s, now_s)
         return self.job is not None and self.job_due_s <= now_s
@@ -390,7 +382,7 @@ class Member:
     @property
     def comes_back(self) -> bool:
         """Return whether it is away or on its way back, and was checked against the head's file in this run."""
-        return self.identified and self.state in _COMING | {MemberState.SILENT}
+        return self.identified and self.state in _COMING | {"silent"}
 
     def step(self, now_s: float) -> None:
         """Take one exchange of its job. Raises BusError if the port fails."""
@@ -415,12 +407,12 @@ class Member:
         """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
         if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
-        self.state = MemberState.ONLINE
+        self.state = "online"
         return True
 
     def _holds(self, ticks: int) -> None:
         recalled, bits, named = self.recalled, self._bits, self._named
-        self._reset(MemberState.REJOINING)
+        self._reset("rejoining")
         self.identified = self.torque_seen = self.rejoined = True
         self.stands_ticks = ticks
         if recalled:
@@ -432,11 +424,11 @@ class Member:
 
     def _act(self, policy: str, now_s: float, limp_s: float) -> None:
         if policy == "hold":
-            self.state = MemberState.FAULTY
+            self.state = "faulty"
         elif policy == "reduce":
             # One that holds got no goals: the next may be far from where it stands.
-            if self.state is not MemberState.FAULTY:
-                self.state = MemberState.REDUCED
+            if self.state != "faulty":
+                self.state = "reduced"
         elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)
         else:
@@ -444,7 +436,7 @@ class Member:
 
     def _release(self, back_s: float) -> None:
         self._drop_job()
-        self.state, self._back_s, self.off_written = MemberState.LIMP, back_s, False
+        self.state, self._back_s, self.off_written = "limp", back_s, False
         if self.torque_seen:
             self.torque_seen = None
 
@@ -457,12 +449,12 @@ class Member:
             return
         self._notices.add(self.servo, f"came back {len(recent)} times in {FORGET_S:g} s, and is left alone")
         self._release(math.inf)
-        self.state = MemberState.GIVEN_UP
+        self.state = "given up"
         self._trouble = GIVEN_UP
 
     def _return(self, due_s: float, reboot: bool = False) -> None:
         self._drop_job()
-        self.state = MemberState.REBOOTING if reboot else MemberState.RETURNING
+        self.state = "rebooting" if reboot else "returning"
         self.torque_seen = None
         self.job, self.job_due_s = self.startup.bring_back(reboot), due_s
         self.stands_s = None

@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import Final
 
 from sfms_robot.servo.chain.link import RegisterLink
-from sfms_robot.servo.chain.member import ONLINE, REDUCED, Member
+from sfms_robot.servo.chain.member import Member
 from sfms_robot.servo.chain.poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Block
 from sfms_robot.servo.policy import torque_register
@@ -75,11 +75,11 @@ class Settings:
 
         Raises BusError if the port fails.
         """
-        troubled = [member for member in self._members.values() if member.state is not ONLINE]
+        troubled = [member for member in self._members.values() if member.state != "online"]
         released = [member for member in troubled if member.to_release]
         self._pending[self._torque.name] = {member.id: (self._torque, 0) for member in released}
         for member in troubled:
-            if member.state is REDUCED:
+            if member.state == "reduced":
                 self._reduce(member)
         for name, requests in self._pending.items():
             self._write(link, poll, name, requests, now_s)
