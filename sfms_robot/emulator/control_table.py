@@ -40,16 +40,17 @@ _SINGLE_TURN_OFFSET: Final = 1024  # homing offset (20) is held to +-90 degrees 
 _MX_MULTI_TURN: Final = 4095
 _FULL_PWM: Final = 885.0  # goal PWM (100): 100 %
 _FULL_DUTY: Final = 1000.0  # Feetech, register 44 in PWM mode: 100 %
-_FULL_TORQUE: Final = 1000.0  # torque limit: 0.1 %, although it goes to 1023 in Dynamixels
+_FULL_TORQUE: Final = 1000  # torque limit: 0.1 %, although it goes to 1023 in Dynamixels
 _FULL_AX_SPEED: Final = 1023.0
 _SCS_SIGN: Final = 1 << 10
 _COUNTS_TURNS: Final = 0x10  # STS phase (18), bit 4: positions beyond one turn are reported
-_ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # seconds, seconds squared; all other units are degrees
 
 
 class ControlTable:
-    """Values by register name, and raw bytes by address. Reading an absent register gives its default.
+    """Values by name of a register, or of the role that it plays in its family, and raw bytes by address.
+
+    Reading an absent register gives its default.
 
     An indirect data register is a window: byte k of the block shows the byte whose address stands in
     `indirect_address_k`. The firmware map says where the block lies (X330 servos up to firmware 52 have it elsewhere).
@@ -61,9 +62,10 @@ class ControlTable:
     def __init__(self, table: Table, size: int | None = None) -> None:
         self.table = table
         self.raw = bytearray(size or table.size)
-        self._ranges = {name: _value_range(field) for name, field in table.fields.items()}
-        self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
         fields = table.fields
+        self._named = {role: field for role in table.roles if (field := table.role(role))} | dict(fields)
+        self._ranges = {name: _value_range(field) for name, field in self._named.items()}
+        self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
         self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
             field.address: fields[word].address
             for name, field in fields.items()
@@ -73,12 +75,12 @@ class ControlTable:
         self._last_window = max(self._windows, default=-1)
 
     def get(self, name: str, default: int = 0) -> int:
-        field = self.table.fields.get(name)
+        field = self._named.get(name)
         return default if field is None else field.from_bytes(self.raw[field.address : field.address + field.size])
 
     def put(self, name: str, value: int) -> None:
         """Set a register to the nearest value that it can hold; do nothing where the model has no such register."""
-        field = self.table.fields.get(name)
+        field = self._named.get(name)
         if field is not None:
             low, high = self._ranges[name]
             self.raw[field.address : field.address + field.size] = field.to_bytes(min(max(value, low), high))
@@ -112,9 +114,8 @@ class ControlTable:
 
 def _value_range(field: Field) -> tuple[int, int]:
     """Return the smallest and the largest value that fit the register's size and sign rule."""
-    if field.signed.startswith("sign_bit_"):
-        high = (1 << int(field.signed.removeprefix("sign_bit_"))) - 1
-        return -high, high
+    if bit := field.sign_bit:
+        return 1 - bit, bit - 1
     bits = 12 if field.signed == "offset_2048" else 8 * field.size
     low = -(1 << bits - 1) if field.signed != "no" else 0
     return low, low + (1 << bits) - 1
@@ -229,8 +230,7 @@ def motor_command(
         stepped: Where the steps of step mode lead, ticks of the shaft.
     """
     table, get = memory.table, memory.get
-    top, strength = table.top_speed_ticks_s, table.role("torque_limit")
-    torque = 1.0 if strength is None else min(1.0, get(strength.name) / _FULL_TORQUE)
+    top, torque = table.top_speed_ticks_s, min(1.0, get("torque_limit", _FULL_TORQUE) / _FULL_TORQUE)
     if not torque or mode is Mode.NONE:
         return None
     current = get("goal_current") / max(1, get("current_limit", 1))
@@ -263,8 +263,7 @@ def _profile(memory: ControlTable, distance: float) -> tuple[float, float]:
             return 0.0, 0.0
         speed = distance / (whole_ms / 1e3 - ramp_s)
         return speed, speed / ramp_s if ramp_s else 0.0
-    acceleration = next((table[name] for name in _ACCELERATIONS if name in table.fields), None)
-    return abs(_rate(memory, table.role("moving_speed"))), _rate(memory, acceleration)
+    return abs(_rate(memory, table.role("moving_speed"))), _rate(memory, table.acceleration)
 
 
 def _duty(memory: ControlTable) -> float:

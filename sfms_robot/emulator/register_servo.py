@@ -97,11 +97,11 @@ class RegisterServo(ABC):
         self._speed_per_tick = per_turn / (table.ticks_per_revolution * (speed.scale if speed else 1.0))
         current = table.role("present_current")
         self._current_scale = current.scale or 1.0 if current else 1.0
-        named = table.faults if table.protocol == 2 else table.status_faults
-        self._bits = USUAL_BITS | {name: 1 << bit for bit, text in named.items() for name in USUAL_BITS if name in text}
+        named = table.servo_faults.items()
+        self._bits = USUAL_BITS | {name: 1 << bit for bit, text in named for name in USUAL_BITS if name in text}
         self._reset_registers()
-        self._put_role("id", what.id)
-        self._put_role("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == what.baud))
+        self._put("id", what.id)
+        self._put("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == what.baud))
         for name, value in what.registers.items():
             self._put(name, value)
         self._stored = bytes(self._memory.raw)
@@ -227,7 +227,7 @@ class RegisterServo(ABC):
         self.advance(now_s)
         self.plant.position %= self.table.ticks_per_revolution
         self.plant.reference = self.plant.position
-        self._put("goal_position", round(self.frame.reported(self.plant.position)))
+        self._stay()
         self._settings()
 
     def feed_watchdog(self, now_s: float) -> None:
@@ -262,7 +262,7 @@ class RegisterServo(ABC):
         self.supply_v = volts
         was_powered, self._powered = self._powered, volts >= _BROWN_OUT * self._volts("min_voltage_limit")
         if not self._powered:
-            self._put_role("torque_enable", 0)
+            self._put("torque_enable", 0)
             self._settings()
         elif not was_powered:
             self.power_cycle(now_s)
@@ -294,7 +294,7 @@ class RegisterServo(ABC):
             self._put("bus_watchdog", -1)
             self._tripped = True
             if self.table.watchdog != "flags_only":  # firmware from 53 on stops where it is
-                self._put("goal_position", round(self.frame.reported(self.plant.position)))
+                self._stay()
                 self._put("goal_velocity", 0)
             self._settings()
         self._advance(now_s)
@@ -324,14 +324,21 @@ class RegisterServo(ABC):
         """Return the error of a write to a register, 0 where it is taken. `value`: None for a part of the register."""
 
     def _apply(self, wanted: Mapping[str, int]) -> None:
-        locked = "lock" in self.table.fields and self._get("lock") == 1
+        locked = self._get("lock") == 1
         for name, value in wanted.items():
-            self._store(name, value, locked)
+            field = self.table[name]
+            if locked and not self._is_feetech and (field.eeprom or name == "lock"):
+                continue  # a Dynamixel that is locked stays locked until its supply is switched off
+            if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:  # clipped, not refused
+                value = min(max(value, self._lowest), self._highest) if self._lowest < self._highest else value
+            self._put(name, value)
+            if field.eeprom and not locked:
+                self._keep(field)
         torque = self.table.role("torque_enable")
         if torque is not None and torque.name in wanted:
             self._torque_written(wanted[torque.name], locked)
         elif "goal_position" in wanted and self._goal_enables and not self.torque and not self._shut_down():
-            self._put_role("torque_enable", 1)
+            self._put("torque_enable", 1)
         elif not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
             if self.drive is not None and self._mode in POSITIONING:
                 goal = self.frame.shaft(float(self._get("goal_position")))
@@ -341,15 +348,9 @@ class RegisterServo(ABC):
         if wanted.keys() & {"min_voltage_limit", "max_voltage_limit"}:
             self._watch_supply()
 
-    def _store(self, name: str, value: int, locked: bool) -> None:
-        field = self.table[name]
-        if locked and not self._is_feetech and (field.eeprom or name == "lock"):
-            return  # a Dynamixel that is locked stays locked until its supply is switched off
-        if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:  # clipped, not refused
-            value = min(max(value, self._lowest), self._highest) if self._lowest < self._highest else value
-        self._put(name, value)
-        if field.eeprom and not locked:
-            self._keep(field)
+    def _stay(self) -> None:
+        """Set the goal to where it stands."""
+        self._put("goal_position", round(self.frame.reported(self.plant.position)))
 
     def _keep(self, field: Field) -> None:
         """Keep a register over the next power-up."""
@@ -376,7 +377,7 @@ class RegisterServo(ABC):
     def _fail(self, bits: int) -> None:
         self.fault_status |= bits
         if self._shut_down():
-            self._put_role("torque_enable", 0)
+            self._put("torque_enable", 0)
         self._settings()
 
     def _watch_motor(self) -> None:
@@ -396,9 +397,9 @@ class RegisterServo(ABC):
         for field in self.table.fields.values():
             if not field.eeprom:
                 self._put(field.name, field.initial)
-        self._put_role("torque_enable", 0)
+        self._put("torque_enable", 0)
         self._put("goal_position", self.table.center_ticks)  # the least helpful goal: torque would be a jump
-        self._put_role("torque_limit", self._get("max_torque") or _FULL_TORQUE)
+        self._put("torque_limit", self._get("max_torque") or _FULL_TORQUE)
         self._settings()
         self._watch_supply()
 
@@ -415,13 +416,13 @@ class RegisterServo(ABC):
         """Take over what the registers say now. `stepped`: as `_stepped`; None: no step was written."""
         get = self._get
         stepped = self._stepped({}) if stepped is None else stepped
-        self.id = self._role("id")
+        self.id = get("id")
         second = get("secondary_id", 255)
         self.second_id = second if second <= dxl2.MAX_ID and second != self.id else None
-        self.baud = self.table.baud_codes.get(self._role("baud_rate"))
-        self.return_delay_s = _DELAY_TICK_S * self._role("return_delay")
-        self._level = self._role("status_level", 2) + self._is_feetech  # a Feetech answers reads at level 0 too
-        self.torque = self._role("torque_enable")
+        self.baud = self.table.baud_codes.get(get("baud_rate"))
+        self.return_delay_s = _DELAY_TICK_S * get("return_delay")
+        self._level = get("status_level", 2) + self._is_feetech  # a Feetech answers reads at level 0 too
+        self.torque = get("torque_enable")
         self._watchdog, self._hottest_C = get("bus_watchdog"), get("temperature_limit")
         self._lowest, self._highest = angle_limits(self._memory)
         # Drive mode (10) of Protocol 2.0; the others always switch torque on by a goal.
@@ -435,13 +436,3 @@ class RegisterServo(ABC):
 
     def _volts(self, name: str) -> float:
         return self.table[name].to_unit(self._get(name))
-
-    def _role(self, role: str, default: int = 0) -> int:
-        """Return the value of a role's register; `default` where the model has none."""
-        field = self.table.role(role)
-        return default if field is None else self._get(field.name)
-
-    def _put_role(self, role: str, value: int) -> None:
-        field = self.table.role(role)
-        if field is not None:
-            self._put(field.name, value)

@@ -148,7 +148,7 @@ class Dynamixel2Servo(RegisterServo):
         if "operating_mode" in wanted:  # "Operating Mode (11)": a change resets gains, profile and goals
             for name in _RESET_BY_MODE:
                 self._put(name, 0)
-            self._put("goal_position", round(self.frame.reported(self.plant.position)))
+            self._stay()
             self._settings()
 
 
@@ -314,16 +314,16 @@ class Protocol1Servo(RegisterServo):
             self._put("homing_offset", one_turn - _CENTER_ON_STS)
             if not locked:
                 self._keep(self.table["homing_offset"])
-            self._put_role("torque_enable", 0)
-        elif value == 1 and self._role("torque_limit", 1):  # "Shutdown (18)": first a torque limit, then torque
+            self._put("torque_enable", 0)
+        elif value == 1 and self._get("torque_limit", 1):  # "Shutdown (18)": first a torque limit, then torque
             self.fault_status &= ~self._bits["overload"]
             if self._shut_down():
-                self._put_role("torque_enable", 0)
+                self._put("torque_enable", 0)
 
     def _fail(self, bits: int) -> None:
         super()._fail(bits)
         if self._shut_down() and not self._is_feetech:
-            self._put_role("torque_limit", 0)  # "Torque Limit (34)" is 0 after a shutdown, until a host sets it
+            self._put("torque_limit", 0)  # "Torque Limit (34)" is 0 after a shutdown, until a host sets it
 
 
 class Protocol1Chain(ServoChain[Protocol1Servo]):

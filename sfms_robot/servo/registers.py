@@ -11,9 +11,8 @@ Feetech SCS.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from sfms_robot.config import FirmwareMap
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
 ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
 ByteOrder = Literal["little", "big"]
 
+_ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _FROM_ROW = ("address", "size", "access", "area", "unit", "scale", "low", "high", "signed")
-_EMPTY: Mapping[Any, Any] = MappingProxyType({})
 
 
 class Field(NamedTuple):
@@ -49,13 +48,17 @@ class Field(NamedTuple):
     def eeprom(self) -> bool:
         return self.area == "EEPROM"
 
+    @property
+    def sign_bit(self) -> int:
+        """Return the weight of the sign bit above the magnitude; 0 for a register with another rule."""
+        return 1 << int(self.signed[9:]) if self.signed.startswith("sign_bit_") else 0
+
     def to_bytes(self, value: int) -> bytes:
         """Return the raw form. Raises OverflowError if `value` does not fit the size and sign rule of the register."""
         raw = value
         if self.signed == "offset_2048":
             raw = value + 2048
-        elif self.signed.startswith("sign_bit_"):
-            bit = 1 << int(self.signed[9:])
+        elif bit := self.sign_bit:
             if abs(value) >= bit:
                 raise OverflowError(f"{self.name} = {value} does not fit below its sign bit ({1 - bit}..{bit - 1})")
             raw = bit - value if value < 0 else value
@@ -66,8 +69,7 @@ class Field(NamedTuple):
         raw = int.from_bytes(data[: self.size], self.byte_order, signed=self.signed == "twos_complement")
         if self.signed == "offset_2048":
             return raw - 2048
-        if self.signed.startswith("sign_bit_"):
-            bit = 1 << int(self.signed[9:])
+        if bit := self.sign_bit:
             return -(raw & bit - 1) if raw & bit else raw & bit - 1
         return raw
 
@@ -105,17 +107,17 @@ class Table:
     top_speed_ticks_s: float
     baud_codes: Mapping[int, int]
     faults: Mapping[int, str]
-    family: str = "dynamixel"
-    protocol: int | None = 2
-    byte_order: ByteOrder = "little"
-    status_faults: Mapping[int, str] = field(default_factory=lambda: _EMPTY)
-    roles: Mapping[str, str | None] = field(default_factory=lambda: _EMPTY)
-    watchdog: str = "none"
-    position_mode: int | None = None
-    firmware: tuple[int, int] = (0, 255)
-    channels: int | None = None
-    pulse_us: tuple[float, float] | None = None
-    tick_us: float | None = None
+    family: str
+    protocol: int | None
+    byte_order: ByteOrder
+    status_faults: Mapping[int, str]
+    roles: Mapping[str, str | None]
+    watchdog: str
+    position_mode: int | None
+    firmware: tuple[int, int]
+    channels: int | None
+    pulse_us: tuple[float, float] | None
+    tick_us: float | None
 
     @classmethod
     def of(cls, firmware_map: FirmwareMap) -> Table:
@@ -156,6 +158,11 @@ class Table:
         return self.fields.get(name) if name is not None else None
 
     @property
+    def acceleration(self) -> Field | None:
+        """Return the register that limits the acceleration on the way to a goal; None if the model has none."""
+        return next((self.fields[name] for name in _ACCELERATIONS if name in self.fields), None)
+
+    @property
     def size(self) -> int:
         """Return the number of bytes of the whole table."""
         return max((each.address + each.size for each in self.fields.values()), default=0)
@@ -169,6 +176,11 @@ class Table:
     def span(self, names: Sequence[str]) -> tuple[int, int]:
         """Return (address, length) of the block that holds all of `names`."""
         return span_of([self.fields[name] for name in names])
+
+    @property
+    def servo_faults(self) -> Mapping[int, str]:
+        """Return bit -> fault of the servo: of its error status (Protocol 2.0), or of every status packet."""
+        return self.faults if self.protocol == 2 else self.status_faults
 
     def fault_names(self, status: int) -> str:
         """Return the faults in a value of role `error_status`, in words; empty for 0."""

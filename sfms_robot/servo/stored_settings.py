@@ -222,8 +222,7 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
     name = "unloading_condition" if table.family == "feetech" else "shutdown"
     if name not in values:
         return
-    faults = table.faults if table.protocol == 2 else table.status_faults
-    now, factory = values[name], table[name].initial
+    faults, now, factory = table.servo_faults, values[name], table[name].initial
     protecting = sum(1 << bit for bit, text in faults.items() if text in _PROTECTIONS and factory >> bit & 1)
     allowed = sum(1 << bit for bit, text in faults.items() if text in needs.allowed_faults and factory >> bit & 1)
     wanted = (now | protecting) & ~(allowed & ~protecting)

@@ -218,9 +218,8 @@ def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) ->
     raw: NDArray[Any] = np.ndarray(len(rows) // length, raw_type, rows, field.address - start, strides=(length,))
     if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)
         return np.asarray(raw.astype(np.int64) - 2048)
-    if field.signed.startswith("sign_bit_"):
-        # A bit above the magnitude is the sign (AX speed and load, Feetech).
-        wide, bit = raw.astype(np.int64), 1 << int(field.signed[9:])
+    if bit := field.sign_bit:  # AX speed and load, Feetech
+        wide = raw.astype(np.int64)
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)
     return raw
