@@ -30,14 +30,14 @@ def startups_on(port, servos, conversion):
     link, kind = link_on(port, table), Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
     startups = [kind(servo, needs, {}) for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)]
     for each in startups:
-        each.attach(link)
+        each.link = link
     return startups, lambda: start_up("face", link, startups, port.baud)
 
 
 def switched_on(startup):
     """Torque on, as `enable` does it; the position held."""
-    with startup._link.patient(PATIENCE_S, TRIES):
-        return finish(startup.torque_on(), startup._link.wait)
+    with startup.link.patient(PATIENCE_S, TRIES):
+        return finish(startup.torque_on(), startup.link.wait)
 
 
 class Straight:

@@ -158,7 +158,7 @@ def test_rejoining_to_online_by_a_goal_near_to_where_it_stands(member):
     silent(member)
     member.back(1.0)
     run(member, 1.0)
-    assert member.rejoined and not member.accepts(STANDS + 50) and not member.gets_goals
+    assert member.state == REJOINING and not member.accepts(STANDS + 50) and not member.gets_goals
     assert member.accepts(STANDS + 5)
     assert member.state == ONLINE and member.gets_goals
 

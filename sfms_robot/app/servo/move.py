@@ -87,7 +87,7 @@ def _startup(seen: FoundServo) -> Startup:
     servo = BusServo(joint="servo", id=seen.id, table=table, min_rad=0.0, max_rad=0.0)
     startup = kind(servo, JointNeeds(0, 0), {})
     wire.link.tries = TRIES
-    startup.attach(wire.link)
+    startup.link = wire.link
     return startup
 
 

@@ -91,6 +91,7 @@ class ChainBus(WireBus[RegisterLink]):
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
         self._ids = np.array([servo.id for servo in servos])
         self._telemetry = Telemetry(name, *self.maps, [servo.table for servo in servos], conversion)
+        self.capabilities = {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
         self._faults: dict[str, None] = {}  # reported so far, for the statistics
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._startups = [
@@ -102,15 +103,15 @@ class ChainBus(WireBus[RegisterLink]):
             Member(i, each, faults or Faults(), self._faults, self._notices) for i, each in enumerate(self._startups)
         ]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
-        self._settings = Settings(self._members, self._telemetry.torque)
+        self._settings = Settings(self._members, self._telemetry.torque, self._poll)
         self._enabled = False
         self._places: Indices = _NO_PLACES  # members that get goals
         self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
-        self._arrived: list[Member] = []  # members that came to hold a position in this poll
+        self._arrived: set[int] = set()  # indices of members that came to hold a position in this poll
         self._stamp_s = 0.0
         self._peak_mA = 0.0
         self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]
-        self._release_packet = b""
+        self._release_packet = self._packet_off(self._released_ids)
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
         self._asked: deque[tuple[int, bool]] = deque()  # released, or resumed (True); not yet passed to members
         self._sending = RLock()
@@ -123,12 +124,13 @@ class ChainBus(WireBus[RegisterLink]):
         self._wrote_s = math.inf
         self._fed: Indices | None = None  # places whose watchdogs are armed
 
-    @property
-    def capabilities(self) -> Mapping[str, frozenset[str]]:
-        return {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
-
     def _open(self) -> RegisterLink:
-        return self.link(self._open_port(), self._baud, self._read_deadline_s)
+        """Open the port, and pass the link over it to all that make requests."""
+        link = self._poll.link = self.link(self._open_port(), self._baud, self._read_deadline_s)
+        for startup in self._startups:
+            startup.link = link
+        self._now_s = link.port.now_s
+        return link
 
     # --- start --------------------------------------------------------------------------------------------------
 
@@ -141,21 +143,17 @@ class ChainBus(WireBus[RegisterLink]):
         link = self._open()
         try:
             self._warnings.clear()
-            for startup in self._startups:
-                startup.attach(link)
             bits = start_up(self.name, link, self._startups, self._baud)
             present = [self._servos[index].id for index in bits]
             self._read_deadline_s = link.adapt(present[0], *self._telemetry.position)
             self._poll.read_deadline_s = self._read_deadline_s
             self._telemetry.forget()
-            self._release_packet = self._packet_off(self._released_ids)
-            self._now_s = link.port.now_s
             for member in self._members:
                 member.connected(member.index in bits)
-            self._poll.find_reads(link, present, self._startups[0].table.byte_order == "little")
+            self._poll.find_reads(present, self._startups[0].table.byte_order == "little")
             self._wrote_s = math.inf
             self._stamp_s = link.port.now_s()
-            self._poll.measure(link, self._stamp_s)
+            self._poll.measure(self._stamp_s)
             for index, status in bits.items():
                 self._members[index].take_bits(status, self._telemetry.measured(index), self._stamp_s)
         except BaseException:
@@ -324,7 +322,7 @@ class ChainBus(WireBus[RegisterLink]):
         for _ in range(len(ids) + _ROUNDS):
             if not rest or not link.affords(link.framing.reads(1, field.size)):
                 break
-            got = self._attempt(partial(self._poll.read_some, link, "stop", where, rest))
+            got = self._attempt(partial(self._poll.read_some, "stop", where, rest))
             if got is None:
                 break  # the port is gone
             rest = [servo for servo in rest if servo not in got or got[servo].data != off]
@@ -388,7 +386,7 @@ class ChainBus(WireBus[RegisterLink]):
         else:
             pairs = zip(ids.tolist(), ticks.tolist(), strict=True)
             data = b"".join(bytes([servo]) + goal.to_bytes(tick) for servo, tick in pairs)
-        link.sync_write_rows(goal.address, goal.size, data)
+        link.send(link.sync_packet(goal.address, goal.size, data))
         if self._watchdog and places is not self._fed:
             self._fed = places
             self._settings.arm(ids.tolist(), self._watchdog)
@@ -429,8 +427,6 @@ class ChainBus(WireBus[RegisterLink]):
         Blocks for `StatusPoll.budget_s` at most. Raises BusError if no servo has answered for so long that the bus has
         failed.
         """
-        for member in self._arrived:
-            member.rejoined = False
         self._arrived.clear()
         return super().poll(now_s)
 
@@ -442,11 +438,11 @@ class ChainBus(WireBus[RegisterLink]):
         if self._asked:
             self._pass_on()
         with link.within(self._poll.budget_s, self._read_deadline_s + TURN_S):
-            answered = self._poll.step(link, stamp_s)
-            self._settings.command(link, self._poll, stamp_s)
+            answered = self._poll.step(stamp_s)
+            self._settings.command(stamp_s)
             self._bring_back(link, stamp_s)
-            self._settings.compare(link, self._poll, stamp_s)
-            self._poll.blocks(link, stamp_s)
+            self._settings.compare(stamp_s)
+            self._poll.blocks(stamp_s)
         self._notices.log(stamp_s)
         self._peak_mA = max(self._peak_mA, self._telemetry.supply_mA())
         self._update_places()
@@ -455,11 +451,10 @@ class ChainBus(WireBus[RegisterLink]):
     def _readings(self, now_s: float) -> Mapping[str, Reading]:
         """Return the readings; ages are by the port's clock, whatever the origin of `now_s`."""
         stamp_s = self._stamp_s if self._link is not None else self._now_s()
-        rejoined = {member.index for member in self._arrived}
-        for index in rejoined:
+        for index in self._arrived:
             self._hold(index)
         faults = [member.fault for member in self._members]
-        return self._telemetry.readings(self.joints, faults, rejoined, stamp_s)
+        return self._telemetry.readings(self.joints, faults, self._arrived, stamp_s)
 
     def _bring_back(self, link: RegisterLink, now_s: float) -> None:
         """Take a poll's share of the jobs of members on their way back; a silence ends it."""
@@ -470,10 +465,9 @@ class ChainBus(WireBus[RegisterLink]):
                     return
                 left -= 1
                 self._powered |= {member.id}
-                member.step(now_s)
-                if member.rejoined:
+                if member.step(now_s):
                     self._counts["reconnects"] += not member.recalled
-                    self._arrived.append(member)
+                    self._arrived.add(member.index)
                     self._forget(member)
                     self._telemetry.ticks[member.index] = member.stands_ticks
                     self._telemetry.seen_s[member.index] = member.stands_s
@@ -489,7 +483,5 @@ class ChainBus(WireBus[RegisterLink]):
 
     def _returned(self, link: RegisterLink, now_s: float) -> None:
         """Ask every member alone first."""
-        self._now_s = link.port.now_s
         for member in self._members:
-            member.startup.attach(link)
             member.suspect(link.port.now_s(), pause_s=0.0)

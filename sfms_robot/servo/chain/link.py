@@ -114,7 +114,7 @@ class RegisterLink(ABC):
     @staticmethod
     @abstractmethod
     def sync_packet(address: int, length: int, rows: bytes) -> bytes:
-        """Return the packet of `sync_write_rows`."""
+        """Return the packet of a write to several servos; `rows` are the id and the `length` bytes of each."""
 
     @abstractmethod
     def refusal(self, answer: Answer) -> str:
@@ -136,13 +136,9 @@ class RegisterLink(ABC):
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write to several servos in one packet; all values have one length. Nothing answers."""
-        self._send(self.sync_write_packet(address, values))
+        self.send(self.sync_write_packet(address, values))
 
-    def sync_write_rows(self, address: int, length: int, rows: bytes) -> None:
-        """Do as `sync_write`; `rows` are the id and the `length` bytes of each servo."""
-        self._send(self.sync_packet(address, length, rows))
-
-    def _send(self, packet: bytes) -> None:
+    def send(self, packet: bytes) -> None:
         """Send a packet; drop what came before it."""
         self.port.discard_input()
         self.port.write(packet)
@@ -295,20 +291,20 @@ def verified_write(
     Raises Silent if no read back was answered, ServoError for a value that does not fit, is refused or not taken,
     BusError if the port is gone.
     """
-    name = about or f"id {servo_id}"
+    write = partial(_write, link, servo_id, about or f"id {servo_id}", tries)
     if lock is None or not field.eeprom:  # RAM, or an EEPROM without a lock (Dynamixel 2.0)
-        yield from _write(link, servo_id, field, value, tries, name)
+        yield from write(field, value)
         return
-    yield from _write(link, servo_id, lock, 0, tries, name)
+    yield from write(lock, 0)
     try:
-        yield from _write(link, servo_id, field, value, tries, name)
+        yield from write(field, value)
     except BaseException:  # also if the caller closes this half way
         link.write(servo_id, lock.address, lock.to_bytes(1))
         raise
-    yield from _write(link, servo_id, lock, 1, tries, name)
+    yield from write(lock, 1)
 
 
-def _write(link: RegisterLink, servo_id: int, field: Field, value: int, tries: int, name: str) -> Steps[None]:
+def _write(link: RegisterLink, servo_id: int, name: str, tries: int, field: Field, value: int) -> Steps[None]:
     try:
         data = field.to_bytes(value)
     except OverflowError:

@@ -116,7 +116,6 @@ class Member:
         identified: it has been checked against the head's file.
         torque_seen: what it last reported; None if that is not known.
         job: its way back, in steps of one exchange; `job_due_s` is when the next is due.
-        rejoined: it came to hold a position in this poll.
         recalled: it was called back and had not been away.
         stands_ticks: position while it is rejoining, reported at some time since `stands_s`.
         off_written: torque off has been sent since it was wanted.
@@ -136,7 +135,7 @@ class Member:
         self.torque_seen: bool | None = None
         self.job: Steps[int] | None = None
         self.job_due_s = 0.0
-        self.rejoined = self.recalled = False
+        self.recalled = False
         self.stands_ticks = 0
         self.stands_s: float | None = None
         self.off_written = False
@@ -304,8 +303,7 @@ class Member:
         if not bits and not self._bits:
             return
         self._bits = bits
-        table = self.startup.table
-        texts = table.faults if table.protocol == 2 else table.status_faults
+        texts = self.startup.table.servo_faults
         names = []
         for name in (texts.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1):
             if counts(name, self._faults, measured):
@@ -384,10 +382,10 @@ class Member:
         """Return whether it is away or on its way back, and was checked against the head's file in this run."""
         return self.identified and self.state in _COMING | {"silent"}
 
-    def step(self, now_s: float) -> None:
-        """Take one exchange of its job. Raises BusError if the port fails."""
+    def step(self, now_s: float) -> bool:
+        """Take one exchange of its job; return whether it now holds a position. Raises BusError if the port fails."""
         if self.job is None:
-            return
+            return False
         if self.stands_s is None:
             self.stands_s = now_s
         try:
@@ -395,6 +393,7 @@ class Member:
         except StopIteration as end:
             self.job = None
             self._holds(end.value)
+            return True
         except Silent:
             self.job = None
             self._return(now_s + RETRY_S)
@@ -402,6 +401,7 @@ class Member:
             self.job = None
             self._report(str(error))
             self._try_again(now_s + REFUSED_S, now_s)
+        return False
 
     def accepts(self, goal_ticks: int) -> bool:
         """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
@@ -413,7 +413,7 @@ class Member:
     def _holds(self, ticks: int) -> None:
         recalled, bits, named = self.recalled, self._bits, self._named
         self._reset("rejoining")
-        self.identified = self.torque_seen = self.rejoined = True
+        self.identified = self.torque_seen = True
         self.stands_ticks = ticks
         if recalled:
             self.recalled, self._bits, self._named = True, bits, named

@@ -83,10 +83,13 @@ class StatusPoll:
         framing: bytes of the packets on this wire.
 
     Attributes:
+        link: to the wire; set by the bus when it opens the port.
         read_deadline_s: time without a byte after which a servo counts as silent on this wire.
         budget_s: time that a poll may take, waiting for answers included; what is granted besides is not.
         quiet_polls: polls in a row in which no servo answered.
     """
+
+    link: RegisterLink
 
     def __init__(
         self,
@@ -131,21 +134,21 @@ class StatusPoll:
         self._answered: list[int] = []  # ids that answered in this poll, and may be asked for more
         self._plan()
 
-    def find_reads(self, link: RegisterLink, present: list[int], group: bool) -> None:
+    def find_reads(self, present: list[int], group: bool) -> None:
         """Find out how the servos that answered, `present`, can be read together, and begin with this connection.
 
         `group`: one request for several is worth a try. All servos with fast reads answer it.
         """
-        if link.has_fast_read:
+        if self.link.has_fast_read:
             wanted, position = self._config.fast_read, self._telemetry.position
             fast = wanted == "on"
             if wanted == "auto":
-                fast = len(link.read_many(*position, present, fast=True)) == len(present)
+                fast = len(self.link.read_many(*position, present, fast=True)) == len(present)
             self.restart(grouped=True, fast=fast, proven=wanted == "auto")
             return
         if group:
-            with link.patient(_GROUP_TRIAL_S):
-                group = len(link.read_many(*self._telemetry.block, present)) == len(present)
+            with self.link.patient(_GROUP_TRIAL_S):
+                group = len(self.link.read_many(*self._telemetry.block, present)) == len(present)
             if not group:
                 log.info("bus %r: not every servo answers a request for several: they are read one by one", self._bus)
         self.restart(group)
@@ -177,17 +180,17 @@ class StatusPoll:
         """Return the bytes of reading `length` bytes of each, by one request if the wire has one."""
         return self._framing.reads(servos, length, self._way)
 
-    def measure(self, link: RegisterLink, now_s: float) -> None:
+    def measure(self, now_s: float) -> None:
         """Read the full status block of each listed servo once, without updating miss counters."""
         where = self._telemetry.block
-        self._take(where, self.read_some(link, "blocks", where, self._listed()), now_s)
+        self._take(where, self.read_some("blocks", where, self._listed()), now_s)
 
-    def step(self, link: RegisterLink, now_s: float) -> bool:
+    def step(self, now_s: float) -> bool:
         """Read all listed servos, and probe others; return whether any answered. Raises BusError if the port fails."""
         telemetry, listed = self._telemetry, self._listed()
         whole = not self._grouped or self._blocks >= len(self._ids)
         where = telemetry.block if whole else telemetry.position
-        outcome = self._read_all(link, where, listed) if self._grouped else self._read_in_turn(link, listed)
+        outcome = self._read_all(where, listed) if self._grouped else self._read_in_turn(listed)
         answers = outcome.answers
         self._counts["errors"] += len(outcome.gaps) + len(outcome.missed)
         for servo in self._missing & answers.keys():
@@ -195,26 +198,26 @@ class StatusPoll:
         self._missing -= answers.keys()
         fresh = self._take(where, answers, now_s)
         self._suspect(outcome, now_s)
-        self._look(link, list(answers), now_s)
-        self._look_at_alerts(link, fresh, now_s)
+        self._look(list(answers), now_s)
+        self._look_at_alerts(fresh, now_s)
         self._answered = [] if whole else list(answers)
-        return self._probe(link, now_s) or bool(answers)
+        return self._probe(now_s) or bool(answers)
 
-    def blocks(self, link: RegisterLink, now_s: float) -> None:
+    def blocks(self, now_s: float) -> None:
         """Read the full block of some servos in what is left of the poll, if it has no time for all."""
         where = self._telemetry.block
-        count = self.fitting(link, "blocks", where[1], self._blocks) if self._answered else 0
+        count = self.fitting("blocks", where[1], self._blocks) if self._answered else 0
         if count:
             chosen = self._rotation.take(self._answered, count)
-            fresh = self._take(where, self.read_some(link, "blocks", where, chosen), now_s)
-            self._look_at_alerts(link, fresh, now_s)
+            fresh = self._take(where, self.read_some("blocks", where, chosen), now_s)
+            self._look_at_alerts(fresh, now_s)
 
     # --- requests -----------------------------------------------------------------------------------------------
 
     def _listed(self) -> list[int]:
         return [member.id for member in self._members if member.listed]
 
-    def fitting(self, link: RegisterLink, purpose: str, length: int, most: int) -> int:
+    def fitting(self, purpose: str, length: int, most: int) -> int:
         """Return how many servos can be asked for `length` bytes in what is left of the poll, `most` at most.
 
         One if the purpose has waited for too long.
@@ -222,29 +225,29 @@ class StatusPoll:
         if most <= 0:
             return 0
         if not self._grouped:
-            return int(link.grants(purpose, self._bytes(1, length), alone=True))
-        while most > 1 and not link.affords(self._bytes(most, length)):
+            return int(self.link.grants(purpose, self._bytes(1, length), alone=True))
+        while most > 1 and not self.link.affords(self._bytes(most, length)):
             most -= 1
-        return most if link.grants(purpose, self._bytes(most, length)) else 0
+        return most if self.link.grants(purpose, self._bytes(most, length)) else 0
 
-    def read_some(self, link: RegisterLink, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
+    def read_some(self, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
         """Return answers of as many of `ids` as there is time for, by one request if the wire has one."""
         if self._grouped:
-            ids = ids[: self.fitting(link, purpose, where[1], len(ids))]
+            ids = ids[: self.fitting(purpose, where[1], len(ids))]
             if not ids:
                 return {}
             self._counts["reads"] += 1
-            return link.read_many(*where, ids, self._fast and len(ids) > 1 and where == self._telemetry.block)
+            return self.link.read_many(*where, ids, self._fast and len(ids) > 1 and where == self._telemetry.block)
         answers: dict[int, Answer] = {}
         for servo in ids:
-            if not link.grants(purpose, self._bytes(1, where[1]), alone=True):
+            if not self.link.grants(purpose, self._bytes(1, where[1]), alone=True):
                 break
             self._counts["reads"] += 1
-            if (answer := link.read(servo, *where)) is not None:
+            if (answer := self.link.read(servo, *where)) is not None:
                 answers[servo] = answer
         return answers
 
-    def _read_all(self, link: RegisterLink, where: Block, ids: Sequence[int]) -> PollOutcome:
+    def _read_all(self, where: Block, ids: Sequence[int]) -> PollOutcome:
         """Read all by one request, and those behind a silent one by a second: see the table of the module."""
         out = PollOutcome()
         # Behind a dead servo in front all are silent: after a quiet poll another servo is asked first.
@@ -254,14 +257,14 @@ class StatusPoll:
             # A wire that was quiet in the last poll too is asked once: most likely all are gone.
             if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
                 break
-            if attempt > 0 and not link.affords(self._bytes(len(rest), where[1])):
+            if attempt > 0 and not self.link.affords(self._bytes(len(rest), where[1])):
                 break
             self._counts["retries"] += attempt > 0
             self._counts["reads"] += 1
             fast = self._fast and attempt == 0 and len(rest) > 1
-            got = link.read_many(*where, rest, fast)
+            got = self.link.read_many(*where, rest, fast)
             out.answers.update(got)
-            out.judged |= link.judged
+            out.judged |= self.link.judged
             if fast and not got:
                 if self._fast_proven:  # the first servo is the likely cause: one silence in a poll is enough
                     out.missed, rest = rest[:1], rest[1:]
@@ -275,7 +278,7 @@ class StatusPoll:
                 self._fast_proven |= len(got) == len(rest)
             last = max((i for i, servo in enumerate(rest) if servo in got), default=-1)
             out.missed += [servo for servo in rest[: last + 1] if servo not in got]
-            if link.judged:
+            if self.link.judged:
                 out.gaps += rest[last + 1 : last + 2]
             rest = rest[last + 2 :]
         if not out.answers:
@@ -290,19 +293,19 @@ class StatusPoll:
             self._plan()
             log.warning("bus %r: fast sync read is not answered; plain sync read from now on", self._bus)
 
-    def _read_in_turn(self, link: RegisterLink, ids: Sequence[int]) -> PollOutcome:
+    def _read_in_turn(self, ids: Sequence[int]) -> PollOutcome:
         """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
         out, where = PollOutcome(), self._telemetry.block
         place = {servo: i for i, servo in enumerate(self._ids)}
         order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
         for number, servo in enumerate(order[: self._many]):
-            if number and not link.affords(self._bytes(1, where[1]), alone=True):
+            if number and not self.link.affords(self._bytes(1, where[1]), alone=True):
                 break
             self._turn = (place[servo] + 1) % len(place)
             self._counts["reads"] += 1
-            if (answer := link.read(servo, *where)) is not None:
+            if (answer := self.link.read(servo, *where)) is not None:
                 out.answers[servo] = answer
-            elif link.judged:
+            elif self.link.judged:
                 out.gaps.append(servo)
                 if len(out.gaps) >= _SILENCES:
                     break
@@ -327,7 +330,7 @@ class StatusPoll:
         for servo in found:
             self._by_id[servo].suspect(now_s)
 
-    def _probe(self, link: RegisterLink, now_s: float) -> bool:
+    def _probe(self, now_s: float) -> bool:
         """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
         where = self._telemetry.position if self._grouped else self._telemetry.block
@@ -335,15 +338,15 @@ class StatusPoll:
         waiting = [member for member in absent if member.probe_s <= now_s]
         request = self._bytes(1, self._telemetry.block[1])
         for _ in range(_PROBES):
-            if not waiting or not link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
+            if not waiting or not self.link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
                 return answered
             member = min(waiting, key=lambda each: each.probe_s)
             self._counts["retries"] += 1
             self._counts["reads"] += 1
             if self._grouped:
-                answer = link.read_many(*where, [member.id]).get(member.id)
+                answer = self.link.read_many(*where, [member.id]).get(member.id)
             else:
-                answer = link.read(member.id, *where)
+                answer = self.link.read(member.id, *where)
             if answer is None:
                 member.probe_failed(now_s)
                 return answered
@@ -355,7 +358,7 @@ class StatusPoll:
             for other in absent:
                 other.hurry(now_s)
             waiting = list(absent)
-            self._take_health(self.read_some(link, "health", self._telemetry.health, [member.id]), now_s)
+            self._take_health(self.read_some("health", self._telemetry.health, [member.id]), now_s)
             member.back(now_s)
         return answered
 
@@ -376,23 +379,18 @@ class StatusPoll:
                 good.append(member.index)
                 data.append(content)
             if error or servo in flagged:
-                fresh += self._take_status(member, error & self._error_bits[member.index], alert, now_s)
+                status = error & self._error_bits[member.index]
+                if alert and status:  # the alert only says that there is a fault, which is asked for once
+                    if servo not in flagged:
+                        fresh.append(servo)
+                elif status or servo in flagged:
+                    member.take_bits(status, telemetry.measured(member.index), now_s)
+                (flagged.add if status else flagged.discard)(servo)
         if good:
             telemetry.take(where, good, data, now_s)
             if where == telemetry.block:
                 self.judge_loads(good, now_s)
         return fresh
-
-    def _take_status(self, member: Member, status: int, alert: bool, now_s: float) -> list[int]:
-        """Pass on the error byte of an answer; return the servo's id if it has to be asked for its fault."""
-        known = member.id in self._flagged
-        if not status and not known:
-            return []
-        (self._flagged.add if status else self._flagged.discard)(member.id)
-        if alert and status:
-            return [] if known else [member.id]
-        member.take_bits(status, self._telemetry.measured(member.index), now_s)
-        return []
 
     def judge_loads(self, indices: Sequence[int], now_s: float) -> None:
         """Compare the present currents of servos that have just reported them with their load rules."""
@@ -402,34 +400,34 @@ class StatusPoll:
             if abs(currents[index]) > member.lowest_mA or member.over_load:
                 member.take_current(currents[index], now_s)
 
-    def _look(self, link: RegisterLink, ids: Sequence[int], now_s: float) -> None:
+    def _look(self, ids: Sequence[int], now_s: float) -> None:
         """Read of a few servos what is not in the block: torque, error status, a current with another address."""
         if not ids:
             return
         self._polls += 1
         tells = [servo for servo in ids if servo in self._tells] if self._tells else []
         if tells and (self._grouped or self._polls % 2):
-            self._look_at_current(link, self._currents.take(tells, 1)[0], now_s)
+            self._look_at_current(self._currents.take(tells, 1)[0], now_s)
         due = self._polls % _HEALTH_POLLS == 0 if self._grouped else not (tells and self._polls % 2)
-        count = self.fitting(link, "health", self._telemetry.health[1], _HEALTH_SHARE) if due else 0
+        count = self.fitting("health", self._telemetry.health[1], _HEALTH_SHARE) if due else 0
         if count:
             chosen = self._looks.take(ids, count)
-            self._take_health(self.read_some(link, "health", self._telemetry.health, chosen), now_s)
+            self._take_health(self.read_some("health", self._telemetry.health, chosen), now_s)
 
-    def _look_at_current(self, link: RegisterLink, servo: int, now_s: float) -> None:
+    def _look_at_current(self, servo: int, now_s: float) -> None:
         index = self._by_id[servo].index
         register = self._telemetry.currents[index]
-        if register is None or not link.grants("current", self._bytes(1, register.size), alone=True):
+        if register is None or not self.link.grants("current", self._bytes(1, register.size), alone=True):
             return
-        answer = link.read(servo, register.address, register.size)
+        answer = self.link.read(servo, register.address, register.size)
         if answer is not None and len(answer.data) == register.size:
             self._telemetry.take_current(index, register, answer.data)
             self.judge_loads([index], now_s)
 
-    def _look_at_alerts(self, link: RegisterLink, fresh: Sequence[int], now_s: float) -> None:
+    def _look_at_alerts(self, fresh: Sequence[int], now_s: float) -> None:
         """Ask servos whose alert bit was newly set for their faults; those left out are asked in the next poll."""
         asked = fresh[:_ALERTS_READ]
-        answers = self.read_some(link, "alerts", self._telemetry.health, asked) if asked else {}
+        answers = self.read_some("alerts", self._telemetry.health, asked) if asked else {}
         self._flagged -= set(fresh) - answers.keys()
         self._take_health(answers, now_s)
 

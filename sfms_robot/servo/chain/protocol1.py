@@ -102,7 +102,7 @@ class Protocol1Link(RegisterLink):
     def _ask(self, servo: int, code: int, params: bytes, length: int) -> Answer | None:
         if self._owes(servo, length) and not self._fence(servo):
             return None
-        self._send(self._packet(servo, code, params))
+        self.send(self._packet(servo, code, params))
         return self._answers([servo], length).get(servo)
 
     # --- several servos -----------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class Protocol1Link(RegisterLink):
         if not asked:
             self.judged = judged  # by one of them: the last may have had no time left
             return {}
-        self._send(self._packet(BROADCAST, *self._group_request(address, length, asked)))
+        self.send(self._packet(BROADCAST, *self._group_request(address, length, asked)))
         return self._answers(asked, length)
 
     # --- the wire -----------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ class Protocol1Link(RegisterLink):
         """Ask for data of a length that no owed answer has; return whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
         request = (protocol1.READ, bytes([0, size])) if size else (protocol1.PING, b"")
-        self._send(self._packet(servo, *request))
+        self.send(self._packet(servo, *request))
         return servo in self._answers([servo], size)
 
     def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
@@ -225,7 +225,7 @@ class FeetechLink(Protocol1Link):
 
     def broadcast_ping(self) -> dict[int, Found]:
         ids = range(protocol1.MAX_ID + 1)
-        self._send(encode(BROADCAST, protocol1.PING))
+        self.send(encode(BROADCAST, protocol1.PING))
         with self.patient(_STAGGER_S * len(ids)):
             there = sorted(self._answers(ids, 0))
         self._owed.clear()  # no servo owes an answer to a broadcast
@@ -247,13 +247,10 @@ class Protocol1Startup(Startup):
 
     def _acknowledge(self) -> None:
         """Raise its status level, unconfirmed: while that is low, it answers pings and nothing else."""
-        servo, lock = self.servo.id, self.table.role("lock")
-        level = self._field("status_level")
-        if lock is not None:
-            self._link.write(servo, lock.address, lock.to_bytes(0))
-        self._link.write(servo, level.address, level.to_bytes(level.high))
-        if lock is not None:
-            self._link.write(servo, lock.address, lock.to_bytes(1))
+        lock, level = self.table.role("lock"), self._field("status_level")
+        raised = level, level.high
+        for field, value in [raised] if lock is None else [(lock, 0), raised, (lock, 1)]:
+            self.link.write(self.servo.id, field.address, field.to_bytes(value))
 
     def _read_state(self) -> Steps[dict[str, int]]:
         level = self._field("status_level")
@@ -298,7 +295,7 @@ class Protocol1Startup(Startup):
             raise
         except ServoError as error:
             torque = self._field("torque_enable")
-            answer = self._link.read(self.servo.id, torque.address, torque.size)
+            answer = self.link.read(self.servo.id, torque.address, torque.size)
             fault = "" if answer is None else self.table.status_fault_names(answer.error)
             raise ServoError(f"{error}, and it reports a hardware error ({fault})" if fault else str(error)) from None
 

@@ -20,7 +20,6 @@ from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Ste
 from sfms_robot.servo.chain.sdk_packets import read2, sync_read2
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.codecs.dxl2 import STATUS, maybe_packet
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import contradictions
@@ -50,11 +49,11 @@ class Dynamixel2Link(RegisterLink):
 
     def ping(self, servo: int) -> Found | None:
         # The status of a ping holds 3 bytes: model number (2), firmware (1).
-        self._send(dxl2.encode_instruction(servo, dxl2.PING))
+        self.send(dxl2.encode_instruction(servo, dxl2.PING))
         return _found(self._answers([servo], 3)).get(servo)
 
     def broadcast_ping(self) -> dict[int, Found]:
-        self._send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
+        self.send(dxl2.encode_instruction(dxl2.BROADCAST, dxl2.PING))
         ids = range(dxl2.MAX_ID + 1)
         with self.patient(len(ids) * _PING_S):
             return _found(self._answers(ids, 3))
@@ -70,7 +69,7 @@ class Dynamixel2Link(RegisterLink):
         return self._instruct(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22")
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
-        self._send(read2(servo, address, length))
+        self.send(read2(servo, address, length))
         return self._answers([servo], length).get(servo)
 
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
@@ -84,7 +83,7 @@ class Dynamixel2Link(RegisterLink):
         return text + ", and reports a hardware error" * bool(answer.error & dxl2.ALERT)
 
     def _instruct(self, servo: int, instruction: int, params: bytes = b"") -> Answer | None:
-        self._send(dxl2.encode_instruction(servo, instruction, params))
+        self.send(dxl2.encode_instruction(servo, instruction, params))
         return self._answers([servo], 0).get(servo)
 
     # --- many servos --------------------------------------------------------------------------------------------
@@ -93,7 +92,7 @@ class Dynamixel2Link(RegisterLink):
 
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
         longer = length + self._extra
-        self._send(sync_read2(address, longer, tuple(servos), fast))
+        self.send(sync_read2(address, longer, tuple(servos), fast))
         answers = self._fast_answers(servos, longer) if fast else self._answers(servos, longer)
         if self._extra:
             answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
@@ -114,10 +113,10 @@ class Dynamixel2Link(RegisterLink):
         size = self.framing.answer + length
         for data in self._incoming(len(self._sent) + size, (len(servos) - 1) * size):
             buffer += data
-            while (packet := maybe_packet(buffer)) is not None:
+            while (packet := dxl2.maybe_packet(buffer)) is not None:
                 servo, instruction, params, error = packet
                 expected = len(params) == length or (error & 0x7F and not params)
-                if instruction == STATUS and servo in pending and expected:
+                if instruction == dxl2.STATUS and servo in pending and expected:
                     answers[servo] = Answer(error, params)
                     pending.remove(servo)
             if not pending:
@@ -166,15 +165,15 @@ class Dynamixel2Startup(Startup):
     def _read_state(self) -> Steps[dict[str, int]]:
         if (level := self.table.role("status_level")) is not None:
             # Status return level 2, unconfirmed: at level 0 a servo answers pings and nothing else.
-            self._link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
+            self.link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
         return (yield from self._clear_turns((yield from self._snapshot())))
 
     def _find_again(self, reboot: bool) -> Steps[None]:
         if reboot:
-            answer = self._link.reboot(self.servo.id)
+            answer = self.link.reboot(self.servo.id)
             if answer is None:
                 raise Silent(self._about("does not answer to a reboot"))
-            if refusal := self._link.refusal(answer):
+            if refusal := self.link.refusal(answer):
                 raise self._error(f"refuses to reboot: {refusal}")
             yield _REBOOT_S
         found = self.ping()
@@ -199,9 +198,9 @@ class Dynamixel2Startup(Startup):
         turned = any(each.register == present.name and each.fixable for each in found)
         if not turned or now[self._name("torque_enable")] or now.get("moving"):
             return now
-        answer = cast(Dynamixel2Link, self._link).clear_turns(self.servo.id)
+        answer = cast(Dynamixel2Link, self.link).clear_turns(self.servo.id)
         yield 0.0
-        if answer is not None and (refusal := self._link.refusal(answer)):
+        if answer is not None and (refusal := self.link.refusal(answer)):
             raise self._error(f"stands at {now[present.name]}, beyond one turn, and refuses CLEAR: {refusal}")
         cleared = self.value(present)
         yield 0.0

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import Final
 
-from sfms_robot.servo.chain.link import RegisterLink
 from sfms_robot.servo.chain.member import Member
 from sfms_robot.servo.chain.poll import StatusPoll
 from sfms_robot.servo.chain.telemetry import Block
@@ -35,9 +34,11 @@ class Settings:
     Args:
         members: of the bus; their tables may be replaced while it runs.
         torque: the register of torque enable.
+        poll: reads registers back in what is left of its time.
     """
 
-    def __init__(self, members: Sequence[Member], torque: Field) -> None:
+    def __init__(self, members: Sequence[Member], torque: Field, poll: StatusPoll) -> None:
+        self._poll = poll
         self._members = {member.id: member for member in members}
         self._torque = torque
         self._pending: dict[str, dict[int, tuple[Field, int]]] = {}  # writes not confirmed yet, by register name
@@ -70,7 +71,7 @@ class Settings:
 
     # --- written until they are confirmed -----------------------------------------------------------------------
 
-    def command(self, link: RegisterLink, poll: StatusPoll, now_s: float) -> None:
+    def command(self, now_s: float) -> None:
         """Write torque off and less force, then read them back; again in the next poll unless it is confirmed.
 
         Raises BusError if the port fails.
@@ -82,22 +83,20 @@ class Settings:
             if member.state == "reduced":
                 self._reduce(member)
         for name, requests in self._pending.items():
-            self._write(link, poll, name, requests, now_s)
+            self._write(name, requests, now_s)
         for member in released:
             member.off_written |= member.to_release
 
-    def _write(
-        self, link: RegisterLink, poll: StatusPoll, name: str, requests: dict[int, tuple[Field, int]], now_s: float
-    ) -> None:
+    def _write(self, name: str, requests: dict[int, tuple[Field, int]], now_s: float) -> None:
         """Write all requests of one register, and read back those of listed members."""
         # One packet has one address and one length: models with another address get another packet.
         for field in dict.fromkeys(field for field, _ in requests.values()):
             values = {servo: value for servo, (each, value) in requests.items() if each == field}
             written = {s: field.to_bytes(v) for s, v in values.items() if (s, name) not in self._read_first}
             if written:
-                link.sync_write(field.address, written)
+                self._poll.link.sync_write(field.address, written)
             ids = [servo for servo in values if self._members[servo].listed][:_VERIFIED]
-            answers = poll.read_some(link, "confirmed", (field.address, field.size), ids) if ids else {}
+            answers = self._poll.read_some("confirmed", (field.address, field.size), ids) if ids else {}
             for servo, answer in answers.items():
                 if len(answer.data) == field.size:
                     self._read_first.discard((servo, name))
@@ -142,7 +141,7 @@ class Settings:
 
     # --- compared once a second ---------------------------------------------------------------------------------
 
-    def compare(self, link: RegisterLink, poll: StatusPoll, now_s: float) -> None:
+    def compare(self, now_s: float) -> None:
         """Read a poll's share of a round. A servo that does not answer is read in the next round."""
         if now_s < self._due_s:
             return
@@ -154,11 +153,11 @@ class Settings:
             return
         where = self._round[0][0]
         servos = [servo for block, servo in self._round[:_TOGETHER] if block == where]
-        asked = servos[: poll.fitting(link, "settings", where[1], len(servos))]
+        asked = servos[: self._poll.fitting("settings", where[1], len(servos))]
         del self._round[: len(asked)]
         self._due_s = now_s + self._part_s * len(asked)
         there = [servo for servo in asked if _compared(self._members[servo])]
-        for servo, answer in poll.read_some(link, "settings", where, there).items():
+        for servo, answer in self._poll.read_some("settings", where, there).items():
             if len(answer.data) == where[1]:
                 self._judge(servo, where[0], answer.data)
 

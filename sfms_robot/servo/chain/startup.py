@@ -61,7 +61,6 @@ _LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its l
 _STILL_TICKS: Final = 1  # between two looks: it stands
 _AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers of 2.0 that are read
 _BY_TIME: Final = 0x04  # drive mode bit 2: the profile registers are durations
-_ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _DEG_S: Final = {"rpm": 6.0, "deg_per_s": 1.0}
 _DEG_S2: Final = {"rev_per_min2": 0.1, "deg_per_s2": 1.0}
 
@@ -96,8 +95,7 @@ def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Mapping[
 
     0 would mean no limit, so no value is less than 1.
     """
-    speed = table.role("moving_speed")
-    acceleration = next((table[name] for name in _ACCELERATIONS if name in table.fields), None)
+    speed, acceleration = table.role("moving_speed"), table.acceleration
     if speed is None:
         return {}
     if speed.name == "profile_velocity" and drive_mode & _BY_TIME:
@@ -112,7 +110,7 @@ def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Mapping[
 
 
 class Startup(ABC):
-    """Requests that start up one servo. The link is set by `attach`.
+    """Requests that start up one servo.
 
     Args:
         servo: its joint, id, control table, limits and safety.
@@ -121,6 +119,7 @@ class Startup(ABC):
         others: returns the startups of known servos that are being started up too.
 
     Attributes:
+        link: to the wire; set before the first request.
         table: a protocol whose servos report their firmware replaces it by that of another layout.
         can_reboot: whether the protocol has an instruction for it.
         unlimited: registers of speed and acceleration, in which 0 means unlimited.
@@ -128,7 +127,7 @@ class Startup(ABC):
 
     can_reboot: ClassVar[bool]
     unlimited: ClassVar[tuple[str, ...]]
-    _link: RegisterLink
+    link: RegisterLink
 
     def __init__(
         self,
@@ -142,10 +141,6 @@ class Startup(ABC):
         self._needs = needs
         self._warnings = warnings
         self._others = others
-
-    def attach(self, link: RegisterLink) -> None:
-        """Use this link from now on."""
-        self._link = link
 
     @abstractmethod
     def _read_state(self) -> Steps[dict[str, int]]:
@@ -237,7 +232,7 @@ class Startup(ABC):
                 yield from self._write(table[name], usual.get(name, 0))
         except BaseException:
             with suppress(BusError):  # a port that is gone: nothing can be sent
-                self._link.sync_write(torque.address, {servo: torque.to_bytes(0)})
+                self.link.sync_write(torque.address, {servo: torque.to_bytes(0)})
             raise
         if present is None:
             late = f"{where}, and does not come inside in {way.bound_s:.1f} s"
@@ -315,7 +310,7 @@ class Startup(ABC):
             data = field.to_bytes(target)
             alike = {each.servo.id: data for each in self._others() if each.table.role("return_delay") == field}
             if alike:
-                self._link.sync_write(field.address, alike)
+                self.link.sync_write(field.address, alike)
         yield from self._write(field, target)
         return True
 
@@ -337,12 +332,10 @@ class Startup(ABC):
         found = contradictions(values, self.table, self._needs)
         for each in found:
             if each.then == "refused":
-                raise ServoError(
-                    f"{self._link.port.name}: servo {servo.id} ({servo.joint}): {each}{_cure(each, servo)}"
-                )
+                raise ServoError(f"{self.link.port.name}: servo {servo.id} ({servo.joint}): {each}{_cure(each, servo)}")
             if each.then == "told" and servo.joint not in (joints := self._warnings.setdefault(str(each), [])):
                 joints.append(servo.joint)
-                if self._link.tries == 1:
+                if self.link.tries == 1:
                     log.warning("%s", self._about(f"comes back, and {each}"))
         return {each.register: each.wanted for each in found if each.then == "set"}
 
@@ -350,7 +343,7 @@ class Startup(ABC):
 
     def ping(self) -> Found | None:
         """Return the servo that answers; None if there is none."""
-        return self._link.ping(self.servo.id)
+        return self.link.ping(self.servo.id)
 
     def recognise(self, found: Found) -> None:
         """Raise ServoError for another model. One without a number passes for any."""
@@ -376,13 +369,13 @@ class Startup(ABC):
         return field.from_bytes(self._read(field.name, field.address, field.size))
 
     def _read(self, what: str, address: int, length: int) -> bytes:
-        for _ in range(self._link.tries):
-            answer = self._link.read(self.servo.id, address, length)
+        for _ in range(self.link.tries):
+            answer = self.link.read(self.servo.id, address, length)
             if answer is not None:
                 break
         else:
             raise Silent(self._about(f"does not answer when asked for {what}"))
-        if refusal := self._link.refusal(answer):
+        if refusal := self.link.refusal(answer):
             raise self._error(f"refuses to report {what}: {refusal}")
         if len(answer.data) != length:
             raise self._error(f"gives no value for {what}")
@@ -391,9 +384,7 @@ class Startup(ABC):
     def _write(self, field: Field, value: int) -> Steps[None]:
         """Write and verify a register, through the lock of the EEPROM if there is one."""
         servo, lock = self.servo, self.table.role("lock")
-        yield from verified_write(
-            self._link, servo.id, field, value, lock=lock, tries=self._link.tries, about=str(servo)
-        )
+        yield from verified_write(self.link, servo.id, field, value, lock=lock, tries=self.link.tries, about=str(servo))
 
     def _field(self, role: str) -> Field:
         field = self.table.role(role)
