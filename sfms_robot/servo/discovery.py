@@ -1,7 +1,7 @@
 """Which serial ports there are, which processes hold them, how long their adapters hold bytes back; and `--port`.
 
 No port is opened. The list and the USB adapters come from pyserial, which knows macOS and Windows too, and the ports of
-built-in UARTs from /dev; names, drivers and holders come from /dev, /sys and /proc. Tests pass a list and roots of
+built-in UARTs from /dev; names, drivers and holders come from /dev, /sys and /proc. Tests pass a list and a root of
 their own.
 """
 
@@ -19,9 +19,7 @@ from urllib.parse import urlsplit
 from sfms_robot.endpoint import host_and_port
 from sfms_robot.errors import ConfigError, PortError
 
-DEV: Final = Path("/dev")
-SYS: Final = Path("/sys")
-PROC: Final = Path("/proc")
+ROOT: Final = Path("/")  # of /dev, /sys and /proc
 AUTO: Final = "auto"
 NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs that can lead to servos
 
@@ -78,19 +76,17 @@ def _pyserial_ports() -> Iterator[Any]:
     yield from comports()
 
 
-def list_ports(
-    dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[Any]] = _pyserial_ports
-) -> list[SerialDevice]:
+def list_ports(root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> list[SerialDevice]:
     """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware.
 
     `listed`: returns pyserial's `ListPortInfo` of each port, from which come the facts of USB adapters.
     """
-    found: dict[str, Any] = {_real(str(path)): None for pattern in _PATTERNS for path in dev.glob(pattern)}
+    found: dict[str, Any] = {_real(str(path)): None for pattern in _PATTERNS for path in (root / "dev").glob(pattern)}
     found |= {_real(port.device): port for port in listed()}
     return [
-        _described(path, found[path], dev, sys)
+        _described(path, found[path], root)
         for path in sorted(found)
-        if _line(sys / "class" / "tty" / os.path.basename(path) / "type") != _NO_UART
+        if _line(root / "sys" / "class" / "tty" / os.path.basename(path) / "type") != _NO_UART
     ]
 
 
@@ -107,24 +103,22 @@ def ports_data() -> list[dict[str, Any]]:
     ]
 
 
-def describe(
-    path: str, dev: Path = DEV, sys: Path = SYS, listed: Callable[[], Iterable[Any]] = _pyserial_ports
-) -> SerialDevice:
+def describe(path: str, root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> SerialDevice:
     """Return what the system knows of a port; `path` may be a link to it."""
     real = _real(path)
-    return _described(real, next((port for port in listed() if _real(port.device) == real), None), dev, sys)
+    return _described(real, next((port for port in listed() if _real(port.device) == real), None), root)
 
 
-def _described(path: str, port: Any, dev: Path, sys: Path) -> SerialDevice:
+def _described(path: str, port: Any, root: Path) -> SerialDevice:
     """Return a port with its names and driver, and what pyserial says of it; `port` None: it does not know it."""
-    name = os.path.basename(path)
+    name, links, sys = os.path.basename(path), root / "dev" / "serial", root / "sys"
     driver = sys / "class" / "tty" / name / "device" / "driver"
     latency = sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
     text = _line(latency)
     known = SerialDevice(
         path,
-        by_id=_link_to(path, dev / "serial" / "by-id"),
-        by_path=_link_to(path, dev / "serial" / "by-path"),
+        by_id=_link_to(path, links / "by-id"),
+        by_path=_link_to(path, links / "by-path"),
         driver=os.path.basename(os.path.realpath(driver)) if driver.exists() else None,
         latency_ms=int(text) if text is not None and text.isdigit() else None,
         latency_file=str(latency) if text is not None else None,
@@ -137,13 +131,14 @@ def _described(path: str, port: Any, dev: Path, sys: Path) -> SerialDevice:
     return replace(known, vendor=vendor, product=product, serial=port.serial_number or None, description=description)
 
 
-def stable_name(device: str, dev: Path = DEV, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> str:
+def stable_name(device: str, root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> str:
     """Return the name under which an adapter is found again after it was unplugged, or `device` itself.
 
     That is by serial number if the adapter has a unique one. Two CH340 have none, and two CP2102 both have 0001: their
     by-id names are equal, and the link points to the one plugged in last. Such adapters are named by their USB socket.
     """
-    if not device.startswith((str(dev / "tty"), str(dev / "serial" / "by-id"))):
+    links = root / "dev" / "serial"
+    if not device.startswith((str(root / "dev" / "tty"), str(links / "by-id"))):
         return device
     real = _real(device)
     sockets: dict[tuple[Any, ...], set[str]] = {}  # USB sockets by numbers; ports of one adapter share its socket
@@ -153,29 +148,29 @@ def stable_name(device: str, dev: Path = DEV, listed: Callable[[], Iterable[Any]
         sockets.setdefault(numbers, set()).add((port.location or "").partition(":")[0])
         own = numbers if _real(port.device) == real else own
     if own and own[2] and len(sockets[own]) == 1:
-        return _link_to(real, dev / "serial" / "by-id") or device
-    return _link_to(real, dev / "serial" / "by-path") or real
+        return _link_to(real, links / "by-id") or device
+    return _link_to(real, links / "by-path") or real
 
 
-def holders(path: str, proc: Path = PROC) -> list[Holder]:
+def holders(path: str, root: Path = ROOT) -> list[Holder]:
     """Return the processes that have the port open, as far as this user may see; this one is left out."""
     real = os.path.realpath(path)
     found = []
-    for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
+    for folder in _processes(root):
         if int(folder.name) != os.getpid() and any(target == real for target in _open_files(folder)):
             found.append(Holder(int(folder.name), _command(folder)))
     return found
 
 
-def rivals(path: str, proc: Path = PROC, sys: Path = SYS) -> list[tuple[str, str]]:
+def rivals(path: str, root: Path = ROOT) -> list[tuple[str, str]]:
     """Return what else uses a port, or takes it when it is plugged in: in words, with the command that frees it."""
     name, found = os.path.basename(os.path.realpath(path)), []
-    if name in (_line(sys / "class" / "tty" / "console" / "active") or "").split():
+    if name in (_line(root / "sys" / "class" / "tty" / "console" / "active") or "").split():
         fix = (
             "sudo raspi-config nonint do_serial_cons 1, or take console= of it out of the kernel's command line; reboot"
         )
         found.append(("is a login console: the kernel writes its messages to it", fix))
-    for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
+    for folder in _processes(root):
         program, words = _line(folder / "comm"), _command(folder).split()
         if program == "agetty" and name in words:
             fix = f"sudo systemctl disable --now serial-getty@{name}"
@@ -216,8 +211,8 @@ def _meant(path: str) -> str:
     """Return how to write what a path that does not exist was probably meant to be."""
     if ":" in path and host_and_port(path) is not None:
         return f"; the port of a serial server is written socket://{path}"
-    if path and (DEV / path).exists():
-        return f"; it is written {DEV / path}"
+    if path and (device := ROOT / "dev" / path).exists():
+        return f"; it is written {device}"
     return "; COM ports are Windows'" if re.fullmatch(r"(?i)com\d+", path) else ""
 
 
@@ -263,6 +258,11 @@ def _real(device: str) -> str:
 
 def _link_to(real: str, folder: Path) -> str | None:
     return next((str(link) for link in sorted(folder.glob("*")) if os.path.realpath(link) == real), None)
+
+
+def _processes(root: Path) -> list[Path]:
+    """Return the folder of every process, by its id."""
+    return sorted((root / "proc").glob("[0-9]*"), key=lambda each: int(each.name))
 
 
 def _open_files(folder: Path) -> Iterator[str]:

@@ -80,7 +80,7 @@ def test_an_adapter_is_described_by_numbers_driver_and_latency_also_through_a_li
         Listed("/dev/cu.usbserial-FT9", 0x0403, 0x6014, "FT9"),
         Listed(str(ftdi / "dev" / "ttyS0")),
     )
-    places = ftdi / "dev", ftdi / "sys", more
+    places = ftdi, more
     found = {os.path.basename(each.path): each for each in list_ports(*places)}
     assert sorted(found) == ["COM3", "cu.usbserial-FT9", "ttyACM0", "ttyAMA0", "ttyS4", "ttyUSB0"]
     usb, acm, com = found["ttyUSB0"], found["ttyACM0"], found["COM3"]
@@ -100,7 +100,7 @@ def test_holders_are_found_through_links_and_named(ftdi):
     process(proc, os.getpid(), "ourselves", port)
     (proc / "300").mkdir()  # its files may not be looked at
     link = str(ftdi / "dev" / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0")
-    assert holders(link, proc) == [Holder(100, "python wizard.py")]
+    assert holders(link, ftdi) == [Holder(100, "python wizard.py")]
 
 
 def test_a_port_that_this_process_holds_is_really_seen_in_proc():
@@ -139,7 +139,7 @@ def test_what_else_takes_a_port_is_named_with_the_command_that_frees_it(tmp_path
         (proc / str(pid)).mkdir(parents=True)
         (proc / str(pid) / "comm").write_text(f"{name}\n")
         (proc / str(pid) / "cmdline").write_bytes(line.replace(" ", "\0").encode())
-    told = {path: rivals(path, proc, tmp_path / "sys") for path in ("/dev/ttyAMA0", "/dev/ttyUSB3", "/dev/ttyS1")}
+    told = {path: rivals(path, tmp_path) for path in ("/dev/ttyAMA0", "/dev/ttyUSB3", "/dev/ttyS1")}
     (console, _), (getty, disable) = told["/dev/ttyAMA0"]
     assert "login console" in console and "process 7" in getty
     assert disable == "sudo systemctl disable --now serial-getty@ttyAMA0"
@@ -163,7 +163,7 @@ def plug(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> L
 
 def names(root: Path, ports: list[Listed], *devices: str) -> list[str]:
     devices = devices or tuple(port.device for port in ports)
-    return [os.path.basename(stable_name(device, root / "dev", lambda: ports)) for device in devices]
+    return [os.path.basename(stable_name(device, root, lambda: ports)) for device in devices]
 
 
 @pytest.mark.parametrize("serial", [None, "0001"])
