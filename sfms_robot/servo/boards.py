@@ -165,7 +165,7 @@ class Maestro:
     """
 
     status_length = 2
-    factory_us: tuple[float, float] | None = maestro.FACTORY_PULSE_US
+    factory_us = maestro.FACTORY_PULSE_US
     reports_pulses = True
 
     def __init__(self, table: Table, crc: bool) -> None:
@@ -245,7 +245,7 @@ class Ssc32:
     """
 
     status_length = 1
-    factory_us: tuple[float, float] | None = None
+    factory_us = None
     reports_pulses = False
 
     def status_request(self, restarted: bool) -> bytes:

@@ -283,16 +283,8 @@ class AbsentBus:
 
     def __init__(self, servos: Sequence[BusServo]) -> None:
         self._held = {servo.joint: servo.nearest_to_zero_rad for servo in servos}
-
-    @property
-    def joints(self) -> Sequence[str]:
-        """Return the joint names in the order of `servos`."""
-        return tuple(self._held)
-
-    @property
-    def capabilities(self) -> Mapping[str, frozenset[str]]:
-        """Return nothing for every joint."""
-        return dict.fromkeys(self._held, frozenset[str]())
+        self.joints = tuple(self._held)
+        self.capabilities = dict.fromkeys(self._held, frozenset[str]())
 
     def _nothing(self, *arguments: Any, **more: Any) -> None:
         """Do nothing: there is no servo, and no torque."""
@@ -310,8 +302,4 @@ class AbsentBus:
     def statistics(self) -> Mapping[str, Any]:
         """Return the counters of the report."""
         faults = [f"{joint}: {LEFT_OUT}" for joint in self.joints]
-        return {
-            **dict.fromkeys(COUNTS, 0),
-            "silent": [],
-            "faults": faults,
-        }
+        return {**dict.fromkeys(COUNTS, 0), "silent": [], "faults": faults}

@@ -32,7 +32,7 @@ FAILED: Final = "bus failed"
 
 
 class Writer:
-    """A thread for one bus, from construction until `close`. `raise_failure` raises what ended it.
+    """A thread for one bus, from construction until `close`. `readings` raises what ended it.
 
     The newest goals win: goals that come while a write is in progress replace one another. Nothing is sent that the
     loop did not ask for: if the loop stops, so does the wire, and the servos' watchdogs see it.
@@ -61,15 +61,14 @@ class Writer:
             self._goals = goals_rad.copy(), now_s
             self._changed.notify()
 
-    def raise_failure(self) -> None:
-        """Raise what ended the thread, if anything did."""
+    def readings(self, now_s: float) -> Mapping[str, Reading]:
+        """Return the last readings, older by the time since; empty before the first tick of the bus.
+
+        Raises what ended the thread, if anything did.
+        """
         with self._changed:
             if self._failure is not None:
                 raise self._failure
-
-    def readings(self, now_s: float) -> Mapping[str, Reading]:
-        """Return the last readings, older by the time since; empty before the first tick of the bus."""
-        with self._changed:
             later_s = max(0.0, now_s - self._read_s)
             out = {
                 joint: replace(each, age_s=each.age_s + later_s, rejoined=joint in self._back)
@@ -281,7 +280,6 @@ class CompositeBus:
         writer = self._writers.get(name)
         if writer is None:
             return bus.poll(now_s)
-        writer.raise_failure()
         return writer.readings(now_s) or {joint: Reading(None, float("inf")) for joint in bus.joints}
 
     def _fail(self, name: str, error: Exception) -> None:

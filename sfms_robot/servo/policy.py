@@ -90,9 +90,8 @@ def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
     """Return the named load rules of a joint; none if its servo does not report its current."""
     if not tells_current(servo.table):
         return []
-    rules = [("pinched", servo.safety.pinch), ("under load too long", servo.safety.strain)]
-    limit = servo.table.fields.get("current_limit")
-    if servo.safety.pinch is None and limit is not None and limit.initial:
-        own = LoadRule(current_mA=PINCH_SHARE * limit.initial * limit.scale, for_s=PINCH_S, then="limp")
-        rules[0] = ("pinched", own)
-    return [(name, rule) for name, rule in rules if rule is not None]
+    pinch, limit = servo.safety.pinch, servo.table.fields.get("current_limit")
+    if pinch is None and limit is not None and limit.initial:
+        pinch = LoadRule(current_mA=PINCH_SHARE * limit.initial * limit.scale, for_s=PINCH_S, then="limp")
+    rules = {"pinched": pinch, "under load too long": servo.safety.strain}
+    return [(name, rule) for name, rule in rules.items() if rule is not None]

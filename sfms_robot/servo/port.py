@@ -209,9 +209,9 @@ class VirtualTimePort:
         self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
 
     def write(self, data: bytes) -> None:
-        now_s = self._clock.now_s()
-        if self._announced < self._written and self._written_at_s < now_s:
-            self._exchange(self._written_at_s)
+        now_s = self.now_s()
+        if self._written_at_s < now_s:
+            self._announce()
         for start in range(0, len(data), self._WINDOW):
             chunk = data[start : start + self._WINDOW]
             if self._written + len(chunk) - self._announced > self._WINDOW:
@@ -225,7 +225,7 @@ class VirtualTimePort:
 
     def read(self, n: int, deadline_s: float) -> bytes:
         if not self._inbox:
-            self._exchange(self._clock.now_s(), deadline_s)
+            self._exchange(self.now_s(), deadline_s)
         data = bytes(self._inbox[:n])
         del self._inbox[:n]
         return data
@@ -241,18 +241,22 @@ class VirtualTimePort:
         self._clock.wait_until(time_s)
 
     def set_baud(self, baud: int) -> None:
-        if self._announced < self._written:
-            self._exchange(self._written_at_s)
+        self._announce()
         self._serial.baudrate = baud
 
     def close(self) -> None:
-        if self._serial.is_open and self._announced < self._written:
+        if self._serial.is_open:
             try:
-                self._exchange(self._written_at_s)
+                self._announce()
             except BusError:
                 self._inbox.clear()  # the emulator is gone
         _shut(self._serial)
         self._control.close()
+
+    def _announce(self) -> None:
+        """Let the emulator take what it has not taken yet, at the time of the last write."""
+        if self._announced < self._written:
+            self._exchange(self._written_at_s)
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
         """Let the emulator take the bytes written, at `now_s`, and read all that it sends by `until_s`."""

@@ -85,6 +85,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         reconnect_s = config.reconnect_s if config is not None else RECONNECT_S
         patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
         super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
+        self.capabilities = dict.fromkeys(self.joints, _CAPABILITIES)
         self._confirmed = confirmed
         table = board_of(name, servos)
         self.model = table.model
@@ -112,10 +113,6 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._status_due_s: float | None = None  # when to ask the board next
         self._unanswered = 0
         self._next_on_s = -math.inf  # when the next waiting output may come on
-
-    @property
-    def capabilities(self) -> Mapping[str, frozenset[str]]:
-        return dict.fromkeys(self.joints, _CAPABILITIES)
 
     def connect(self) -> None:
         """Open the port and find the board, pulses left unchanged.
