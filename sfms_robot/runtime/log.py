@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -77,10 +76,7 @@ class EventCounter:
 
     def total(self) -> int:
         """Return the events so far, with the unfinished block. Blocks while it is searched."""
-        try:
-            return self._submit(len(self._values)).result()
-        except RuntimeError:  # the interpreter ends: its workers have done all they had, and take no more
-            return self._count(np.array(self._values), self._before, len(self._values), False)
+        return self._submit(len(self._values)).result()
 
     def _submit(self, last: int, whole: bool = False) -> Future[int]:
         block = (np.array(self._values), self._before, last, whole)
@@ -100,49 +96,38 @@ class EventCounter:
         return self._so_far
 
 
-@dataclass(kw_only=True)
 class RunLog:
     """Figures filled by the loop and read at the end; `motion_so_far`, counters and quantiles also by other threads.
 
     `period_s`: of a tick.
     """
 
-    joints: Sequence[str]
-    period_s: float
-    audit: CommandAudit
-    ticks: int = 0
-    late: int = 0
-    skipped: int = 0
-    pace: TickPace = field(default_factory=TickPace)
-    frames: int = 0
-    judged_frames: int = 0  # whose attention is known
-    attentive_frames: int = 0
-    refused_plans: int = 0
-    late_ms: Quantiles = field(default_factory=Quantiles)
-    frame_to_wire_ms: Quantiles = field(default_factory=Quantiles)
-    speech_to_wire_ms: Quantiles = field(default_factory=Quantiles)
-    eased: int = 0
-    listened_s: float = 0.0
-    audited: Any = None  # the state of the audit
-    state: Any = None  # of the loop at its end, with the counters of timeline and limiter
-    torque_unconfirmed: list[str] = field(default_factory=list)  # joints that came on and are not confirmed off
-    detached: Mapping[str, str] = field(default_factory=dict)  # observers that raised
-    reported: Sequence[str] = ()  # lost parts that log their own loss
-    states: deque[tuple[float, RunState]] = field(default_factory=lambda: deque(maxlen=STATES))
-    state_s: dict[str, float] = field(default_factory=dict)
-    _low_rad: Doubles = field(init=False)  # (J,), as the two below
-    _high_rad: Doubles = field(init=False)
-    _travel_rad: Doubles = field(init=False)
-    _last_rad: Doubles | None = None
-    _worked_s: float = 0.0  # by the loop's thread so far
-    _waiting: deque[Plan] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    _speech_s: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    _counters: dict[str, EventCounter] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
+    def __init__(self, joints: Sequence[str], period_s: float, audit: CommandAudit) -> None:
+        self.joints, self.period_s, self.audit = joints, period_s, audit
+        self.pace = TickPace()
+        self.ticks = self.late = self.skipped = self.eased = self.refused_plans = 0
+        self.frames = 0
+        self.judged_frames = 0  # whose attention is known
+        self.attentive_frames = 0
+        self.late_ms, self.frame_to_wire_ms, self.speech_to_wire_ms = Quantiles(), Quantiles(), Quantiles()
+        self.listened_s = 0.0
+        self.audited: Any = None  # the state of the audit
+        self.state: Any = None  # of the loop at its end, with the counters of timeline and limiter
+        self.torque_unconfirmed: list[str] = []  # joints that came on and are not confirmed off
+        self.detached: Mapping[str, str] = {}  # observers that raised
+        self.reported: Sequence[str] = ()  # lost parts that log their own loss
+        self.states: deque[tuple[float, RunState]] = deque(maxlen=STATES)
+        self.state_s: dict[str, float] = {}
+        self._low_rad = np.full(len(joints), np.inf)  # (J,), as the two below
+        self._high_rad = -self._low_rad
+        self._travel_rad = np.zeros(len(joints))
+        self._last_rad: Doubles | None = None
+        self._worked_s = 0.0  # by the loop's thread so far
+        self._waiting: deque[Plan] = deque(maxlen=_REMEMBERED)
+        self._speech_s: deque[float] = deque(maxlen=_REMEMBERED)
         worker = ThreadPoolExecutor(1, "event counter")
         worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
-        rate_hz = 1.0 / self.period_s
+        rate_hz = 1.0 / period_s
         self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
     def start(self, held_rad: Doubles) -> None:
@@ -222,12 +207,10 @@ class RunLog:
         self.pace.judge(tick.time_s, late_s, self._worked_s - before_s)
         self.skipped += tick.skipped
         self.audited = self.audit.step(goals_rad, asked_rad, self.audited)
-        if self._last_rad is None:
-            self._low_rad, self._high_rad, self._last_rad = goals_rad, goals_rad, goals_rad
-            self._travel_rad = np.zeros_like(goals_rad)
         self._low_rad = np.minimum(self._low_rad, goals_rad)
         self._high_rad = np.maximum(self._high_rad, goals_rad)
-        self._travel_rad = self._travel_rad + np.abs(goals_rad - self._last_rad)
+        if self._last_rad is not None:
+            self._travel_rad = self._travel_rad + np.abs(goals_rad - self._last_rad)
         self._last_rad = goals_rad
 
     def attention_report(self) -> dict[str, float | int | None]:

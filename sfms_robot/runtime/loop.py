@@ -12,7 +12,7 @@ acceleration are central differences, so one sample lies one tick ahead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
@@ -24,7 +24,7 @@ from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Double
 from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
-from sfms_robot.runtime.clock import tick_times
+from sfms_robot.runtime.clock import TickTime, tick_times
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.observers import Observers
@@ -101,7 +101,7 @@ class LoopState:
     heat: Heat
     released: Bools
     life: LifeState = LifeState()
-    presence: Presence = field(default_factory=Presence.start)
+    presence: Presence = field(default_factory=Presence)
     run: RunState = RunState()
     lost_joints: tuple[str, ...] = ()
     answer: Fade = Fade()
@@ -166,20 +166,8 @@ def drive(
                     )
                 )
         finally:
-            state = _ending(log, clock.now_s() - start_s, state)
-            if not parts.halt.causes:  # a head that was halted moves no more
-                seen = partial(_seen_on_the_way, observers, state)
-                come_to_rest(
-                    parts.bus,
-                    parts.limiter,
-                    state.limiter,
-                    from_rad=state.here_rad,
-                    rest_rad=parts.rest_rad,
-                    ticks=tick_times(clock, rate_hz, start_s),
-                    log=log,
-                    seen=seen,
-                )
-            log.state = state
+            ticks = tick_times(clock, rate_hz, start_s)
+            log.state = _ended(parts, observers, log, ticks, clock.now_s() - start_s, state)
     finally:
         parts.bus.stop("release")
     return "interrupted" if interrupted() else "done"
@@ -253,23 +241,29 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
     return replace(state, run=run, released=released)
 
 
-def _ending(log: RunLog, now_s: float, state: LoopState) -> LoopState:
+def _ended(
+    parts: Parts, observers: Observers, log: RunLog, ticks: Iterator[TickTime], now_s: float, state: LoopState
+) -> LoopState:
+    """Bring the head to rest; return the last state."""
     run = state.run.then(now_s, ending=True)
     log.entered(run, now_s)
+
+    def seen(time_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]) -> None:
+        """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
+        observers.tick(Tick(time_s, state.motion * np.float32(ahead), goals_rad, readings, run.name, run.why))
+
+    if not parts.halt.causes:  # a head that was halted moves no more
+        come_to_rest(
+            parts.bus,
+            parts.limiter,
+            state.limiter,
+            from_rad=state.here_rad,
+            rest_rad=parts.rest_rad,
+            ticks=ticks,
+            log=log,
+            seen=seen,
+        )
     return replace(state, run=run)
-
-
-def _seen_on_the_way(
-    observers: Observers,
-    state: LoopState,
-    now_s: float,
-    ahead: float,
-    goals_rad: Doubles,
-    readings: Mapping[str, Reading],
-) -> None:
-    """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
-    motion = state.motion * np.float32(ahead)
-    observers.tick(Tick(now_s, motion, goals_rad, readings, state.run.name, state.run.why))
 
 
 def turned_by_hand(planned: Floats, asked: Floats) -> bool:

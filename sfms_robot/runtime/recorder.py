@@ -57,6 +57,7 @@ _log = logging.getLogger(__name__)
 
 _NUMBER: Final = {"type": "number"}
 _NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
+_NUMBERS: Final = {"type": "array", "items": _NUMBER}
 _NUMBERS_OR_NULL: Final = {"type": ["array", "null"], "items": _NUMBER}
 _PCM16: Final = {"type": "string", "contentEncoding": "base64"}
 _CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
@@ -83,9 +84,9 @@ _SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
     },
     "/plan": {
         "made_at_s": _NUMBER,
-        "times_s": {"type": "array", "items": _NUMBER},
-        "frames": {"type": "array", "items": {"type": "array", "items": _NUMBER}},
-        "jaw_rad": {"type": ["array", "null"], "items": {"type": "array", "items": _NUMBER}},
+        "times_s": _NUMBERS,
+        "frames": {"type": "array", "items": _NUMBERS},
+        "jaw_rad": {"type": ["array", "null"], "items": _NUMBERS},
         "hazards_hz": {"type": "object", "additionalProperties": _NUMBER},
     },
     "/event": {

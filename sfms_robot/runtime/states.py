@@ -18,7 +18,7 @@ is being played, has sound, pauses between words included: neither a text nor th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from sfms_robot.frames import Doubles, SpeakerFrame
@@ -118,14 +118,10 @@ class Presence:
         sensed_s: time of the last input, silence included.
     """
 
-    ear: Ear
+    ear: Ear = field(default_factory=voice_activity.start)
     watched: Watched = Watched()
     heard_s: float = _NEVER_S
     sensed_s: float = _NEVER_S
-
-    @classmethod
-    def start(cls) -> Presence:
-        return cls(voice_activity.start())
 
     def after(self, frame: SpeakerFrame) -> Presence:
         """Return the presence one frame later. A frame without a face leaves the last sighting in place."""
@@ -166,8 +162,7 @@ class Fade:
 
     def at(self, times_s: Doubles) -> Doubles:
         """Return the share (N,) at (N,) instants."""
-        share: Doubles = self.before + (self.after - self.before) * ease((times_s - self.since_s) / FADE_S)
-        return share
+        return self.before + (self.after - self.before) * ease((times_s - self.since_s) / FADE_S)
 
     def toward(self, share: float, times_s: Doubles) -> Fade:
         """Return a fade to `share` from the latest of the instants (N,) on: no instant played before changes."""

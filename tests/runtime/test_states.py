@@ -89,7 +89,7 @@ class Room:
     """Frames one after the other."""
 
     def __init__(self) -> None:
-        self.presence, self.now_s = Presence.start(), 0.0
+        self.presence, self.now_s = Presence(), 0.0
 
     def goes_on(
         self, seconds: float, audio: object = hum, face: FaceFrame | None = None, says: Floats | None = None
@@ -127,7 +127,7 @@ def test_pauses_between_its_words_and_what_the_person_says_do_not_end_its_turn()
 def test_a_face_that_is_lost_leaves_the_person_where_they_were_seen() -> None:
     place_m = np.array([1.0, 0.2, 0.0], np.float32)
     face = FaceFrame(0.9, FACE.pose, FACE.blendshapes)
-    seen = Presence.start().after(SpeakerFrame(1.0, NONE, face, attention=0.5, place_m=place_m))
+    seen = Presence().after(SpeakerFrame(1.0, NONE, face, attention=0.5, place_m=place_m))
     assert (seen.watched.seen_s, seen.watched.attention) == (0.9, 0.5) and seen.watched.place_m is place_m
     assert seen.after(SpeakerFrame(1.04, NONE)).watched == seen.watched
     assert seen.after(SpeakerFrame(1.04, NONE, face)).watched.place_m is None
