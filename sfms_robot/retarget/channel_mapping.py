@@ -73,12 +73,10 @@ class Units:
 
     def values(self, angles_rad: Doubles) -> Doubles:
         away = angles_rad - self.rest
-        out: Doubles = away / np.where(away > 0, self.up, self.down)
-        return out
+        return away / np.where(away > 0, self.up, self.down)
 
     def angles(self, values: Doubles) -> Doubles:
-        out: Doubles = self.rest + values * np.where(values > 0, self.up, self.down)
-        return out
+        return self.rest + values * np.where(values > 0, self.up, self.down)
 
 
 class ChannelMapping:
@@ -166,8 +164,7 @@ class ChannelMapping:
     def _turned(self, values: Doubles, knobs: Knobs) -> Doubles:
         ends = np.where(values > 0, self._units.high, -self._units.low)
         share = np.abs(values) / np.where(ends > 0, ends, 1.0)
-        turned: Doubles = values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
-        return turned
+        return values * knobs.intensity * (1.0 + (knobs.style - 1.0) * (1.0 - share))
 
 
 # --- Compiled drives ------------------------------------------------------------------------------------------------
@@ -175,7 +172,7 @@ class ChannelMapping:
 
 @dataclass(frozen=True)
 class _Curves:
-    """Monotone cubics of the nodes `where`: C of them with at most K points, evaluated together.
+    """Monotone cubics (PCHIP) of the nodes `where`: C of them with at most K points, evaluated together.
 
     `breaks` (C, K) is filled up with inf; `pieces` (C, K+1, 4) are coefficients about `origins` (C, K+1), highest
     power first, the outermost two constant.
@@ -192,6 +189,8 @@ class _Curves:
         where = [i for i, curve in enumerate(curves) if curve is not None]
         if not where:
             return None
+        from scipy.interpolate import PchipInterpolator  # takes a third of a second, and few heads have curves
+
         longest = max(len(curve) for curve in curves if curve is not None)
         breaks = np.full((len(where), longest), np.inf)
         origins = np.zeros((len(where), longest + 1))
@@ -203,7 +202,7 @@ class _Curves:
             origins[row, 1 : len(x)] = x[:-1]
             pieces[row, 0, 3], pieces[row, len(x), 3] = y[0], y[-1]
             with np.errstate(over="ignore"):  # slopes too small for a float are 0
-                pieces[row, 1 : len(x)] = _monotone_cubics(x, y)
+                pieces[row, 1 : len(x)] = PchipInterpolator(x, y).c.T
         return cls(np.array(where, dtype=np.intp), breaks, origins, pieces)
 
     def into(self, values: Doubles) -> None:
@@ -216,30 +215,6 @@ class _Curves:
         t = np.where(flat, 0.0, x - self.origins[rows, piece])  # outside, x may be too large to be cubed
         t[piece == self.breaks.shape[1]] = 0.0
         values[..., self.where] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
-
-
-def _monotone_cubics(x: Doubles, y: Doubles) -> Doubles:
-    """Return cubics between K points (Fritsch, Butland 1984) without overshoot: (K-1, 4), highest power first."""
-    dx = np.diff(x)
-    rise = np.diff(y) / dx
-    slopes = np.full(len(x), rise[0])
-    if len(x) > 2:
-        w1, w2 = 2 * dx[1:] + dx[:-1], dx[1:] + 2 * dx[:-1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inner = 1.0 / ((w1 / rise[:-1] + w2 / rise[1:]) / (w1 + w2))
-        slopes[1:-1] = np.where(rise[:-1] * rise[1:] > 0, inner, 0.0)
-        slopes[0] = _end_slope(dx[0], dx[1], rise[0], rise[1])
-        slopes[-1] = _end_slope(dx[-1], dx[-2], rise[-1], rise[-2])
-    bend = (slopes[:-1] + slopes[1:] - 2 * rise) / dx
-    return np.stack([bend / dx, (rise - slopes[:-1]) / dx - bend, slopes[:-1], y[:-1]], axis=1)
-
-
-def _end_slope(dx0: float, dx1: float, rise0: float, rise1: float) -> float:
-    """Return the slope at an end by three points, limited against overshoot."""
-    slope = ((2 * dx0 + dx1) * rise0 - dx0 * rise1) / (dx0 + dx1)
-    if np.sign(slope) != np.sign(rise0):
-        return 0.0
-    return 3.0 * rise0 if np.sign(rise0) != np.sign(rise1) and abs(slope) > 3.0 * abs(rise0) else slope
 
 
 @dataclass(frozen=True, kw_only=True)
