@@ -18,7 +18,7 @@ the same cranks would fit but the head could only have fallen there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -41,8 +41,6 @@ HOME: Final = np.zeros(6)
 BLOCK: Final = 500  # poses at a time, for the memory that their pieces take
 PIECES: Final = 32
 PASSES: Final = 6  # to a billionth of the way: 32 ** 6 = 2 ** 30
-
-Reachable = Callable[[Doubles], Bools]  # poses (n, 6) -> (n,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +84,7 @@ class Platform:
         """Return q (..., 6, 3) of R (..., 3, 3) and t (..., 3)."""
         shape = place_m.shape[:-1]
         stacked = np.concatenate([rotation.reshape(*shape, 9), place_m], axis=-1)
-        ends: Doubles = (stacked @ self.linear.T + self.constant).reshape(*shape, 6, 3)
-        return ends
+        return (stacked @ self.linear.T + self.constant).reshape(*shape, 6, 3)
 
     def inverse(self, poses: Doubles, dead_centre: float = 1.0) -> Doubles:
         """Return crank angles (..., 6) [rad] within -pi..pi of poses (..., 6); NaN for a leg that does not reach.
@@ -226,7 +223,7 @@ class Stewart:
     def _solved(self, poses: Doubles, body: Doubles) -> Solved:
         shape = poses.shape[:-1]
         wanted = rotations.seen_from(body, poses).reshape(-1, 6)
-        given, reached = nearest(wanted, self.reachable)
+        given, reached = self.nearest(wanted)
         cranks = np.clip(self.geometry.inverse(given), self._low, self._high)  # a border pose may round past its end
         angles = cranks.reshape(*shape, 6)
         if self.turns_body:
@@ -243,33 +240,32 @@ class Stewart:
             shown=shown,
         )
 
+    def nearest(self, poses: Doubles) -> tuple[Doubles, Bools]:
+        """Return the nearest poses (n, 6) that can be reached, straight back toward home, and which were reached (n,).
 
-def nearest(poses: Doubles, reachable: Reachable) -> tuple[Doubles, Bools]:
-    """Return the nearest poses (n, 6) that can be reached, straight back toward home, and which were reached (n,).
+        Home, the zero pose, is inside the reach. Along the straight line home -> wanted pose (in roll, pitch, yaw, x,
+        y, z) the border is the first place where the reach ends; it is found by cutting the line into pieces and
+        keeping the first one that leaves. The answer depends on the wanted pose alone and changes continuously with it
+        as long as the reach is star-shaped about home, so a pose that moves smoothly in and out of reach gives a smooth
+        one, with nothing to remember. A pose in reach comes back unchanged, even where the line to it leaves the reach
+        for a while.
+        """
+        reached = self.reachable(poses)
+        out = poses.copy()
+        beyond = np.flatnonzero(~reached)
+        for first in range(0, beyond.size, BLOCK):
+            some = beyond[first : first + BLOCK]
+            out[some] *= self._share(poses[some])[:, None]
+        return out, reached
 
-    Home, the zero pose, is inside the reach. Along the straight line home -> wanted pose (in roll, pitch, yaw, x, y, z)
-    the border is the first place where the reach ends; it is found by cutting the line into pieces and keeping the
-    first one that leaves. The answer depends on the wanted pose alone and changes continuously with it as long as the
-    reach is star-shaped about home, so a pose that moves smoothly in and out of reach gives a smooth one, with nothing
-    to remember. A pose in reach comes back unchanged, even where the line to it leaves the reach for a while.
-    """
-    reached = reachable(poses)
-    out = poses.copy()
-    beyond = np.flatnonzero(~reached)
-    for first in range(0, beyond.size, BLOCK):
-        some = beyond[first : first + BLOCK]
-        out[some] *= _share(poses[some], reachable)[:, None]
-    return out, reached
-
-
-def _share(poses: Doubles, reachable: Reachable) -> Doubles:
-    """Return the share (n,) of each pose (n, 6) lies before the border, 0..1."""
-    start, width = np.zeros(len(poses)), 1.0
-    ends = np.arange(1, PIECES + 1) / PIECES
-    for _ in range(PASSES):
-        shares = start[:, None] + width * ends  # (n, pieces)
-        inside = reachable((shares[..., None] * poses[:, None]).reshape(-1, 6)).reshape(shares.shape)
-        whole = np.where(inside.all(axis=1), PIECES - 1, np.argmin(inside, axis=1))  # pieces before the leaving one
-        width /= PIECES
-        start = start + width * whole
-    return start
+    def _share(self, poses: Doubles) -> Doubles:
+        """Return the share (n,) of each pose (n, 6) lies before the border, 0..1."""
+        start, width = np.zeros(len(poses)), 1.0
+        ends = np.arange(1, PIECES + 1) / PIECES
+        for _ in range(PASSES):
+            shares = start[:, None] + width * ends  # (n, pieces)
+            inside = self.reachable((shares[..., None] * poses[:, None]).reshape(-1, 6)).reshape(shares.shape)
+            whole = np.where(inside.all(axis=1), PIECES - 1, np.argmin(inside, axis=1))  # pieces before the leaving one
+            width /= PIECES
+            start = start + width * whole
+        return start

@@ -10,7 +10,7 @@ from sfms_robot.config import load_head
 from sfms_robot.config.kinematics import BodyYaw, StewartPlatform
 from sfms_robot.errors import ConfigError
 from sfms_robot.retarget.head_retargeter import build_neck
-from sfms_robot.retarget.stewart import Stewart, nearest
+from sfms_robot.retarget.stewart import Stewart
 from sfms_robot.signals import rotations
 
 HEAD = load_head("reachy_mini")
@@ -139,7 +139,7 @@ def test_joints_stay_in_range_whatever_pose_is_asked(seed):
 @given(seeds)
 def test_a_reachable_pose_passes_unchanged_and_another_ends_on_the_border_of_the_way_home(seed):
     wanted = np.random.default_rng(seed).normal(size=(100, 6)) * FAR * 0.6
-    got, reached = nearest(wanted, NECK.reachable)
+    got, reached = NECK.nearest(wanted)
     assert np.array_equal(got[reached], wanted[reached]) and NECK.reachable(got).all()
     beyond, border = wanted[~reached], got[~reached]
     share = (border * beyond).sum(1) / (beyond * beyond).sum(1)
@@ -160,7 +160,7 @@ def test_the_reach_has_no_second_part_behind_its_border():
 @given(seeds)
 def test_on_a_smooth_path_in_and_out_of_reach_no_step_is_longer_than_the_asked_one_allows(seed):
     path = smooth_path(seed)
-    got, _ = nearest(path, NECK.reachable)
+    got, _ = NECK.nearest(path)
     asked, made = distance_m(path[1:], path[:-1]), distance_m(got[1:], got[:-1])
     assert (made <= LONGEST_STEP * asked).all()
 
@@ -187,7 +187,7 @@ def test_along_one_axis_the_platform_reaches_as_far_as_its_cranks_let_it(axis, l
     for sign, end in ((-1, low), (1, high)):
         far = np.zeros(6)
         far["xyz".index(axis) + 3] = sign * 0.2
-        assert nearest(far[None], NECK.reachable)[0][0] == pytest.approx(far / 0.2 * abs(end), abs=6e-4)
+        assert NECK.nearest(far[None])[0][0] == pytest.approx(far / 0.2 * abs(end), abs=6e-4)
 
 
 @pytest.mark.parametrize(("column", "limit_deg"), [(0, 40), (1, 40), (2, 65)])
