@@ -62,5 +62,4 @@ class Calibration:
 
     def to_rad(self, ticks: Ints) -> Doubles:
         """Return angles (J,) of servo positions, also of those outside the limits."""
-        angles: Doubles = (ticks - self.zero_ticks) / self.ticks_per_rad
-        return angles
+        return (ticks - self.zero_ticks) / self.ticks_per_rad

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 _HALVINGS: Final = 16
 # Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
@@ -126,12 +126,12 @@ class TimeOptimalChase:
 
         self._errors = (ruckig.RuckigError, ValueError)  # no way at the rim of the law, or one of hours (-101, unnamed)
         self._planner, self._path, self._dt_s = ruckig.Ruckig(1), ruckig.Trajectory(1), dt_s
-        self._inputs = [self._input(ruckig.InputParameter(1), bound) for bound in bounds]
-
-    def _input(self, given: Any, bound: Bound) -> Any:
-        given.max_velocity, given.max_acceleration, given.max_jerk = [bound.speed], [bound.acceleration], [bound.jerk]
-        given.minimum_duration = self._dt_s
-        return given
+        self._inputs = []
+        for speed, acceleration, jerk in bounds:
+            given = ruckig.InputParameter(1)
+            given.max_velocity, given.max_acceleration, given.max_jerk = [speed], [acceleration], [jerk]
+            given.minimum_duration = dt_s
+            self._inputs.append(given)
 
     def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
         """Return the state one tick after `before` on the way to `target`, both lawful; None without a lawful one."""

@@ -91,8 +91,7 @@ class HeadTurn:
         """Return angles (N, 2); before the turn those of its start."""
         t = np.maximum(times_s - self.began_s, 0.0)[:, None]
         off, slope, bend = self._lags()
-        angles: Doubles = self.end_rad + (off + (slope + bend * t) * t) * np.exp(-self.rate * t)
-        return angles
+        return self.end_rad + (off + (slope + bend * t) * t) * np.exp(-self.rate * t)
 
     def state_at(self, now_s: float) -> Doubles:
         """Return angle, speed and acceleration (3, 2)."""
@@ -178,8 +177,7 @@ class Camera:
         mounted: Doubles = np.asarray(place_m, np.float64) @ self._turned.T + self._at_m
         if not self.on_head:
             return mounted
-        moved: Doubles = mounted @ rotation(pose[:3]).T + pose[3:]
-        return moved
+        return mounted @ rotation(pose[:3]).T + pose[3:]
 
 
 class GazeTarget:

@@ -97,16 +97,15 @@ class HeadRetargeter:
         if self.neck is None:
             blind = [name in self.blind_channels for name in POSE_CHANNELS]
             return np.where(blind, 0.0, motion[..., :_POSE].astype(np.float64))
-        return self.neck.solve(self._turned(motion[..., :_POSE].astype(np.float64), knobs)).shown
+        return self.neck.solve(self._turned(motion, knobs)).shown
 
     def _pose(self, motion: Floats, knobs: Knobs | None) -> Doubles:
-        first = self.neck_columns[0]
-        row = motion if motion.ndim == 1 else motion[..., first, :]
-        return self._turned(row[..., :_POSE].astype(np.float64), knobs)
+        return self._turned(motion if motion.ndim == 1 else motion[..., self.neck_columns[0], :], knobs)
 
-    def _turned(self, pose: Doubles, knobs: Knobs | None) -> Doubles:
-        """Apply the knobs of the neck's region to poses (..., 6), in place."""
+    def _turned(self, motion: Floats, knobs: Knobs | None) -> Doubles:
+        """Return the poses (..., 6) of motion (..., 58), changed by the knobs of the neck's region."""
         first, knobs = self.neck_columns[0], knobs or self._knobs
+        pose = motion[..., :_POSE].astype(np.float64)
         if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
             pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))
         pose *= knobs.intensity[first]

@@ -83,15 +83,13 @@ class Request:
         """Return the weights (N, C) at (N,) instants."""
         times = times_s[:, None]
         risen = self.start + (1.0 - self.start) * ease((times - self.began_s) / self.rise_s)
-        weight: Doubles = risen * (1.0 - ease((times - self.until_s) / self.fall_s))
-        return weight
+        return risen * (1.0 - ease((times - self.until_s) / self.fall_s))
 
     def values(self, times_s: Doubles) -> Doubles:
         """Return the values (N, C) at (N,) instants."""
         share = (times_s - self.since_s) / self.change_s
         share = ease(share) if self.smooth else np.clip(share, 0.0, 1.0)
-        value: Doubles = self.before + share[:, None] * (self.after - self.before)
-        return value
+        return self.before + share[:, None] * (self.after - self.before)
 
     def then(self, values: Doubles, which: Bools, seconds: float, now_s: float) -> Request:
         """Return the request with `which` (C,) of `values` (C,) from now on: risen, they stay for `seconds`."""

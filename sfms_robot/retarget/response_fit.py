@@ -95,6 +95,7 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
     x, y, weight = _binned(has, looks, low, high)
     width = np.diff(knots)
     parts = np.clip((x[:, None] - knots[:-1]) / width, 0.0, 1.0) - (knots[:-1] < 0)  # 0 at rest, of either side
+    # Unknowns are the slope of each piece, then the offset.
     data = np.concatenate([parts * width, np.ones((len(x), 1))], axis=1) * weight[:, None]
     slopes, bends = np.eye(len(width)), np.diff(np.eye(len(width)), axis=0)
     priors = np.concatenate([_PLAIN * slopes, _SMOOTH * bends])
@@ -103,8 +104,7 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
     bounds = np.append(np.full(len(width), FLATTEST), -np.inf), np.append(np.full(len(width), STEEPEST), np.inf)
     found = lsq_linear(matrix, wanted, bounds).x
     heights = np.concatenate([[0.0], np.cumsum(found[:-1] * width)])
-    heights -= heights[len(below) - 1]
-    heights[len(below) - 1] = 0.0
+    heights -= heights[len(below) - 1]  # 0 at rest
     return Response(knots, heights, float(found[-1]), moved)
 
 

@@ -69,7 +69,7 @@ class IdleState:
     glance_s: float
     head: float = 0.0
     eyes: float = 0.0
-    draws: int = 0
+    draws: int = 1
 
 
 class IdleFiller:
@@ -93,7 +93,7 @@ class IdleFiller:
             nowhere = Jump.between(np.zeros(2), np.zeros(2), now_s)
             blink = BlinkState(rate=self._blinks_per_s, due_at=self._until_blink(1))
             return IdleState(
-                now_s=now_s, head_rad=head_rad, eyes_rad=eyes_rad, blink=blink, glance=nowhere, glance_s=now_s, draws=1
+                now_s=now_s, head_rad=head_rad, eyes_rad=eyes_rad, blink=blink, glance=nowhere, glance_s=now_s
             )
         dt_s = max(now_s - state.now_s, 0.0)
         state = replace(
