@@ -93,18 +93,13 @@ def frame_json(record: bytes, shown: Shown | None = None) -> bytes:
         "j": asked_rad.round(_DIGITS),
         "r": read_rad.round(_DIGITS),
         "u": (there_rad if shown is None else shown(there_rad)).round(_DIGITS),
-        "db": _number(voice_db, 1),
+        "db": round(voice_db, 1),  # unknown is NaN, of which JSON makes null; the same below
         "talk": bool(talking),
-        "own": _number(own_db, 1),
-        "at": _number(attention),
-        "o": None if math.isnan(place_m[0]) else [_number(each) for each in place_m],
+        "own": round(own_db, 1),
+        "at": round(attention, _DIGITS),
+        "o": None if math.isnan(place_m[0]) else [round(each, _DIGITS) for each in place_m],
     }
     return message_json(**message)[:-1] + b"," + record[_HEADER.size + 4 * count :] + b"}"
-
-
-def _number(value: float, digits: int = _DIGITS) -> float | None:
-    """Return a rounded number; None for NaN, which JSON does not have."""
-    return None if math.isnan(value) else round(value, digits)
 
 
 def message_json(**message: Any) -> bytes:

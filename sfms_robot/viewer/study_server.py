@@ -57,12 +57,14 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
         if path == "/begin":
             return JSONResponse({"participant": study.begin(), "questions": dict(study.questions)})
         participant = given.get("participant")
+        if not isinstance(participant, str) or not participant.isalnum() or len(participant) > MOST_NAME:
+            raise ConfigError("participant is what /begin gave")
         if path == "/answer":
             number, chosen = given.get("trial"), given.get("answers")
             if not isinstance(number, int) or not isinstance(chosen, dict):
                 raise ConfigError("an answer needs a number `trial` and a table `answers`")
-            study.answer(_name(participant), number, {str(key): str(value) for key, value in chosen.items()})
-        return JSONResponse(study.next(_name(participant)))
+            study.answer(participant, number, {str(key): str(value) for key, value in chosen.items()})
+        return JSONResponse(study.next(participant))
 
     async def page(request: Request) -> Response:
         return FileResponse(STATIC / "people.html", media_type="text/html")
@@ -84,9 +86,3 @@ def serve_study(study: Comparison, address: Address, ready: Callable[[str, int |
     ready(place.url, place.taken)
     with asyncio.Runner(loop_factory=WebLoop) as runner:
         runner.run(web_server(study_app(study, place.token), ws="none").serve(sockets=[place.socket]))
-
-
-def _name(participant: object) -> str:
-    if not isinstance(participant, str) or not participant.isalnum() or len(participant) > MOST_NAME:
-        raise ConfigError("participant is what /begin gave")
-    return participant
