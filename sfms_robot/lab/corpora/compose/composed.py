@@ -37,7 +37,7 @@ from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, read_people, split_series
-from sfms_robot.lab.corpora.compose.motions import Rng, pick
+from sfms_robot.lab.corpora.compose.motions import Rng, first_frame, pick
 from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
@@ -101,7 +101,7 @@ class Stretch:
 
     @property
     def frames(self) -> int:
-        return int(round((self.end_s - self.start_s) * FRAME_HZ))
+        return round((self.end_s - self.start_s) * FRAME_HZ)
 
     @property
     def name(self) -> str:
@@ -406,7 +406,7 @@ def attention_of(stretch: Stretch) -> Floats:
     for start, _, agent in (phrase for phrase in person.floor if phrase[1] - phrase[0] >= _FLOOR_S):
         if start >= stretch.end_s:
             break
-        holder[max(0, int(round((start - stretch.start_s) * FRAME_HZ))) :] = agent
+        holder[max(0, first_frame(start - stretch.start_s)) :] = agent
     out = np.full(stretch.frames, np.nan, np.float32)
     for agent in person.gaze_known:
         looks = active(_spans(person.looked_at, agent), stretch)
