@@ -7,7 +7,7 @@ phrases begin and end at the same times. Meetings, people, takes and voices kept
 (`clips.SERIES`).
 
 All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
-when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
+when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, and so while
 no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, looks are
 drawn from the durations in the training split (`speaking.Dwell`), in an order of ours.
 
@@ -147,11 +147,10 @@ def compose_folder(
     speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
-    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
-    or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
-    dyad: the set, the minutes wanted of it, the minutes written. `jobs`: processes; each part, a split of a set, has
-    random numbers of its own, so the files are the same with any number. Returns the minutes written per split. Raises
-    ConfigError.
+    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused, or, with `overwrite`, removed
+    from `out` once the new ones are written: two sets never mix. `told` is called after every dyad, with the set, the
+    minutes wanted of it and the minutes written. `jobs`: processes; each part, a split of a set, has its own random
+    numbers, so the files are the same with any number. Returns the minutes written per split. Raises ConfigError.
     """
     folders: dict[SetName, Path] = {"listening": out, **{name: out / name for name in SHARES}}
     parts = [
