@@ -106,7 +106,6 @@ LAYOUTS: Final = {
     )
 }  # fmt: skip
 _SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
-_ORDERED: Final = ("train", "validation", "test")
 _SAMPLE: Final = 8  # clips looked at for the order of their channels
 _SEED: Final = 0
 
@@ -135,7 +134,7 @@ def split_names(layout: Layout, place: Path) -> tuple[str, ...]:
     found = set(layout.splits(place))
     if "train" in found and layout.held_out:
         found.add("validation")
-    return tuple(sorted(found, key=lambda name: (_ORDERED.index(name) if name in _ORDERED else len(_ORDERED), name)))
+    return tuple(sorted(found, key=lambda name: (SPLITS.index(name) if name in SPLITS else len(SPLITS), name)))
 
 
 def open_dataset(

@@ -318,7 +318,7 @@ def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ConfigError(f"--scratch: {folder} cannot be written: {error.strerror}") from error
+        raise ConfigError(f"--scratch: {folder} cannot be written: {error.strerror or error}") from error
 
 
 # --- Packs: all that a trainer reads of its data, in one file --------------------------------------------------------
@@ -453,7 +453,7 @@ def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor
     sizes = torch.stack([track.square().mean(0).sqrt().clamp(min=1e-9).log() for track in tracks])  # (K, S)
     common = (sizes - sizes.mean(0)).mean(1)  # of the whole head
     weight = torch.tensor([float(len(track)) for track in tracks], dtype=torch.float64)
-    spread = common.std(correction=0) if len(tracks) > 1 else torch.zeros((), dtype=torch.float64)
+    spread = common.std(correction=0)
     powers = torch.stack(
         [band_powers(track / one.exp()) * weight_ for track, one, weight_ in zip(tracks, common, weight, strict=True)]
     )
@@ -484,10 +484,8 @@ def band_powers(track: Tensor) -> Tensor:
     """Return the co-spectrum (BANDS, S, S) of a track (N, S) by band of `BANDS_HZ`; slower parts count in the first."""
     from scipy import signal
 
-    length = min(len(track), LONGEST)
-    values = track.numpy()
-    how = {"fs": FRAME_HZ, "nperseg": length, "detrend": "constant"}
-    frequency_hz, density = signal.csd(values.T[:, None], values.T[None], **how)
+    length, values = min(len(track), LONGEST), track.T.numpy()
+    frequency_hz, density = signal.csd(values[:, None], values[None], FRAME_HZ, nperseg=length, detrend="constant")
     band = np.clip(np.searchsorted(BANDS_HZ, frequency_hz, side="right") - 1, 0, BANDS)
     powers = np.zeros((BANDS + 1, *density.shape[:2]))
     np.add.at(powers, band, np.moveaxis(density.real, -1, 0) * (frequency_hz[1] - frequency_hz[0]))

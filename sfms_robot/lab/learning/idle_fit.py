@@ -41,6 +41,8 @@ PATTERNS: Final = 4  # of each region, at most
 LEAST: Final = 0.001  # deviation of a pattern that is worth drawing, in every channel together
 AT: Final = (0.01, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99)  # quantiles
 _SOUND: Final = 1e-3
+# Band of every line of a window's spectrum.
+_BAND: Final = np.searchsorted(IDLE_BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ), side="right") - 1
 
 
 def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats | None = None) -> Floats:
@@ -122,17 +124,14 @@ def _leakage() -> Doubles:
     both = (power + np.roll(power[..., ::-1], 1, axis=-1)) / 2
     found = np.zeros((IDLE_BANDS, IDLE_BANDS))
     found[0] = both[..., 0].mean(1)
-    band = np.searchsorted(IDLE_BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ), side="right") - 1
     for at in range(1, IDLE_BANDS):
-        found[at] = 2 * both[..., : WINDOW // 2 + 1][..., band == at].sum(-1).mean(1)
+        found[at] = 2 * both[..., : WINDOW // 2 + 1][..., _BAND == at].sum(-1).mean(1)
     return found
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
     """Return (IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
     windows = np.concatenate(faces)
-    hz = np.fft.rfftfreq(WINDOW, 1 / FRAME_HZ)
-    band = np.searchsorted(IDLE_BANDS_HZ, hz, side="right") - 1
     channels = windows.shape[-1]
     means = windows.mean(axis=1, dtype=np.float64)
     found = np.zeros((IDLE_BANDS, channels, channels))
@@ -140,7 +139,7 @@ def covariances(faces: Sequence[Floats]) -> Doubles:
     found[0] = off.T @ off / len(windows)
     lines = np.fft.rfft(windows - means[:, None], axis=1) / WINDOW  # (W, F, C)
     for at in range(1, IDLE_BANDS):
-        chosen = lines[:, band == at].reshape(-1, channels)
+        chosen = lines[:, _BAND == at].reshape(-1, channels)
         found[at] = 2 * np.real(chosen.conj().T @ chosen) / len(windows)
     return found
 

@@ -184,7 +184,7 @@ def test_a_plan_that_is_drawn_as_a_whole_is_learned_as_a_whole(hop):
     corpus = gather([dyad("a")], 48, ARKIT, AudioFrontend.of(tiny.listener), tiny.listener)
     model, undecided = SfmsModel(tiny.listener), []
     model.predictor.register_forward_pre_hook(lambda _, seen: undecided.append(seen[0].tokens[:, -8:] == UNDECIDED))
-    listener.held_out_loss(model, corpus, tiny.predictor)
+    listener.held_out_loss(listener.Lessons(model, corpus), tiny.predictor)
     first = torch.cat(undecided)[..., 0]
     assert first[:, -1].all() and first.all() == (hop == 8)
 

@@ -7,7 +7,7 @@ phrases begin and end at the same times. Meetings, people, takes and voices kept
 (`clips.SERIES`).
 
 All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
-when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, as it is while
+when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, and so while
 no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, looks are
 drawn from the durations in the training split (`speaking.Dwell`), in an order of ours.
 
@@ -37,7 +37,7 @@ from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, read_people, split_series
-from sfms_robot.lab.corpora.compose.motions import Rng, pick
+from sfms_robot.lab.corpora.compose.motions import Rng, first_frame, pick
 from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
@@ -100,7 +100,7 @@ class Stretch:
 
     @property
     def frames(self) -> int:
-        return int(round((self.end_s - self.start_s) * FRAME_HZ))
+        return round((self.end_s - self.start_s) * FRAME_HZ)
 
     @property
     def name(self) -> str:
@@ -146,11 +146,10 @@ def compose_folder(
     speaking.
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
-    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused,
-    or, with `overwrite`, removed from `out` once the new ones are written: two sets never mix. `told` hears of every
-    dyad: the set, the minutes wanted of it, the minutes written. `jobs`: processes; each part, a split of a set, has
-    random numbers of its own, so the files are the same with any number. Returns the minutes written per split. Raises
-    ConfigError.
+    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused, or, with `overwrite`, removed
+    from `out` once the new ones are written: two sets never mix. `told` is called after every dyad, with the set, the
+    minutes wanted of it and the minutes written. `jobs`: processes; each part, a split of a set, has its own random
+    numbers, so the files are the same with any number. Returns the minutes written per split. Raises ConfigError.
     """
     folders: dict[SetName, Path] = {"listening": out, **{name: out / name for name in SHARES}}
     parts = [
@@ -405,7 +404,7 @@ def attention_of(stretch: Stretch) -> Floats:
     for start, _, agent in (phrase for phrase in person.floor if phrase[1] - phrase[0] >= _FLOOR_S):
         if start >= stretch.end_s:
             break
-        holder[max(0, int(round((start - stretch.start_s) * FRAME_HZ))) :] = agent
+        holder[max(0, first_frame(start - stretch.start_s)) :] = agent
     out = np.full(stretch.frames, np.nan, np.float32)
     for agent in person.gaze_known:
         looks = active(_spans(person.looked_at, agent), stretch)

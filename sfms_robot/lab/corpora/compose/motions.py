@@ -72,7 +72,7 @@ def held(curve: Floats, frames: int) -> Floats:
 
 def first_frame(start_s: float) -> int:
     """Return the frame that begins at or nearest to a time."""
-    return int(round(start_s * FRAME_HZ))
+    return round(start_s * FRAME_HZ)
 
 
 def placed(curve: Floats, start_s: float, frames: int) -> Floats:

@@ -272,7 +272,7 @@ def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> list[ListenerEvent]:
 
 def _bend(shape: Floats, length_s: float) -> float:
     """Return the largest second derivative of a unit cycle over unit time, as seen at the frame rate."""
-    samples = max(4, int(round(length_s * FRAME_HZ)))
+    samples = max(4, round(length_s * FRAME_HZ))
     played = np.interp(np.linspace(0, 1, samples + 1), np.linspace(0, 1, len(shape)), shape)
     twice = np.concatenate([[0, 0], np.tile(played[:-1], 2), [0, 0, 0]])
     return float(np.abs(np.diff(twice, 2)).max()) * samples**2

@@ -402,9 +402,9 @@ def _wander(
     The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
     the drift of a stream: its speed does not continue in the frames after it.
     """
-    place = generator.device
     if not is_drawn(generator, phase.history_noise):
-        return torch.zeros(b, n, 1, device=place), torch.zeros(b, n, 1, device=place)
+        nothing = torch.zeros(b, n, 1, device=generator.device)
+        return nothing, nothing
     size = uniform(generator, b, 1, 1) * phase.history_noise
     size = size * (uniform(generator, b, 1, 1) >= COLD)
     jumps = normal(generator, b, n, channels)

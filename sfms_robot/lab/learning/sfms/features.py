@@ -79,7 +79,6 @@ def corpora(
     which a tokenizer does without.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
-    frontend = AudioFrontend.of(listener) if heard else None
 
     def read(split: str) -> SfmsCorpus:
         dyads = open_for(space.name, data, split, order, [listener.audio] if heard else ())
@@ -88,6 +87,7 @@ def corpora(
                 "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
                 data, dyads.fps, FRAME_HZ,
             )  # fmt: skip
+        frontend = AudioFrontend.of(listener) if heard else None
         return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
 
     return training_data(data, SfmsFrames, listener, listener.window_frames, read)

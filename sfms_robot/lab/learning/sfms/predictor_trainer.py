@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -66,7 +66,7 @@ def train_listener(
     outcome = fit(job, out, run)
     last = outcome.held_out
     if last is None:
-        last = held_out_loss(model, held_out.to(run.device), phase)
+        last = held_out_loss(Lessons(model, held_out.to(run.device), phase.tokens), phase)
     if run.group.first:
         checkpoint.save_config(out, corrected(settings))
         checkpoint.save_weights(out / checkpoint.WEIGHTS, model)
@@ -79,17 +79,14 @@ def listener_job(
 ) -> Job:
     """Return the job of phase 2, on a model whose tokenizer is trained; move the model to `device`."""
     phase, listener = settings.predictor, settings.listener
-    starts = corpus.starts(listener.window_frames)
-    eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
     fingerprint = corpus.fingerprint()
     neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames).to(device)
     tokenizer_digest = digest_of(model.tokenizer)
     model.to(device)
-    corpus, held_out = corpus.to(device), held_out.to(device)
-    tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
-    tokens_at, held = placed_tokens(model, corpus, tokens, phase.tokens)
-    motion = standard_motion(model, corpus)
-    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
+    lessons, unseen = (Lessons(model, each.to(device), phase.tokens) for each in (corpus, held_out))
+    starts, motion = lessons.starts, lessons.motion
+    eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
+    dense = keyframe_tokens(model, motion) if phase.missed_keyframes else lessons.tokens
     codebook = model.tokenizer.quantizer.codebook
     levels = codebook.levels if isinstance(codebook, Grid) else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
@@ -103,10 +100,8 @@ def listener_job(
         louder = (uniform(generator, batch) * 2 - 1) * phase.gain_db * LN_PER_DB if listener.audio == "mel" else None
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
-        own = tokens_at(chosen)
-        seen = context(model, corpus, own, chosen, louder, held)
+        seen, target = lessons.at(chosen, louder)
         seen = augment(seen, levels, neutral, phase, noise)
-        target = own[:, listener.past_frames :]
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
         count = _drawn(listener, target, generator)
         if phase.missed_keyframes:
@@ -127,7 +122,7 @@ def listener_job(
         model=model,
         optimizers=[optimizer(model.predictor.parameters(), phase.learning_rate, phase.weight_decay)],
         loss_of=loss_of,
-        held_out=lambda: held_out_loss(model, held_out, phase, held_out_tokens),
+        held_out=lambda: held_out_loss(unseen, phase),
         frames_per_step=phase.batch * listener.window_frames,
         phase=phase,
         seed=settings.seed,
@@ -141,19 +136,42 @@ def listener_job(
     )
 
 
-def placed_tokens(
-    model: SfmsModel, corpus: SfmsCorpus, tokens: Tensor, placed: TokensOf
-) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
-    """Return the tokens (B, T, G) of windows by their first frames, and those held (N, G) at a window's first frame.
+class Lessons:
+    """Windows of a corpus as the predictor learns them: what is seen in one, and the tokens that come next.
 
-    `tokens` (N, G) are those of whole dyads; `placed`: `PredictorTraining.tokens`.
+    Attributes:
+        starts: first frames of all windows.
+        tokens: (N, G) of whole dyads.
+        motion: (N, C) standardised.
     """
-    if placed == "dyads":
-        held = held_tokens(tokens, corpus.lengths) if model.settings.placement == "penalised" else None
-        return lambda starts: windows(tokens, starts, model.settings.window_frames), held
-    motion = standard_motion(model, corpus)
-    dense = keyframe_tokens(model, motion)
-    return lambda starts: window_tokens(model, motion, dense, starts), None
+
+    def __init__(self, model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dyads") -> None:
+        """Tokenise a corpus. `placed`: `PredictorTraining.tokens`."""
+        settings = model.settings
+        self.model, self._corpus = model, corpus
+        self.starts = corpus.starts(settings.window_frames)
+        self.tokens = tokenise(model, corpus)
+        self.motion = standard_motion(model, corpus)
+        self._held: Tensor | None = None
+        self._dense: Tensor | None = None
+        if placed == "windows":
+            self._dense = keyframe_tokens(model, self.motion)
+        elif settings.placement == "penalised":
+            self._held = held_tokens(self.tokens, corpus.lengths)
+
+    def at(self, starts: Tensor, louder: Tensor | None = None) -> tuple[Context[Tensor], Tensor]:
+        """Return the contexts of windows at (B,) starts, and the tokens (B, H, G) that come next."""
+        settings = self.model.settings
+        if self._dense is None:
+            own = windows(self.tokens, starts, settings.window_frames)
+        else:
+            own = window_tokens(self.model, self.motion, self._dense, starts)
+        return context(self.model, self._corpus, own, starts, louder, self._held), own[:, settings.past_frames :]
+
+    def some(self, generator: torch.Generator) -> Iterator[tuple[Context[Tensor], Tensor]]:
+        """Yield batches of `at` for windows that are drawn."""
+        for _ in range(HELD_OUT_BATCHES):
+            yield self.at(self.starts[torch.randint(len(self.starts), (HELD_OUT_BATCH,), generator=generator)])
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
@@ -254,34 +272,15 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 
 
 @torch.no_grad()
-def held_out_loss(
-    model: SfmsModel, corpus: SfmsCorpus, phase: config.PredictorTraining, tokens: Tensor | None = None
-) -> float:
-    """Return the loss, not augmented, on windows drawn with a fixed seed; `tokens` (N, G) of the corpus if known."""
-    model.eval()
-    tokens = tokenise(model, corpus) if tokens is None else tokens
+def held_out_loss(lessons: Lessons, phase: config.PredictorTraining) -> float:
+    """Return the loss, not augmented, on windows drawn with a fixed seed."""
+    model = lessons.model.eval()
     generator = torch.Generator().manual_seed(0)
     losses = []
-    for seen, target in some_windows(model, corpus, tokens, generator, phase.tokens):
+    for seen, target in lessons.some(generator):
         meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
         losses.append(float(_loss(model, seen, meant, _drawn(model.settings, target, generator), phase)))
     return sum(losses) / len(losses)
-
-
-def some_windows(
-    model: SfmsModel,
-    corpus: SfmsCorpus,
-    tokens: Tensor,
-    generator: torch.Generator,
-    placed: TokensOf = "dyads",
-) -> Iterator[tuple[Context[Tensor], Tensor]]:
-    """Yield batches of contexts and the tokens (B, H, G) that came next; `placed`: `PredictorTraining.tokens`."""
-    starts = corpus.starts(model.settings.window_frames)
-    tokens_at, held = placed_tokens(model, corpus, tokens, placed)
-    for _ in range(HELD_OUT_BATCHES):
-        chosen = starts[torch.randint(len(starts), (HELD_OUT_BATCH,), generator=generator)]
-        own = tokens_at(chosen)
-        yield context(model, corpus, own, chosen, held=held), own[:, model.settings.past_frames :]
 
 
 @torch.no_grad()
@@ -291,9 +290,8 @@ def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dy
     All groups and future frames pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
     """
     model.eval()
-    tokens = tokenise(model, corpus)
     hit = said = true = 0
-    for seen, target in some_windows(model, corpus, tokens, torch.Generator().manual_seed(0), placed):
+    for seen, target in Lessons(model, corpus, placed).some(torch.Generator().manual_seed(0)):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
