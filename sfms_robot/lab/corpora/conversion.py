@@ -146,7 +146,7 @@ def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
     from scipy.spatial.transform import Rotation
 
     name = "deca56" if space == "seamless27" else space
-    columns = slice(0, 3) if space == "seamless27" else SPACES[name].rotation
+    columns = _ANGLES if space == "seamless27" else SPACES[name].rotation
     back = encode(ours, name)[:, SPACES[name].rotation].astype(np.float64)
 
     def turns(rows: Doubles) -> Rotation:

@@ -228,11 +228,7 @@ def learned_loss(
 def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Return consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
-    return windows(
-        standard_motion(model, corpus),
-        first_frames(corpus.lengths, window, window),
-        window,
-    )
+    return windows(standard_motion(model, corpus), first_frames(corpus.lengths, window, window), window)
 
 
 def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
