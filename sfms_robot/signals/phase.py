@@ -128,9 +128,8 @@ def hear(levels_db: Doubles) -> list[bool]:
 
 def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
     """Return seconds (N, 3) of speech so far, silence so far and the last phrase, of frames of speech (N,)."""
-    speaks = np.asarray(active, np.bool_)
-    index = np.arange(len(speaks))
-    newest = np.maximum.accumulate(np.where(speaks, index, -1))  # frame of speech
+    index = np.arange(len(active))
+    newest = np.maximum.accumulate(np.where(active, index, -1))  # frame of speech
     silence = index - newest
     phrase = (newest >= 0) & (silence < GAP_FRAMES)
     begins = phrase & ~np.r_[False, phrase][:-1]
