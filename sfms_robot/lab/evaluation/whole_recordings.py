@@ -419,7 +419,7 @@ def decisions(
             [uniforms(seed, at, Use.EVENT, len(EVENT_KINDS)) for at in steps.tolist()], (-1, len(EVENT_KINDS))
         )
         frames = [*steps[(draws[:, model.draws] < most).any(axis=1)].tolist(), len(heard)]
-        streams.append(_Stream(model.start(seed, calmness), frames))
+        streams.append(_Decider(model.start(seed, calmness), frames))
     while ahead := [stream for stream in streams if stream.frame < len(heard)]:  # each at a time of its own
         sensed = [Sensed(stream.frame, heard[stream.frame]) for stream in ahead]
         decided = model.decide_each(sensed, [stream.memory for stream in ahead])
@@ -428,7 +428,7 @@ def decisions(
     return [tuple(stream.events) for stream in streams]
 
 
-class _Stream:
+class _Decider:
     """A stream that decides at the end of some frames, the last of which is beyond the end.
 
     Attributes:
