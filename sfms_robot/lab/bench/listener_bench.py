@@ -94,9 +94,10 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
         rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
     auto = [*ways][-1]
+    how: Any = getattr(loaded[EAGER], "how", loaded[EAGER])  # of a listener that may also decide events
     rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
-        "params": sum(each.numel() for each in getattr(loaded[EAGER], "how", loaded[EAGER]).model.parameters()),
+        "params": sum(each.numel() for each in how.model.parameters()),
         "weights": weights,
     }
     if isinstance(settings, config.Arig):
