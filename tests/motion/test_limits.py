@@ -101,9 +101,18 @@ def test_a_slow_nod_passes_unchanged():
 
 def test_what_is_not_finite_is_refused_and_the_joint_comes_to_a_stop():
     moving = [np.stack([LIMITS.speed * 0.2 * DT_S * k, LIMITS.speed * 0.2, 0 * LIMITS.speed]) for k in range(4)]
-    sent, state = followed([*moving, *[np.full((3, J), np.nan)] * 60])
-    assert excess(sent) < 1e-6 and state.refused == 60 * J
-    assert not np.diff(sent[-20:], axis=0).any() and not state.motion[1:].any()
+    for row in range(3):  # angle, speed, acceleration
+        lost = np.where(np.arange(3)[:, None] == row, np.nan, np.zeros((3, J)))
+        sent, state = followed([*moving, *[lost] * 60])
+        assert excess(sent) < 1e-6 and state.refused == 60 * J
+        assert not np.diff(sent[-20:], axis=0).any() and not state.motion[1:].any()
+
+
+def test_a_slow_reference_a_little_beyond_the_range_is_left_before_its_end():
+    t = DT_S * np.arange(800)
+    path = np.where(FREE, LIMITS.high + 0.008 - 0.03 * (1 + np.cos(2 * t))[:, None], 0.0)
+    sent, _ = followed([difference(*path[k : k + 3], DT_S) for k in range(798)], path[0])
+    assert excess(sent) < 1e-6
 
 
 def test_one_broken_joint_does_not_disturb_the_others():
@@ -142,7 +151,6 @@ def test_the_reference_of_a_parabola_is_exact():
 
 
 # --- with and without ruckig ------------------------------------------------------------------------------------
-
 RATES = (3.0, 30.0, 1500.0)  # speed, acceleration, jerk
 ONE = JointLimits(np.array([-2.0]), np.array([2.0]), *(np.array([rate]) for rate in RATES))
 
